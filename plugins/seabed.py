@@ -65,9 +65,7 @@ class Bottom:
 
     def __init__(self, get: Get) -> None:
         self.terrain = _read_terrain(get)
-        # The heights of a map may be relative to the sea level; those of a survey are.
-        surveyed = self.terrain is not None and (self.terrain.origin is not None or get("map_values", "") == "depths")
-        depth = get("depth", 0.0 if surveyed else 8.0)
+        depth = get("depth", 8.0 if self.terrain is None else 0.0)
         self.depth = ranged("depth", (positive if self.terrain is None else non_negative)("depth", depth))
         #: Rise along x and y [m/m].
         self.slope = tuple(
@@ -134,7 +132,7 @@ class Bottom:
                 )
         height = float(self.heights(*(np.array([value]) for value in self.centre))[0, 0])
         if height >= 0:
-            hint = "" if self.terrain is None else ", and map_values be depths if the map is of depths"
+            hint = "" if self.terrain is None else ", and map_values be depths or heights, as those of the map are"
             raise UserError(
                 f"depth = {self.depth:g} puts the bottom at z = {height:.3g} m in its middle, "
                 f"({self.centre[0]:g}, {self.centre[1]:g}): it must lie below the sea there{hint}"
@@ -176,17 +174,17 @@ class Bottom:
 def _read_terrain(get: Get) -> HeightMap | None:
     """Read the height map, if there is one."""
     path = get("filename", "")
-    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell")
-    size, x, y, values, holes, cell = (get(name, None) for name in names)
+    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data")
+    given = size, x, y, values, holes, cell, unit, no_data = tuple(get(name, None) for name in names)
     if not path:
-        for name, value in zip(names, (size, x, y, values, holes, cell), strict=True):
+        for name, value in zip(names, given, strict=True):
             if value is not None:
                 raise UserError(f"{name} = {value} needs a height map: give its filename")
         return None
     if (x is None) != (y is None):
         raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
     origin = None if x is None else (finite("origin_x", x), finite("origin_y", y))
-    return read_height_map(path, size, origin, values or "heights", holes or "refuse", cell)
+    return read_height_map(path, size, origin, values, holes or "refuse", cell, unit, no_data)
 
 
 def _read_patches(text: str) -> tuple[Patch, ...]:
@@ -219,7 +217,7 @@ class Seabed(mi.Mesh):
     Parameter                 Type    Meaning
     ========================  ======  ==================================================================================
     depth                     float   Depth at x = y = 0 [m], above 0 to 1e5; with a height map from 0, added to its
-                                      depths. Default: 8, or 0 with a map of depths, or in map coordinates
+                                      depths. Default: 8, or 0 with a height map
     slope_x_deg, slope_y_deg  float   Tilt, -45 to 45 [deg]: positive where the bottom rises towards +x, +y. Default: 0
     curvature                 float   Curvature of a bowl about the centre, -1 to 1 [1/m], negative for a mound; it ends
                                       half of ``refined_size`` from the centre. Default: 0
@@ -227,19 +225,22 @@ class Seabed(mi.Mesh):
                                       none. Default: 0
     ripple_length             float   Distance of their crests [m]. Default: 0.2
     ripple_bearing_deg        float   Direction across the crests, from +x to +y [deg]. Default: 0
-    filename                  string  Height map that is added: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), a
-                                      GeoTIFF (.tif) with the extra ``geo``, a Bathymetric Attributed Grid (.bag), or
-                                      points (.xyz, .csv, .txt). Where its heights are those above the mean sea level,
-                                      give ``depth`` 0
+    filename                  string  Height map above the mean sea level: .npy, .npz, .exr, .nc, an ESRI ASCII grid
+                                      (.asc), a GeoTIFF (.tif), a Bathymetric Attributed Grid (.bag), or points (.xyz,
+                                      .csv, .txt)
     map_size                  float   Side along x of a height map that carries no positions [m]
-    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: ``heights``
+    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: what the file
+                                      states, or ``heights``
+    map_unit                  string  Unit of the values where the file does not state it: ``m``, ``cm``, ``km``,
+                                      ``ft``, ``ftUS`` (US survey foot) or ``fathom``. Default: ``m``
+    map_no_data               float   Value of cells without a height where the file does not declare it
     map_holes                 string  ``refuse`` or ``fill`` cells without a value, with that of the nearest cell.
                                       Default: ``refuse``
     map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
                                       or their mean spacing
-    origin_x, origin_y        float   Point of the map, in its coordinates, that lies at x = y = 0 [m]. Default: the
-                                      centre of an .asc, .tif or .bag, or of points; positions in other files are those
-                                      of the scene
+    origin_x, origin_y        float   Point of the map, in its coordinates in metres, that lies at x = y = 0. Default:
+                                      the centre of an .asc, .tif or .bag, or of points; positions in other files are
+                                      those of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -14,26 +15,39 @@ _HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
 def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[float, float], **changes: Any) -> Path:
     """Write a Bathymetric Attributed Grid from its south-western cell on; `changes` are parts of its metadata."""
     import h5py
+    import pyproj
 
     rows, columns = np.shape(heights)
     last = (first[0] + (columns - 1) * cell[0], first[1] + (rows - 1) * cell[1])
     corners = changes.get("corners", f"{first[0]!r},{first[1]!r} {last[0]!r},{last[1]!r}")
     axes = "".join(
-        f'<gmd:MD_Dimension><gmd:dimensionName><gmd:MD_DimensionNameTypeCode codeListValue="{name}"/>'
-        f'</gmd:dimensionName><gmd:resolution><gco:Measure uom="m">{size!r}</gco:Measure></gmd:resolution>'
-        "</gmd:MD_Dimension>"
-        for name, size in (("row", cell[1]), ("column", cell[0]))
+        "<gmd:axisDimensionProperties><gmd:MD_Dimension><gmd:dimensionName>"
+        f'<gmd:MD_DimensionNameTypeCode codeListValue="{name}">{name}</gmd:MD_DimensionNameTypeCode>'
+        f"</gmd:dimensionName><gmd:dimensionSize><gco:Integer>{count}</gco:Integer></gmd:dimensionSize>"
+        f'<gmd:resolution><gco:Measure uom="Metre">{size!r}</gco:Measure></gmd:resolution></gmd:MD_Dimension>'
+        "</gmd:axisDimensionProperties>"
+        for name, count, size in (("row", rows, cell[1]), ("column", columns, cell[0]))
     )
+    systems = changes.get("system", pyproj.CRS(32633).to_wkt("WKT1_GDAL")), changes.get("datum", "")
+    references = "".join(
+        "<gmd:referenceSystemInfo><gmd:MD_ReferenceSystem><gmd:referenceSystemIdentifier><gmd:RS_Identifier><gmd:code>"
+        f"<gco:CharacterString>{escape(wkt)}</gco:CharacterString></gmd:code><gmd:codeSpace><gco:CharacterString>WKT"
+        "</gco:CharacterString></gmd:codeSpace></gmd:RS_Identifier></gmd:referenceSystemIdentifier>"
+        "</gmd:MD_ReferenceSystem></gmd:referenceSystemInfo>"
+        for wkt in systems
+        if wkt
+    )
+    spaces = "".join(f' xmlns:{name}="http://www.isotc211.org/2005/{name}"' for name in ("gmi", "gmd", "gco", "gml"))
     text = (
-        f'<gmi:MI_Metadata xmlns:gmi="gmi" xmlns:gmd="gmd" xmlns:gco="gco" xmlns:gml="gml">{axes}'
-        f"<gmd:cornerPoints><gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints>"
-        f"<system>{changes.get('system', 'PROJCS[GEOGCS[]]')}</system></gmi:MI_Metadata>"
+        f"<gmi:MI_Metadata{spaces}><gmd:spatialRepresentationInfo><gmd:MD_Georectified>{axes}<gmd:cornerPoints>"
+        f"<gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints></gmd:MD_Georectified>"
+        f"</gmd:spatialRepresentationInfo>{references}</gmi:MI_Metadata>"
     )
-    text = changes.get("head", "") + text
     with h5py.File(path, "w") as file:
         root = file.create_group("BAG_root")
-        root["elevation"] = np.asarray(heights, dtype=np.float32)
-        root["metadata"] = np.array([one.encode() for one in text], dtype="S1")
+        root.attrs["Bag Version"] = np.bytes_("1.6.2")
+        root["elevation"] = root["uncertainty"] = np.asarray(heights, dtype=np.float32)
+        root["metadata"] = np.frombuffer(text.encode(), dtype="S1")
     return path
 
 
@@ -42,6 +56,7 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         import OpenEXR
+        import rasterio
         import xarray as xr
 
         path = folder / f"map{suffix}"
@@ -58,6 +73,11 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
             xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
         elif suffix == ".bag":
             write_bag(path, _HEIGHTS, (500000.0, 6000000.0), (1.0, 1.0))
+        elif suffix == ".tif":
+            shape = {"width": 20, "height": 24, "count": 1, "dtype": "float64", "crs": "EPSG:32633"}
+            place = rasterio.Affine(1, 0, 500000, 0, -1, 6000024)
+            with rasterio.open(path, "w", driver="GTiff", transform=place, **shape) as file:
+                file.write(_HEIGHTS[::-1], 1)
         elif suffix == ".xyz":
             places = np.random.default_rng(0).uniform(0, 20, (200, 2))
             rows = (f"{x:.2f} {y:.2f} {0.1 * np.sin(y):.3f}" for x, y in places)

@@ -23,7 +23,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[1]
 
 #: Extras that quick tests need, or try where they are installed.
-EXTRAS = ("geo", "movie", "test")
+EXTRAS = ("movie", "test")
 
 
 def requirements(*extras):

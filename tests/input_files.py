@@ -402,7 +402,9 @@ KINDS = {
     "trajectory_sbet": Kind(sbet, follow(kind="sbet", epsg=32633)),
     "table_of_runs": Kind(table_of_runs, plan_table, "text"),
     "store": Kind(store, read_store),
-    **{f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc", ".bag")},
+    **{
+        f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc", ".tif", ".bag")
+    },
     "map.xyz": Kind(height_map(".xyz"), load_map, "text"),
     "map.asc": Kind(height_map(".asc"), load_map, "text"),
     "profile": Kind(written("a.csv", _PROFILE), load_plugin(type="layered_water", profile="FILE"), "text"),

@@ -1,7 +1,4 @@
-"""Reading of arrays from files; damaged files are reported as invalid user input.
-
-Formats are .npy, .npz, OpenEXR, NetCDF-4, ESRI ASCII grid and GeoTIFF.
-"""
+"""Reading of arrays from files (.npy, .npz, OpenEXR, NetCDF-4); damaged files are reported as invalid user input."""
 
 from __future__ import annotations
 
@@ -18,15 +15,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
-from mitransient_lidar.core.files import check_regular, is_there, open_file, read_text
-from mitransient_lidar.core.validation import integer, positive, usable_memory
+from mitransient_lidar.core.files import check_regular, open_file
+from mitransient_lidar.core.validation import usable_memory
 
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
 LARGEST_ARRAY = 2**28
 
 EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
-
-_METRES = ("m", "metre", "metres", "meter", "meters")
 
 Array = npt.NDArray[Any]
 
@@ -37,15 +32,12 @@ class Variable(NamedTuple):
     dims: tuple[str, ...]  #: Names of its dimensions.
     values: Array
     is_coordinate: bool
-    units: str  #: Its attribute ``units``, "" if it has none.
+    attributes: dict[str, Any]  #: Among them ``_FillValue`` and ``missing_value``, which are NaN in the values.
 
-
-class Grid(NamedTuple):
-    """Raster in map coordinates."""
-
-    values: npt.NDArray[np.float64]  #: Shape (rows, columns) of increasing y and x; NaN where there is no value.
-    first: tuple[float, float]  #: Position x, y of the centre of the cell in row 0 and column 0 [m].
-    cell: tuple[float, float]  #: Size of the cells along x and y [m].
+    @property
+    def units(self) -> str:
+        """Its attribute ``units``, "" if it has none."""
+        return str(self.attributes.get("units", ""))
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
@@ -188,106 +180,7 @@ def read_netcdf(path: Path) -> dict[str, Variable]:
             dims=tuple(map(str, variable.dims)),
             values=variable.values,
             is_coordinate=name in dataset.coords,
-            units=str(variable.attrs.get("units", "")),
+            attributes={**variable.encoding, **variable.attrs},
         )
         for name, variable in dataset.variables.items()
     }
-
-
-def read_ascii_grid(path: Path) -> Grid:
-    """Read an ESRI ASCII grid: a header of names and numbers, and rows of cells from the largest y down.
-
-    Header (ESRI, "ASCII raster format"): ncols, nrows, xllcorner or xllcenter, yllcorner or yllcenter, cellsize or dx
-    and dy [m], and nodata_value, by default -9999. A file of the same name that ends in .prj may describe the
-    coordinates; degrees are refused.
-    """
-    words = read_text(path, LARGEST_ARRAY).replace(",", ".").split()
-    length = next((i for i in range(0, len(words), 2) if not words[i][0].isalpha() or words[i].lower() == "nan"), 0)
-    try:
-        header = {words[i].lower(): float(words[i + 1]) for i in range(0, length, 2)}
-        values = np.array(words[length:], dtype=np.float64)
-    except ValueError as error:
-        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}.") from error
-    columns, rows = (integer(f"{path}: {name}", _entry(path, header, name), 1, 10**6) for name in ("ncols", "nrows"))
-    if values.size != columns * rows:
-        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
-    system = path.with_suffix(".prj")
-    if is_there(system) and _beginning(system).lstrip().startswith(b"GEOG"):
-        raise UserError(f"{path} has coordinates in degrees according to {system}: they must be projected, in metres.")
-    cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
-    positive(f"{path}: cellsize", min(cell))
-    first = [
-        header[f"{axis}llcorner"] + size / 2
-        if f"{axis}llcorner" in header
-        else _entry(path, header, f"{axis}llcenter", f"{axis}llcorner")
-        for axis, size in zip("xy", cell, strict=True)
-    ]
-    values[values == header.get("nodata_value", -9999.0)] = np.nan
-    return Grid(values.reshape(rows, columns)[::-1], (first[0], first[1]), cell)
-
-
-def _beginning(path: Path) -> bytes:
-    """Return the first bytes of a file."""
-    with open_file(path) as file:
-        return file.read(2**12)
-
-
-def _entry(path: Path, header: dict[str, float], *names: str) -> float:
-    """Return the first of these entries of a header."""
-    for name in names:
-        if np.isfinite(header.get(name, np.nan)):
-            return header[name]
-    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}.")
-
-
-def read_geotiff(path: Path) -> Grid:
-    """Read a GeoTIFF of one band, in projected coordinates [m] and with heights in metres."""
-    try:
-        import rasterio
-    except ImportError as error:
-        raise UserError(
-            f"cannot read {path}: GeoTIFF needs the extra geo, pip install 'mitransient-lidar[geo]'."
-        ) from error
-    # GDAL reads files beside it of the same name, such as .tfw and .tif.aux.xml.
-    for beside in path.parent.iterdir():
-        if beside.name.startswith(f"{path.stem}."):
-            check_regular(beside)
-    try:
-        with rasterio.open(path, driver="GTiff") as file:
-            _check_geotiff(path, file)
-            check_size(path, 8.0 * file.width * file.height)
-            masked, place = file.read(1, masked=True), file.transform
-            scale, offset = file.scales[0], file.offsets[0]
-    except rasterio.errors.NotGeoreferencedWarning as error:  # where warnings are errors
-        raise UserError(_without_coordinates(path)) from error
-    except rasterio.errors.RasterioError as error:
-        raise UserError(f"{path} is damaged, or is not a GeoTIFF.") from error
-    values = scale * masked.astype(np.float64).filled(np.nan) + offset
-    rows, columns = values.shape
-    x, y = place.c + place.a / 2, place.f + place.e / 2
-    if place.e < 0:
-        values, y = values[::-1], y + (rows - 1) * place.e
-    if place.a < 0:
-        values, x = values[:, ::-1], x + (columns - 1) * place.a
-    return Grid(values, (x, y), (abs(place.a), abs(place.e)))
-
-
-def _check_geotiff(path: Path, file: Any) -> None:
-    """Refuse rasters of several bands, without or with rotated map coordinates, and of other units than metres."""
-    place, system = file.transform, file.crs
-    if file.count != 1:
-        raise UserError(f"{path} has {file.count} bands: a height map must have one.")
-    if place.is_identity:
-        raise UserError(_without_coordinates(path))
-    if place.b != 0 or place.d != 0:
-        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
-    if system is not None and system.is_geographic:
-        raise UserError(f"{path} has coordinates in degrees ({system}): they must be projected, in metres.")
-    if system is not None and system.is_projected and system.linear_units_factor[1] != 1:
-        raise UserError(f"{path} has coordinates in {system.linear_units_factor[0]}: they must be in metres.")
-    if (file.units[0] or "m").lower() not in _METRES:
-        raise UserError(f"{path} has heights in {file.units[0]}: they must be in metres.")
-
-
-def _without_coordinates(path: Path) -> str:
-    return f"{path} has no map coordinates: a GeoTIFF must have them."

@@ -22,15 +22,32 @@ _SAME_WAVELENGTH = 0.05
 
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "⁻": "-", "¹": "1", "^": None, "*": None, "·": None})
 
-_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048}
+_METRIC = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "dm": 0.1}
 
-#: Metres, and their other names.
-METRES = {**_LENGTHS, **dict.fromkeys(("metre", "metres", "meter", "meters"), 1.0), "feet": 0.3048}
+#: The foot of US surveys, 2e-6 longer than the international one [m].
+_SURVEY_FOOT = 1200 / 3937
+
+#: Metres, and other units of length, in small letters without blanks and underscores.
+METRES = {
+    **_METRIC,
+    "ft": 0.3048,
+    "ftus": _SURVEY_FOOT,
+    "fathom": 1.8288,
+    **{
+        f"{prefix}{name}": length
+        for prefix, length in (("", 1.0), ("centi", 1e-2), ("milli", 1e-3), ("kilo", 1e3), ("deci", 0.1))
+        for name in ("metre", "metres", "meter", "meters")
+    },
+    **dict.fromkeys(("feet", "foot", "ift", "ftint", "internationalfoot", "internationalfeet"), 0.3048),
+    **dict.fromkeys(("usft", "us-ft", "sft", "ussurveyft", "footus", "feetus", "ussurveyfoot"), _SURVEY_FOOT),
+    **dict.fromkeys(("ussurveyfeet", "surveyfoot", "surveyfeet", "usfoot", "usfeet"), _SURVEY_FOOT),
+    **dict.fromkeys(("fathoms", "ftm", "fm"), 1.8288),
+}
 
 #: Units of coefficients, 1/m.
 PER_METRE = {
-    **{f"1/{unit}": 1 / length for unit, length in _LENGTHS.items() if unit != "ft"},
-    **{f"{unit}-1": 1 / length for unit, length in _LENGTHS.items() if unit != "ft"},
+    **{f"1/{unit}": 1 / length for unit, length in _METRIC.items()},
+    **{f"{unit}-1": 1 / length for unit, length in _METRIC.items()},
     "/m": 1.0,
     "perm": 1.0,
 }
@@ -131,6 +148,40 @@ def read_headings(
     if others:
         logger.info("%s: columns %s are not used", path, ", ".join(others))
     return used
+
+
+def pick_columns(
+    path: str | PathLike[str], names: Sequence[str], groups: Sequence[Sequence[Column]]
+) -> list[tuple[int, Heading]]:
+    """Return the index and the meaning of the one heading of each group of columns; other headings do not matter.
+
+    A name with words that are no unit, such as ``depth_uncertainty``, is another heading; in brackets they are a unit.
+
+    Raises
+    ------
+    UserError
+        If a group has no heading, several, or only some in an unknown unit.
+    """
+    columns = [column for group in groups for column in group]
+    headings = [parse_heading(name, columns) for name in names]
+    picked = []
+    for group in groups:
+        named = [(i, heading) for i, heading in enumerate(headings) if heading and heading.column in group]
+        known = [(i, heading) for i, heading in named if heading.known_unit]
+        wanted = " or ".join(column.name for column in group)
+        if len(known) > 1:
+            same = " and ".join(names[i] for i, _ in known)
+            raise UserError(f"{path} has {len(known)} columns {same} that may be {wanted}: allowed is one.")
+        for i, _ in named if not known else ():
+            if re.search(r"[\[(/]", names[i]):
+                raise UserError(f"{path} has an unknown unit in column {names[i]!r} {_found_and_allowed(names, group)}")
+        if not known:
+            raise UserError(f"{path} has no column {wanted} {_found_and_allowed(names, columns)}")
+        picked += known
+    others = [name for i, name in enumerate(names) if name and i not in dict(picked)]
+    if others:
+        logger.info("%s: columns %s are not used", path, ", ".join(others))
+    return picked
 
 
 def _is_one_of(name: str, others: Collection[str]) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import logging
 import re
 from collections import Counter
@@ -26,7 +28,8 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-_MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---"})
+#: Words for a missing value, in small letters: those of pandas, and dashes.
+MISSING = frozenset({"", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#na", "null", "none", "-", "--", "---"})
 
 #: Values that instruments write for missing ones.
 _FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
@@ -43,8 +46,8 @@ _LONGEST_HEAD = 2**16
 #: Times [ns] without a unit that span less are probably seconds.
 _SHORTEST_RECORD = 1e-3
 
-_COMMENT = re.compile(r"(#(?!N/A)|%|//|!)[#%/!]*\s*")
-_INLINE_COMMENT = re.compile(r"#(?!N/A).*")
+_COMMENT = re.compile(r"(#(?!N/?A)|%|//|!)[#%/!]*\s*")
+_INLINE_COMMENT = re.compile(r"#(?!N/?A).*")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 #: Blanks in a heading that do not stand before a unit.
@@ -59,13 +62,14 @@ class Table(NamedTuple):
     without_unit: frozenset[str]  #: Names of the columns whose unit is not given.
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """Line of a file that is not empty."""
 
     number: int
     text: str  #: Without the mark of a comment.
     separator: str  #: Semicolon, tab, comma, or empty for blanks.
-    cells: list[str]
+    cells: list[str]  #: Numbers with a decimal point.
+    has_decimal_commas: bool
 
     def heading(self, width: int) -> list[str]:
         """Return the cells; names with blanks inside are joined if that makes their number `width`."""
@@ -109,7 +113,10 @@ def read_table(
         If the file cannot be read or is not text; a name, unit or wavelength is unknown, or a column is there twice; or
         a line does not hold one number for each column.
     """
-    lines, comments = _read_lines(path)
+    text = read_text(path)
+    if (count := text.count("\n")) > _MOST_LINES:
+        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}.")
+    lines, comments = split_lines(text)
     width = _width(lines)
     start = next((i for i, line in enumerate(lines) if len(line.cells) == width and _is_row(line)), len(lines))
     names, start = _find_heading(lines, comments, start, width, columns)
@@ -128,6 +135,26 @@ def read_table(
         [rows[row].number for row in kept],
         frozenset(heading.column.name for heading in headings if heading is not None and not heading.unit),
     )
+
+
+def find_rows(
+    path: str | PathLike[str], text: str, columns: Sequence[Column], others: Sequence[Column], names: list[str]
+) -> tuple[list[str], list[Line]]:
+    """Return the names of the heading of the beginning of a table, and its rows.
+
+    A heading, whose names are `names` if they are given elsewhere, has two or more of `columns` and `others`, and any
+    further ones. Without one, the names are empty, and the first columns are `columns`.
+    """
+    lines, comments = split_lines(text)
+    width = _width(lines)
+    start = next((i for i, line in enumerate(lines) if len(line.cells) == width and _is_mostly_numbers(line)), 0)
+    if not names:
+        names, start = _find_heading(lines, comments, start, width, (*columns, *others))
+        if names:
+            names, start = _with_units(names, lines, start, (*columns, *others))
+        else:
+            start = _without_heading(path, lines, start, width, columns, True)
+    return names, lines[start:]
 
 
 def read_two_columns(path: str | PathLike[str], first: Column, second: Column) -> Table:
@@ -166,51 +193,61 @@ def complete_rows(path: str | PathLike[str], columns: Mapping[str, FloatArray], 
     return np.flatnonzero(~missing)
 
 
-def _read_lines(path: str | PathLike[str]) -> tuple[list[_Line], list[_Line]]:
-    """Return the lines of a file, and its comments."""
-    text = read_text(path)
-    if (count := text.count("\n")) > _MOST_LINES:
-        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}.")
-    lines: list[_Line] = []
-    comments: list[_Line] = []
+def split_lines(text: str) -> tuple[list[Line], list[Line]]:
+    """Return the lines of a text that are not empty, and its comments."""
+    lines: list[Line] = []
+    comments: list[Line] = []
     for number, line in enumerate(text.splitlines(), start=1):
         mark = _COMMENT.match(line)
         content = line[mark.end() :] if mark else _INLINE_COMMENT.sub("", line)
         if content.strip(" \t,;"):
-            (comments if mark else lines).append(_split(number, content.strip(" ")))
+            (comments if mark else lines).append(split_line(number, content.strip(" ")))
     return lines, comments
 
 
-def _split(number: int, text: str) -> _Line:
+def split_line(number: int, text: str) -> Line:
     """Split a line into cells."""
     has_tab = "\t" in text
-    # Next to a tab or blank a comma separates; inside a number between tabs it is the decimal point.
-    has_comma = re.search(r",(\s|$)|\s,", text) if has_tab else "," in text
+    # Next to a tab or blank a comma separates; inside a number between tabs or blanks it is the decimal point.
+    has_comma = re.search(r",(\s|$)|\s,", text) if has_tab else "," in text and not _has_decimal_commas(text)
     separator = ";" if ";" in text else "," if has_comma else "\t" if has_tab else ""
-    cells = [cell.strip(" \t\"'") for cell in (text.split(separator) if separator else text.split())]
-    if separator in (";", "\t"):
-        cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
-    return _Line(number, text, separator, cells)
+    cells = text.split(separator or None)
+    if separator and '"' in text:
+        with contextlib.suppress(csv.Error):
+            cells = next(csv.reader([text], delimiter=separator))
+    cells = [cell.strip(" \t\"'") for cell in cells]
+    # Between commas, only a cell in quotation marks has one.
+    numbers = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+    return Line(number, text, separator, numbers, numbers != cells)
 
 
-def _width(lines: Sequence[_Line]) -> int:
+def _has_decimal_commas(text: str) -> bool:
+    """Return whether the cells between blanks, more than one, are numbers of which some have a decimal comma."""
+    cells = text.split()
+    numbers = [_number(cell) is not None or _DECIMAL_COMMA.fullmatch(cell) is not None for cell in cells]
+    return len(cells) > 1 and all(numbers)
+
+
+def _width(lines: Sequence[Line]) -> int:
     """Return the most common number of cells in lines that hold mostly numbers, 0 if there are none."""
-    counts: Counter[int] = Counter()
-    for line in lines[:_LINES_FOR_WIDTH]:
-        numbers = sum(_number(cell) is not None for cell in line.cells)
-        missing = sum(cell.lower() in _MISSING for cell in line.cells) if numbers < len(line.cells) else 0
-        if numbers > 0 and 2 * (numbers + missing) > len(line.cells):
-            counts[len(line.cells)] += 1
+    counts = Counter(len(line.cells) for line in lines[:_LINES_FOR_WIDTH] if _is_mostly_numbers(line))
     return counts.most_common(1)[0][0] if counts else 0
 
 
-def _is_row(line: _Line) -> bool:
+def _is_mostly_numbers(line: Line) -> bool:
+    """Return whether more than half of the cells are numbers or missing values, and not all of them missing."""
+    numbers = sum(_number(cell) is not None for cell in line.cells)
+    missing = sum(cell.lower() in MISSING for cell in line.cells) if numbers < len(line.cells) else 0
+    return numbers > 0 and 2 * (numbers + missing) > len(line.cells)
+
+
+def _is_row(line: Line) -> bool:
     """Return whether all cells are numbers or missing values, and not all of them missing."""
-    return all(map(_is_number, line.cells)) and any(_number(cell) is not None for cell in line.cells)
+    return all(map(is_number_or_missing, line.cells)) and any(_number(cell) is not None for cell in line.cells)
 
 
 def _find_heading(
-    lines: Sequence[_Line], comments: Sequence[_Line], start: int, width: int, columns: Sequence[Column]
+    lines: Sequence[Line], comments: Sequence[Line], start: int, width: int, columns: Sequence[Column]
 ) -> tuple[list[str], int]:
     """Return the names of the heading and the index of the line below it; no names and `start` if there is none."""
     searched = 0
@@ -219,11 +256,15 @@ def _find_heading(
             break
         names = line.heading(width)
         known = sum(parse_heading(name, columns) is not None for name in names)
-        if known > 1 and (len(names) in (width, known) or not width) and not any(map(_is_number, filter(None, names))):
+        if (
+            known > 1
+            and (len(names) in (width, known) or not width)
+            and not any(map(is_number_or_missing, filter(None, names)))
+        ):
             return names, i + 1
     for line in comments:
         names = line.heading(width)
-        if len(names) == width > 1 and all(parse_heading(name, columns) for name in names):
+        if len(names) == width > 1 and sum(parse_heading(name, columns) is not None for name in names) > 1:
             below = sum(other.number < line.number for other in lines)
             if below <= start:
                 return names, below
@@ -231,11 +272,11 @@ def _find_heading(
 
 
 def _with_units(
-    names: list[str], lines: Sequence[_Line], start: int, columns: Sequence[Column]
+    names: list[str], lines: Sequence[Line], start: int, columns: Sequence[Column]
 ) -> tuple[list[str], int]:
     """Return the names with the units of the line below them, and the index of the first row."""
     cells = lines[start].cells if start < len(lines) else []
-    if len(cells) != len(names) or all(map(_is_number, cells)):
+    if len(cells) != len(names) or all(map(is_number_or_missing, cells)):
         return names, start
     named = [(name, parse_heading(name, columns), cell) for name, cell in zip(names, cells, strict=True)]
     if not all(is_unit(cell, heading.column) for _, heading, cell in named if heading):
@@ -246,7 +287,7 @@ def _with_units(
 
 def _without_heading(
     path: str | PathLike[str],
-    lines: Sequence[_Line],
+    lines: Sequence[Line],
     start: int,
     width: int,
     columns: Sequence[Column],
@@ -269,7 +310,7 @@ def _without_heading(
 
 
 def _values(
-    path: str | PathLike[str], rows: Sequence[_Line], names: Sequence[str], headings: Sequence[Heading | None]
+    path: str | PathLike[str], rows: Sequence[Line], names: Sequence[str], headings: Sequence[Heading | None]
 ) -> dict[str, FloatArray]:
     """Return the values of each column in its first unit, NaN where one is missing."""
     for line in rows:
@@ -287,7 +328,7 @@ def _values(
                 number = _number(line.cells[i])
                 if number is not None:
                     column[row] = number
-                elif not _is_number(line.cells[i]):
+                elif not is_number_or_missing(line.cells[i]):
                     raise _invalid_line(path, line, names, headings, i) from None
         if heading.column.fill_values:
             column[np.isin(column, _FILL_VALUES)] = np.nan
@@ -297,7 +338,7 @@ def _values(
 
 def _invalid_line(
     path: str | PathLike[str],
-    line: _Line,
+    line: Line,
     names: Sequence[str],
     headings: Sequence[Heading | None],
     column: int | None,
@@ -326,5 +367,6 @@ def _number(cell: str) -> float | None:
         return None
 
 
-def _is_number(cell: str) -> bool:
-    return cell.lower() in _MISSING or _number(cell) is not None
+def is_number_or_missing(cell: str) -> bool:
+    """Return whether a cell of a table is a number, or stands for a missing one."""
+    return cell.lower() in MISSING or _number(cell) is not None

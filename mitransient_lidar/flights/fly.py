@@ -77,7 +77,7 @@ def fly(
     else:
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
     folder = Path(folder)
-    coordinate_system_wkt(plan.crs)
+    coordinate_system_wkt(plan.crs, plan.origin[:2])
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size), workers, scheduler, False, progress)
     flown = Flown.of(store)
     points = points_of(flown, plan)

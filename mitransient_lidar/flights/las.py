@@ -70,14 +70,14 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
     Raises
     ------
     UserError
-        If the suffix or the coordinate system is unknown, pyproj is missing, there is no point or more than 2^32 - 1, a
+        If the suffix or the coordinate system is unknown or unsuitable, there is no point or more than 2^32 - 1, a
         coordinate is not finite or farther than 2147 km from the first point, or another value is out of range.
     WriteError
         If the operating system reports an error.
     """
     path = _checked(path, ".las", ".laz")
-    wkt = coordinate_system_wkt(crs)
     first, chunks = _first(points)
+    wkt = coordinate_system_wkt(crs, _place(first))
     with replacing(path) as temporary:
         return _write(temporary, las_header(6, _place(first), wkt, _notes(first)), ((chunk, {}) for chunk in chunks))
 
@@ -112,8 +112,8 @@ def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chu
         If the operating system reports an error.
     """
     path = _checked(path, ".las")
-    wkt = coordinate_system_wkt(crs)
     (first, chunks), (first_waveforms, packets) = _first(points), _first(waveforms)
+    wkt = coordinate_system_wkt(crs, _place(first))
     with together(), replacing(path) as las, replacing(path.with_suffix(".wdp")) as wdp, open(wdp, "wb") as file:
         writer = PacketWriter(file, first_waveforms)
         header = las_header(9, _place(first), wkt, _notes(first), writer.descriptor)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from mitransient_lidar._version import __version__
+from mitransient_lidar.core.coordinate_systems import map_system, parsed_system
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ EXTRA_BYTES = (
 )
 
 
-def coordinate_system_wkt(crs: str | None) -> str:
+def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = None) -> str:
     """Return a coordinate system as the WKT of OGC's specification of 2001, which LAS 1.4 asks for.
 
     Parameters
@@ -53,25 +54,24 @@ def coordinate_system_wkt(crs: str | None) -> str:
     crs : str or None
         What pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the frame
         of the scene, an engineering system in metres with x east, y north, z up.
+    place : (float, float), optional
+        Point x, y [m] at which its metres must be those on the ground.
 
     Raises
     ------
     UserError
-        If pyproj is missing, the system is unknown, has no such WKT, or is not a projected one in metres.
+        If the system is unknown, has no such WKT, is not a projected one in metres to east and north, or has another
+        scale than the ground.
     """
     if crs is None:
         return SCENE_WKT
-    try:
-        import pyproj
-    except ImportError:
-        raise UserError(f"crs = {crs!r} needs pyproj: install it by pip install 'mitransient-lidar[geo]'") from None
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-        wkt = str(system.to_wkt("WKT1_GDAL") or "")
-    except pyproj.exceptions.CRSError:
-        raise UserError(f"crs = {crs!r} is no coordinate system that pyproj knows, such as EPSG:32633") from None
-    if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info) or not wkt:
+    system = parsed_system("crs", crs)
+    horizontal = map_system(f"crs = {crs!r}", system)
+    wkt = str(system.to_wkt("WKT1_GDAL") or "")
+    if any(axis.unit_name != "metre" for axis in system.axis_info) or not wkt:
         raise UserError(f"crs = {crs!r} must be a projected coordinate system in metres, such as EPSG:32633")
+    if place is not None:
+        horizontal.check_scale(f"crs = {crs!r}", *place)
     return wkt
 
 

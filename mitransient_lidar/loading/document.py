@@ -26,6 +26,9 @@ _MOST_FILES = 256
 #: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
 DEEPEST_NESTING = 64
 
+#: Stands for a dollar sign that is part of a value in what Mitsuba parses, which takes every other one for a parameter.
+DOLLAR = "\ue024"
+
 #: Most characters of an attribute with the values of parameters in place.
 _LONGEST_TEXT = 10**6
 
@@ -86,13 +89,20 @@ class SceneDocument:
 
     @cached_property
     def settings(self) -> list[Setting]:
-        """Attributes of all elements but ``<default>``, with the values of parameters in place."""
-        found = []
+        """Attributes of all elements but ``<default>``, with the values of parameters in place.
+
+        Defaults may refer to other parameters; other values are taken as they are.
+        """
+        found, defaults = [], parameters_of(self.root)
+        values = {
+            name: value if value == defaults.get(name) else value.replace("$", DOLLAR)
+            for name, value in self.parameters.items()
+        }
         for element in self.root.getElementsByTagName("*"):
             if element.tagName != "default":
                 for attribute, template in element.attributes.items():
-                    value, referred = _resolved(template, self.parameters)
-                    found.append(Setting(element, attribute, template, value, tuple(referred)))
+                    value, referred = _resolved(template, values)
+                    found.append(Setting(element, attribute, template, value.replace(DOLLAR, "$"), tuple(referred)))
         return found
 
     @cached_property
@@ -129,7 +139,7 @@ class SceneDocument:
         _refuse_includes(self.root, self.name)
         values: dict[int, list[str]] = {}
         for setting in self.settings:
-            pair = f" {setting.attribute}={quoteattr(replaced(setting))}"
+            pair = f" {setting.attribute}={quoteattr(replaced(setting).replace('$', DOLLAR))}"
             values.setdefault(id(setting.element), []).append(pair)
 
         def written(node: minidom.Node) -> str:

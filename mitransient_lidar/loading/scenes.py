@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_o
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
-from mitransient_lidar.loading.document import SceneDocument, read_document
+from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
@@ -123,7 +123,7 @@ def _load_xml(
     record = SceneRecord.of_document(document, former)
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
-        loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
+        loaded = _instantiate(lambda config: _with_dollars(mi.parser.parse_string(config, text)))
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, dict(document.parameters), record)
@@ -159,6 +159,18 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     return mi.parser.instantiate(config, parsed)
 
 
+def _with_dollars(parsed: Any) -> Any:
+    """Return a scene that is parsed, with dollar signs in its texts in place of `DOLLAR`."""
+    for node in parsed.nodes:
+        for name in list(node.props.keys()):
+            value = node.props[name]
+            if isinstance(value, str) and DOLLAR in value:
+                node.props[name] = value.replace(DOLLAR, "$")
+            # Mitsuba refuses parameters that no plugin has read.
+            node.props.mark_queried(name, False)
+    return parsed
+
+
 @contextlib.contextmanager
 def _own_file_resolver(folder: Path | None = None) -> Iterator[None]:
     """Add a folder to those in which Mitsuba looks for files; remove it, and those of ``<path>``, afterwards."""
@@ -192,6 +204,7 @@ def as_user_error(document: SceneDocument | None = None) -> Iterator[None]:
             raise KeyboardInterrupt from error
         raise_if_out_of_memory(error)
         text = error.object.decode("utf-8", "replace") if isinstance(error, UnicodeDecodeError) else str(error)
+        text = text.replace(DOLLAR, "$")
         if wrapped := re.findall(r"UserError: (.*)", text):
             message = " ".join(wrapped[-1].split())
             raise UserError(message + _set_by(message, document)) from error

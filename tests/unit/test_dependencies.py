@@ -33,10 +33,10 @@ def imported(*folders):
 
 
 def test_the_package_imports_what_it_declares_and_nothing_else():
-    assert imported("mitransient_lidar", "plugins", "scenes") == declared("geo", "movie") - NOT_IMPORTED
+    assert imported("mitransient_lidar", "plugins", "scenes") == declared("movie") - NOT_IMPORTED
 
 
 def test_the_tests_import_what_their_extra_declares_and_nothing_else():
     found = imported("tests")
-    assert found <= declared("geo", "movie", "test") | OPTIONAL
+    assert found <= declared("movie", "test") | OPTIONAL
     assert declared("test") - declared() - found - declared("movie") == NOT_IMPORTED - declared()

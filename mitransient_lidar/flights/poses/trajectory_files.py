@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+import math
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mitransient_lidar.core.array_files import check_size
+from mitransient_lidar.core.coordinate_systems import (
+    LARGEST_DISTORTION,
+    distortions,
+    is_east_north,
+    parsed_system,
+)
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import open_file, read_text
-from mitransient_lidar.core.validation import FloatArray, integer, is_number
+from mitransient_lidar.core.files import open_file
+from mitransient_lidar.core.headings import METRES, Column, Heading, read_headings
+from mitransient_lidar.core.long_tables import read_head, read_long_table
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
 
-#: Columns of a text file, in the order that holds without a heading, and what a heading may call them.
-_COLUMNS = {
-    "t": ("t", "time", "time_s", "gps_time"),
-    "roll": ("roll", "roll_deg"),
-    "pitch": ("pitch", "pitch_deg"),
-    "yaw": ("yaw", "yaw_deg", "heading", "heading_deg"),
-    "x": ("x", "x_m", "easting"),
-    "y": ("y", "y_m", "northing"),
-    "z": ("z", "z_m", "height"),
-}
+_SECONDS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}
+_DEGREES = {"deg": 1.0, "degree": 1.0, "degrees": 1.0, "°": 1.0, "rad": math.degrees(1.0)}
 
-#: Largest text file [bytes]: four million records.
-_LARGEST_TEXT = 2**28
+#: Columns of a text file, in the order that holds without a heading.
+_COLUMNS = (
+    Column("t", ("time", "gps time"), _SECONDS),
+    Column("roll", (), _DEGREES),
+    Column("pitch", (), _DEGREES),
+    Column("yaw", ("heading",), _DEGREES),
+    Column("x", ("easting",), METRES),
+    Column("y", ("northing",), METRES),
+    Column("z", ("height",), METRES),
+)
 
 #: Numbers of a record of an SBET file, and the largest file [bytes]: eleven hours of 200 records a second.
 _SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
@@ -35,62 +43,51 @@ _SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
 #: Largest code of a coordinate system.
 _LARGEST_EPSG = 10**6
 
-#: Step that gives the direction of a meridian in a projection [deg], about a metre.
-_STEP = 1e-5
-
-#: Length of a degree of a meridian [m], within 0.6 %.
-_METRES_PER_DEGREE = 111_130.0
-
-#: Largest difference of the scale of a grid from 1: no UTM zone has it, but Mercator's projection beyond 18 degrees.
-_LARGEST_DISTORTION = 0.05
-
 
 def read_text_records(path: str | os.PathLike[str]) -> TrajectoryRecords:
     """Read a trajectory from a text file as HELIOS++ does.
 
-    Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], separated by commas, semicolons, tabs or
-    blanks. Another order is given by the names of the columns, in a line ``#HEADER: "t", "x", ...`` or in a first line
-    without numbers; ``#TIME_COLUMN: 0`` names the column of the time by its index from 0. Other lines that begin with #
-    are comments. Unlike HELIOS++, which sorts records, this function refuses times that go back.
+    Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], as `core.long_tables.read_long_table` reads
+    it. Another order is given by the names of the columns, with units or without, in a line
+    ``#HEADER: "t", "x", ...`` or in a first line without numbers; ``#TIME_COLUMN: 0`` names the column of the time by
+    its index from 0. Unlike HELIOS++, which sorts records, this function refuses times that go back.
 
     Raises
     ------
     UserError
-        If the file cannot be read, a column is unknown or missing, or a line does not hold one finite number for each
-        column at a time later than that of the line before.
+        If the file cannot be read, a column or its unit is unknown, a column is missing, or a line does not hold one
+        finite number for each column at a time later than the time of the line before.
     """
-    names: list[str] = []
-    time_column: int | None = None
-    rows: list[tuple[int, list[str]]] = []
-    for number, line in enumerate(read_text(path, _LARGEST_TEXT).splitlines(), start=1):
-        text = line.strip()
-        if text.startswith("#"):
-            key, _, value = text[1:].partition(":")
-            if key.strip() == "HEADER":
-                names = _cells(value)
-            elif key.strip() == "TIME_COLUMN":
-                time_column = integer(f"{path}: TIME_COLUMN", int(value) if value.strip().isdecimal() else value, 0, 6)
-        elif text:
-            rows.append((number, _cells(text)))
-    if not names and rows and not any(map(is_number, rows[0][1])):
-        names = rows.pop(0)[1]
-    order = _order(path, names, time_column)
-    values = np.empty((len(rows), len(order)))
-    for row, (number, cells) in enumerate(rows):
-        if len(cells) != len(order) or not all(map(is_number, cells)):
+    path = Path(path)
+    head = {}
+    for line in read_head(path).splitlines():
+        key, colon, value = line.strip().lstrip("#").partition(":")
+        if colon and line.startswith("#"):
+            head[key.strip()] = value.strip()
+    time_column = None
+    if (given := head.get("TIME_COLUMN")) is not None:
+        time_column = integer(f"{path}: TIME_COLUMN", int(given) if given.isdecimal() else given, 0, len(_COLUMNS) - 1)
+
+    def choose(names: list[str]) -> list[tuple[int, Heading]]:
+        if not names:
+            order = [*range(1, len(_COLUMNS))]
+            order.insert(time_column or 0, 0)
+            return [(order.index(i), Heading(column, "", 0.0)) for i, column in enumerate(_COLUMNS)]
+        if time_column is not None and time_column < len(names):
+            names[time_column] = "t"
+        headings = {one.column.name: (i, one) for i, one in enumerate(read_headings(path, names, _COLUMNS)) if one}
+        if missing := [column.name for column in _COLUMNS if column.name not in headings]:
             raise UserError(
-                f"{path}, line {number}: {', '.join(cells)[:80]!r} must be {len(order)} numbers, {', '.join(order)}"
+                f"{path} has the columns {', '.join(names)}: it must have {', '.join(missing)}, and each of "
+                f"{', '.join(column.name for column in _COLUMNS)} once"
             )
-        values[row] = [float(cell) for cell in cells]
-    columns = {name: values[:, index] for index, name in enumerate(order)}
-    records = TrajectoryRecords(
-        columns["t"],
-        np.column_stack([columns[name] for name in "xyz"]),
-        columns["roll"],
-        columns["pitch"],
-        columns["yaw"],
-    )
-    check_records(records, str(path), lambda row: f"{path}, line {rows[row][0]}")
+        return [headings[column.name] for column in _COLUMNS]
+
+    names = [name.strip(" \"'") for name in head.get("HEADER", "").split(",")] if "HEADER" in head else []
+    table = read_long_table(path, _COLUMNS, (), choose, names)
+    time, roll, pitch, yaw, *position = (table.values * [heading.factor for heading in table.headings]).T
+    records = TrajectoryRecords(time, np.column_stack(position), roll, pitch, yaw)
+    check_records(records, str(path), lambda row: f"{path}, line {table.line(row)}")
     return records
 
 
@@ -109,15 +106,17 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
     epsg
         EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east and y north on the
         grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM 0.9996 to
-        1.001, which may differ from 1 by 5 %.
+        1.001, which may differ from 1 by 1 %.
 
     Raises
     ------
     UserError
         If the file cannot be read or has more than 1 GiB; its size is no multiple of 136 bytes; a record is not finite,
-        not on the Earth, or not later than the one before; the coordinate system is unknown, has no metres, or has
-        another scale there; or pyproj is missing.
+        not on the Earth, or not later than the one before; or the coordinate system is unknown, has no metres, or has
+        another scale there.
     """
+    import pyproj
+
     path = Path(path)
     width = 8 * _SBET_NUMBERS
     with open_file(path) as file:
@@ -140,69 +139,23 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
             f"{place(row)}: latitude = {latitude[row]:g} and longitude = {longitude[row]:g} must be radians, up to"
             " pi / 2 and 2 pi"
         )
-    x, y, north, scale = _projected(np.degrees(longitude), np.degrees(latitude), epsg)
-    for row in np.flatnonzero(~(np.abs(scale - 1) < _LARGEST_DISTORTION))[:1]:
+    system = _system(epsg)
+    places = np.degrees(longitude), np.degrees(latitude)
+    x, y = pyproj.Transformer.from_crs(4326, system, always_xy=True).transform(*places)
+    north, scale = distortions(system, *places)
+    for row in np.flatnonzero(~(np.abs(scale - 1) < LARGEST_DISTORTION))[:1]:
         raise UserError(
             f"{place(row)}: latitude = {np.degrees(latitude[row]):g} and longitude = {np.degrees(longitude[row]):g} deg"
-            f" must lie where a metre is a metre within 5 % in epsg = {epsg}; its scale there is {scale[row]:.3g}"
+            f" must lie where a metre is a metre within {LARGEST_DISTORTION:.0%} in epsg = {epsg}; its scale there is "
+            f"{scale[row]:.3g}"
         )
     return TrajectoryRecords(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
 
 
-def _projected(
-    longitude: FloatArray, latitude: FloatArray, epsg: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x and y [m] of points [deg], the azimuth of true north from grid north [deg], and the scale."""
-    project = _projection(epsg)
-    x, y = project(longitude, latitude)
-    north, south = np.minimum(latitude + _STEP, 90.0), np.maximum(latitude - _STEP, -90.0)
-    (north_x, north_y), (south_x, south_y) = project(longitude, north), project(longitude, south)
-    with np.errstate(invalid="ignore"):
-        along_x, along_y = north_x - south_x, north_y - south_y
-    scale = np.hypot(along_x, along_y) / (_METRES_PER_DEGREE * (north - south))
-    return x, y, np.degrees(np.arctan2(along_x, along_y)), scale
-
-
-def _projection(epsg: int) -> Any:
-    """Return the function from longitude and latitude [deg] of WGS 84 to x and y [m]."""
-    code = integer("epsg", epsg, 1, _LARGEST_EPSG)
-    try:
-        import pyproj
-    except ImportError:
-        raise UserError("SBET files need pyproj: install it by pip install 'mitransient-lidar[geo]'") from None
-    try:
-        system = pyproj.CRS.from_epsg(code)
-    except pyproj.exceptions.CRSError:
-        raise UserError(f"epsg = {code} is no coordinate system that pyproj knows") from None
-    # x east and y north, or along two meridians near a pole, so that headings turn clockwise on the grid as well.
-    directions = sorted(axis.direction for axis in system.axis_info[:2])
-    if (
-        not system.is_projected
-        or directions not in (["east", "north"], ["north", "north"], ["south", "south"])
-        or any(axis.unit_conversion_factor != 1 for axis in system.axis_info[:2])
-    ):
-        raise UserError(f"epsg = {code} ({system.name}) must be projected coordinates in metres, east and north")
-    return pyproj.Transformer.from_crs(4326, system, always_xy=True).transform
-
-
-def _cells(line: str) -> list[str]:
-    """Split a line at commas, semicolons, tabs or blanks, and remove quotation marks."""
-    separator = next((one for one in ",;\t" if one in line), None)
-    return [cell.strip().strip("\"'") for cell in line.split(separator)]
-
-
-def _order(path: str | os.PathLike[str], names: list[str], time_column: int | None) -> list[str]:
-    """Return the names of the columns of a file, in its order."""
-    given = names or [name for name in _COLUMNS if time_column is None or name != "t"]
-    if time_column is not None:
-        given = [*given[:time_column], "t", *given[time_column + bool(names) :]]
-    order = []
-    for name in given:
-        word = re.sub(r"[\s(\[]+", "_", name.strip().lower()).rstrip(")]")
-        known = next((key for key, aliases in _COLUMNS.items() if word in aliases), None)
-        if known is None:
-            raise UserError(f"{path} has an unknown column {name!r}: allowed are {', '.join(_COLUMNS)}")
-        order.append(known)
-    if sorted(order) != sorted(_COLUMNS):
-        raise UserError(f"{path} has the columns {', '.join(order)}: it must have each of {', '.join(_COLUMNS)} once")
-    return order
+def _system(epsg: int) -> Any:
+    """Return projected coordinates in metres by their EPSG code."""
+    system = parsed_system("epsg", integer("epsg", epsg, 1, _LARGEST_EPSG))
+    metric = all(axis.unit_conversion_factor == 1 for axis in system.axis_info[:2])
+    if not (system.is_projected and metric and is_east_north(system)):
+        raise UserError(f"epsg = {epsg} ({system.name}) must be projected coordinates in metres, east and north")
+    return system

@@ -10,36 +10,22 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import (
-    Array,
-    Grid,
-    check_size,
-    read_ascii_grid,
-    read_exr,
-    read_geotiff,
-    read_netcdf,
-    read_npy,
-    read_npz,
-    readable_suffix,
-)
+from mitransient_lidar.core.array_files import Array, read_exr, read_npy, read_npz, readable_suffix
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.survey_files import read_bag, read_points
+from mitransient_lidar.core.grids import Grid, Stated, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
+from mitransient_lidar.physics.sea.height_units import check_positions, described, heights_in_metres, position_unit
+from mitransient_lidar.physics.sea.netcdf_heights import read_netcdf_heights
+from mitransient_lidar.physics.sea.point_grids import UNEVENNESS, grid_of_points, read_points
 
 logger = logging.getLogger(__name__)
 
-#: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
-_UNEVENNESS = 1e-3
+_Contents = tuple[Array, dict[str, Array], Stated]
+"""Heights, positions by the names x and y as far as the file has them, and what it states of both."""
 
-#: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
-_MOST_SCATTERED = 2 * 10**6
-
-#: Least share of the cells of a grid that have a point, if points are taken as one.
-_LEAST_SHARE = 0.25
-
-_Contents = tuple[Array, dict[str, Array]]
-"""Heights, and positions by the names x and y as far as the file has them."""
+_Given = tuple[str | None, str | None, float | None]
+"""Sign, unit and value for no data of `heights_in_metres`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,16 +71,18 @@ def read_height_map(
     path: str | os.PathLike[str],
     size: float | None = None,
     origin: tuple[float, float] | None = None,
-    values: str = "heights",
+    values: str | None = None,
     holes: str = "refuse",
     cell: float | None = None,
+    unit: str | None = None,
+    no_data: float | None = None,
 ) -> HeightMap:
     """Read a height map from a file.
 
     Parameters
     ----------
     path : path
-        File with heights or depths in metres; its suffix selects the format:
+        File with heights or depths; its suffix selects the format:
 
         ``.npy``
             a two-dimensional array, ``heights[j, i]`` at the j-th y and the i-th x;
@@ -103,38 +91,43 @@ def read_height_map(
         ``.exr``
             an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
         ``.nc``
-            a variable ``height`` or ``elevation``, or the only one with two dimensions, of the dimensions (y, x) or
-            (x, y) with, optionally, the coordinates ``x`` and ``y`` [m]. Dimensions of other names count as (y, x);
+            a variable of two dimensions; see `netcdf_heights.read_netcdf_heights`;
         ``.asc``
-            an ESRI ASCII grid in metres;
+            an ESRI ASCII grid, with a .prj file beside it or without;
         ``.tif``, ``.tiff``
-            a GeoTIFF of one band in projected coordinates [m], with the optional package rasterio;
+            a GeoTIFF of one band;
         ``.bag``
-            a Bathymetric Attributed Grid of one resolution in projected coordinates [m];
+            a Bathymetric Attributed Grid of one resolution;
         ``.xyz``, ``.csv``, ``.txt``
-            a table of points x, y, z [m], with or without a heading; see `survey_files.read_points`.
+            a table of points x, y, z, with or without a heading; see `point_grids.read_points`.
     size : float, optional
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.
     origin : (float, float), optional
         Point (x, y) of the map [m], within it, that lies at x = y = 0 of the result. Default: the centre of an .asc,
         .tif, .bag or of points; other positions are kept.
-    values : {'heights', 'depths'}
-        Whether the values are positive up or down.
+    values : {'heights', 'depths'}, optional
+        Whether the values are positive up or down. Default: what the file states, or heights.
     holes : {'refuse', 'fill'}
         Whether cells without a finite value are refused, or filled with the value of the nearest cell that has one,
         with a warning in the log.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m], positive. Default: the square root of the area
         of their convex hull over their number. Only for points; those of an even grid keep it by default.
+    unit : str, optional
+        Unit of the values, such as 'ft', if the file does not state it. Default: metres.
+    no_data : float, optional
+        Value of cells without a height, if the file does not declare it.
 
     Raises
     ------
     UserError
         If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
-        columns, or with holes; positions not increasing or not evenly spaced, in degrees or rotated; `size` not
-        positive, missing or superfluous; `origin` outside the map, or given for a file without positions; `cell` for
-        another file than points, or more than half of their extent; or points on a line, or too many.
+        columns, or with holes; heights beyond 12 000 m, or of an undeclared value for no data; units unknown or not
+        stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or of another scale than
+        the ground; `size` not positive, missing or superfluous; `origin` outside the map, or given for a file without
+        positions; `cell` for another file than points, or more than half of their extent; or points on a line, or too
+        many.
 
     Notes
     -----
@@ -142,90 +135,63 @@ def read_height_map(
     are holes. Points on an even grid, at a quarter of its places or more, are its cells, and other cells are holes.
     """
     path = Path(path)
-    for name, given, allowed in (("values", values, ("heights", "depths")), ("holes", holes, ("refuse", "fill"))):
-        if given not in allowed:
-            raise UserError(f"map_{name} = {given!r} must be {' or '.join(allowed)}")
+    if holes not in ("refuse", "fill"):
+        raise UserError(f"map_holes = {holes!r} must be refuse or fill")
     kind = readable_suffix(path, (*_READERS, *_GRID_READERS, *_POINTS), "height map")
     if cell is not None and kind not in _POINTS:
         raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points.")
+    given = values, unit, no_data
+    centre = None
     if kind not in _READERS:
         if size is not None:
             raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
-        grid = _grid_of_points(path, cell) if kind in _POINTS else _GRID_READERS[kind](path)
-        heights = _checked_heights(path, grid.values)
+        grid = _points(path, cell, given) if kind in _POINTS else _grid(path, _GRID_READERS[kind](path), given)
+        heights, stated = _checked_heights(path, grid.values), grid.stated
         x, y = ((np.arange(n) - (n - 1) / 2) * cell for n, cell in zip(heights.shape[::-1], grid.cell, strict=True))
         # Map coordinates have up to eight digits: the shift is added to exact positions about the centre.
         centre = grid.first[0] - float(x[0]), grid.first[1] - float(y[0])
     else:
-        contents, positions = _READERS[kind](path)
-        heights = _checked_heights(path, contents)
+        contents, positions, stated = _READERS[kind](path)
+        heights = heights_in_metres(path, _checked_heights(path, contents), stated, *given)
         x, y = _positions(path, positions, heights.shape, size)
-        centre = None
-        if origin is not None and not positions:
+        if positions:
+            check_positions(path, stated, x, y, min(float(x[1] - x[0]), float(y[1] - y[0])))
+            x, y = position_unit(path, stated) * x, position_unit(path, stated) * y
+        elif origin is not None:
             raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
-    if values == "depths":
-        heights = -heights
     heights, filled = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
-    return _moved(path, HeightMap(heights, x, y, None, filled), centre, origin)
-
-
-def _grid_of_points(path: Path, cell: float | None) -> Grid:
-    """Return the points of a table on a grid: their own, if they have one, or else interpolated."""
-    points = read_points(path)
-    if len(points) < 3:
-        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
-    # Map coordinates have up to eight digits: distances are exact about the lower corner.
-    corner = points[:, :2].min(axis=0)
-    places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
-    if cell is None and (grid := _own_grid(places, points[:, 2])) is not None:
-        return grid._replace(first=(float(corner[0]), float(corner[1])))
-    if len(points) > _MOST_SCATTERED:
-        raise UserError(
-            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
-        )
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import ConvexHull, Delaunay, QhullError
-
-    try:
-        area, triangles = ConvexHull(places).volume, Delaunay(places)
-    except (QhullError, ValueError) as error:
-        raise UserError(f"{path} has points on a line: a height map needs an area.") from error
-    size = float(np.sqrt(area / len(points))) if cell is None else positive("map_cell", cell)
-    if size > 0.5 * extent.min():
-        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}.")
-    columns, rows = np.floor(extent / size * (1 + 1e-9)) + 1
-    check_size(path, 8 * columns * rows)
-    x, y = (
-        0.5 * (one - (count - 1) * size) + size * np.arange(count)
-        for one, count in zip(extent, (columns, rows), strict=True)
+    terrain = _moved(path, HeightMap(heights, x, y, None, filled), centre, origin)
+    place = "" if terrain.origin is None else "; x = y = 0 is its point ({:.10g}, {:.10g})".format(*terrain.origin)
+    logger.info(
+        "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m%s%s; %s",
+        *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), place),
+        ", the centre" if place and origin is None else "",
+        described(stated, values, unit, 0 if filled is None else int(filled.sum())),
     )
-    values = LinearNDInterpolator(triangles, points[:, 2])(*np.meshgrid(x, y))
-    return Grid(np.asarray(values), (float(corner[0] + x[0]), float(corner[1] + y[0])), (size, size))
+    return terrain
 
 
-def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
-    """Return the even grid that places from its corner are on, shape (n, 2), and None if there is none."""
-    index, cells = [], []
-    for axis in range(2):
-        gaps = np.diff(np.unique(places[:, axis]))
-        # Positions are rounded: equal ones may differ by a thousandth of a cell.
-        gaps = gaps[gaps > 2 * _UNEVENNESS * gaps.max(initial=0.0)]
-        if not gaps.size:
-            return None
-        cell = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-        steps = np.rint(places[:, axis] / cell)
-        # The last place gives the cell precisely.
-        cell = float(places[:, axis].max() / max(steps.max(), 1))
-        if np.abs(places[:, axis] / cell - steps).max() > 0.05:
-            return None
-        index.append(steps.astype(np.int64))
-        cells.append(cell)
-    columns, rows = (int(one.max()) + 1 for one in index)
-    if len(heights) < _LEAST_SHARE * columns * rows:
-        return None
-    values = np.full((rows, columns), np.nan)
-    values[index[1], index[0]] = heights
-    return Grid(values, (0.0, 0.0), (cells[0], cells[1]))
+def _points(path: Path, cell: float | None, given: _Given) -> Grid:
+    """Return the grid of a table of points [m]."""
+    points, stated = read_points(path)
+    if len(points):
+        spacing = float(np.sqrt(np.ptp(points[:, 0]) * np.ptp(points[:, 1]) / len(points)))
+        check_positions(path, stated, points[:, 0], points[:, 1], spacing)
+    points[:, 2] = heights_in_metres(path, points[:, 2], stated, *given)
+    points[:, :2] *= position_unit(path, stated)
+    return grid_of_points(path, points, cell)._replace(stated=stated)
+
+
+def _grid(path: Path, grid: Grid, given: _Given) -> Grid:
+    """Return a grid with heights and positions in metres."""
+    x, y = [
+        np.array([first, first + (count - 1) * cell])
+        for first, count, cell in zip(grid.first, grid.values.shape[::-1], grid.cell, strict=True)
+    ]
+    check_positions(path, grid.stated, x, y, min(grid.cell))
+    metres, heights = position_unit(path, grid.stated), heights_in_metres(path, grid.values, grid.stated, *given)
+    first, cell = ((metres * pair[0], metres * pair[1]) for pair in (grid.first, grid.cell))
+    return Grid(heights, first, cell, grid.stated)
 
 
 def _checked_heights(path: Path, values: Array) -> FloatArray:
@@ -278,7 +244,7 @@ def _without_holes(
 def _moved(
     path: Path, terrain: HeightMap, centre: tuple[float, float] | None, origin: tuple[float, float] | None
 ) -> HeightMap:
-    """Return the map with a point of it at x = y = 0, and log where that is.
+    """Return the map with a point of it at x = y = 0.
 
     The positions of `terrain` are relative to `centre`, or as they are in the file if it is None.
     """
@@ -298,11 +264,6 @@ def _moved(
         if not low <= finite(f"origin_{name}", value) <= high:
             raise UserError(f"origin_{name} = {value:.10g} must lie between {low:.10g} and {high:.10g}, within {path}.")
     x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
-    logger.info(
-        "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m; x = y = 0 is its point (%.10g, %.10g)%s",
-        *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), *point),
-        ", the centre" if origin is None else "",
-    )
     return HeightMap(heights, x, y, point, terrain.filled)
 
 
@@ -321,7 +282,7 @@ def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatAr
         )
     spacing = (positions[-1] - positions[0]) / (count - 1)
     worst = int(np.argmax(np.abs(gaps - spacing)))
-    if abs(gaps[worst] - spacing) > _UNEVENNESS * spacing:
+    if abs(gaps[worst] - spacing) > UNEVENNESS * spacing:
         raise UserError(
             f"{path} has {name}[{worst}] and {name}[{worst + 1}] {gaps[worst]:g} apart, but {spacing:g} on average:"
             " positions must be evenly spaced."
@@ -343,14 +304,14 @@ def _numbers(path: Path, name: str, values: Array) -> FloatArray:
 
 
 def _read_npy(path: Path) -> _Contents:
-    return read_npy(path), {}
+    return read_npy(path), {}, Stated()
 
 
 def _read_npz(path: Path) -> _Contents:
     arrays = read_npz(path, ("heights", "x", "y"))
     if "heights" not in arrays:
         raise UserError(f"{path} must have an array heights, and may have x and y.")
-    return arrays.pop("heights"), arrays
+    return arrays.pop("heights"), arrays, Stated()
 
 
 def _read_exr(path: Path) -> _Contents:
@@ -359,24 +320,9 @@ def _read_exr(path: Path) -> _Contents:
     if not names:
         channels = ", ".join(sorted(images))
         raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
-    return images[names[0]][::-1], {}
+    return images[names[0]][::-1], {}, Stated()
 
 
-def _read_netcdf(path: Path) -> _Contents:
-    variables = read_netcdf(path)
-    data = {name: variable for name, variable in variables.items() if not variable.is_coordinate}
-    flat = [name for name, variable in data.items() if variable.values.ndim == 2]
-    names = [name for name in ("height", "elevation") if name in data] or flat
-    if len(names) != 1:
-        raise UserError(
-            f"{path} has {len(names)} variables that may be the heights: it must have one called height or elevation,"
-            " or only one with two dimensions."
-        )
-    heights = data[names[0]]
-    values = heights.values.T if heights.dims == ("x", "y") else heights.values
-    return values, {name: variables[name].values for name in ("x", "y") if name in variables}
-
-
-_READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": _read_netcdf}
+_READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": read_netcdf_heights}
 _GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff, ".bag": read_bag}
 _POINTS = (".xyz", ".csv", ".txt")

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import read_netcdf, readable_suffix
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.grids import NO_DATA, undeclared_no_data
 from mitransient_lidar.core.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
 from mitransient_lidar.core.text_tables import complete_rows, read_table
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
@@ -260,8 +261,8 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     ----------
     path : path
         ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `core.text_tables.read_table` reads, or ``.nc``, NetCDF-4
-        with variables over the dimension ``depth`` or ``z``, whose attribute ``units`` is read. Names of columns, in
-        any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
+        with variables over the dimension ``depth`` or ``z``, whose attributes ``units`` and ``positive`` are read.
+        Names of columns, in any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
 
         ``depth`` or ``z``
             depth [m], at least 0; z may also be the height, at most 0;
@@ -321,7 +322,10 @@ def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, lis
         if heading is not None:
             if item.values.dtype.kind not in "iuf":
                 raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers.")
-            columns[heading.column.name] = item.values.astype(np.float64) * heading.factor
+            column, values = heading.column.name, item.values.astype(np.float64) * heading.factor
+            if (direction := str(item.attributes.get("positive", "")).lower()) in ("up", "down"):
+                column, values = "depth", values if direction == "down" else -values
+            columns[column] = values
     _check_names(path, list(columns))
     places = [f"index {i} of {dimension}" for i in range(next(iter(columns.values())).size)]
     kept = complete_rows(path, columns, places)
@@ -348,6 +352,9 @@ def _checked(path: Path, columns: _Columns) -> _Columns:
         elif np.any(z < 0):
             _require(z >= 0, "z = {:g} must not be negative, unless all z are heights of at most 0", z)
         columns["depth"] = np.abs(z)
+    if suspect := undeclared_no_data(columns["depth"], numbers=NO_DATA[1:]):
+        text = f"{suspect.times} depths of {suspect.value:g} m, {suspect.reason}, must not stand for missing values"
+        _require(columns["depth"] != suspect.value, text, columns["depth"])
     for name, values in columns.items():
         _require(np.isfinite(values), name + " = {:g} must be finite", values)
         _require(values >= 0, name + " = {:g} must not be negative", values)

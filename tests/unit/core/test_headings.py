@@ -59,7 +59,7 @@ def test_headings_are_understood(text, column, factor, wavelength):
         (["depth", "Tiefe"], r"^x.csv has an unknown column 'Tiefe' \(found: depth, Tiefe\): allowed are time \[ns, "),
         (
             ["depth [hPa]", "a"],
-            r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, ft\]",
+            r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, dm, ft, ftus, fathom\]",
         ),
         (["a_nw", "depth"], "unknown unit in column 'a_nw'"),
         (["a532", "a_532"], "has 2 columns a532 and a_532 for a: allowed is one"),

@@ -1,6 +1,7 @@
 """Scene files that include others."""
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
@@ -215,3 +216,25 @@ def test_parameters_that_double_are_refused_at_once(tmp_path):
     path.write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
     with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
         scenes.load_scene(path)
+
+
+@pytest.mark.parametrize("folder", ["maps", "$x"])
+def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, folder):
+    """A file name with the name of a parameter in it, in a folder of such a name, also where a result holds it."""
+    path, own = tmp_path / folder / "share$x$ depth.npy", tmp_path / folder / "own.xml"
+    path.parent.mkdir()
+    monkeypatch.chdir(path.parent)
+    np.save(path, np.full((3, 3), -4.0))
+    text = """<scene version="3.0.0"><default name="x" value="2"/><default name="depth" value="$x"/>
+        <default name="file" value="none.npy"/><shape type="seabed" id="bottom"><float name="depth" value="$depth"/>
+        <string name="filename" value="$file"/><float name="map_size" value="$x"/></shape></scene>"""
+    own.write_text(text)
+    for given in (path.name, str(path)):
+        loaded = scenes.load(own, {"file": given})
+        for again in (loaded, scenes.load(loaded.record)):
+            assert again.scene.shapes()[0].parameters["filename"] == str(path)
+            assert again.scene.bbox().max.z == pytest.approx(-6)
+            assert again.record.parameters["file"] == given
+    own.write_text(text.replace('value="$depth"', 'value="$dept"'))
+    with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
+        scenes.load(own)

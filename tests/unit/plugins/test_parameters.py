@@ -23,7 +23,10 @@ WITHOUT_VALUE = {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
     },
-    "seabed": {"filename", "map_size", "map_values", "map_holes", "map_cell", "origin_x", "origin_y", "patches"},
+    "seabed": {
+        *("filename", "map_size", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data", "origin_x"),
+        *("origin_y", "patches"),
+    },
     "lidar_transmitter": {
         *("to_world", "divergence_fwhm_mrad", "divergence_1e2_mrad", "divergence_across_mrad"),
         *("profile_file", "profile_mrad", "pulse_file"),
@@ -109,7 +112,9 @@ def test_files_of_every_parameter_that_names_one_are_recorded():
     texts = {name: text for plugin in PLUGINS for names, text in _table(plugin).items() for name in names}
     named = {name for name, text in texts.items() if re.search(r"\bfile\b|\.(png|npy|npz|nc|csv|asc)\b", text)}
     assert named >= set(FILE_PARAMETERS) - {"filename"}
-    assert named - set(FILE_PARAMETERS) == {"spectrum", "origin_x", "origin_y"}
+    assert named - set(FILE_PARAMETERS) == {
+        *("spectrum", "origin_x", "origin_y", "map_values", "map_unit", "map_no_data")
+    }
 
 
 def test_given_values_and_nested_objects_are_kept():

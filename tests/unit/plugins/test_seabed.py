@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+import xarray as xr
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -68,6 +69,26 @@ def test_height_map_is_added(tmp_path):
     # Beyond the map the heights of its edge continue.
     expected = [-4 + 0.1 - 2.775, -4 + 1.95 - 3.2, -4 + 2 - 2.875]
     np.testing.assert_allclose(z, expected, atol=1e-3)
+
+
+def test_the_same_map_is_at_the_same_depth_in_every_format(tmp_path):
+    """With positions of its own or without, it is a map of heights above the sea: the default depth is 0, not 8 m."""
+    heights, x = np.full((5, 5), -7.25), np.arange(5.0) - 2
+    np.save(tmp_path / "map.npy", heights)
+    np.savez(tmp_path / "map.npz", heights=heights, x=x, y=x)
+    header = "ncols 5\nnrows 5\nxllcenter -2\nyllcenter -2\ncellsize 1\n"
+    (tmp_path / "map.asc").write_text(header + " ".join(["-7.25"] * 25))
+    xr.Dataset({"height": (("y", "x"), heights)}, {"x": x, "y": x}).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    for suffix, more in ((".npy", {"map_size": 4.0}), (".npz", {}), (".asc", {}), (".nc", {})):
+        shape = load(filename=str(tmp_path / f"map{suffix}"), **more)
+        np.testing.assert_allclose(look_down(shape, [0.0, 1.5], [0.0, -1.5])[0], -7.25)
+
+
+def test_unit_and_missing_values_of_a_map_are_given(tmp_path):
+    np.savetxt(tmp_path / "map.csv", [[x, y, 10 if x + y else -999] for x in range(5) for y in range(5)], delimiter=",")
+    given = {"map_values": "depths", "map_unit": "ft", "map_no_data": -999.0, "map_holes": "fill"}
+    shape = load(filename=str(tmp_path / "map.csv"), **given)
+    np.testing.assert_allclose(look_down(shape, [0.0, -2.0], [0.0, -2.0])[0], -3.048)
 
 
 def test_height_map_about_the_sea_level(tmp_path):

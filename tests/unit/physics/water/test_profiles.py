@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from scipy.integrate import quad
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.profiles import BACKSCATTERING_FLOOR, COEFFICIENT_FLOOR, Profile, read_profile
 
 # a and b do not change alike, bb/b neither; the first node lies below the surface.
@@ -319,6 +320,38 @@ def test_rounded_decimals_do_not_contradict(tmp_path):
     path.write_text("depth,a,b,c,omega\n0,0.16,0.155,0.31,0.49\n1,0,0,0,0.3")
     read = read_profile(path)
     np.testing.assert_allclose(read.attenuation, [0.315, 0])
+
+
+@pytest.mark.parametrize(
+    ("positive", "sign", "name"), [("down", 1, "z"), ("up", -1, "z"), ("Up", -1, "depth"), ("down", 1, "depth")]
+)
+def test_direction_of_netcdf_depths(tmp_path, positive, sign, name):
+    """A vertical coordinate upwards from the bottom, of positive numbers, would be taken as depths."""
+    path = tmp_path / "water.nc"
+    water = {one: (name, [0.2, 0.3]) for one in "ab"}
+    xr.Dataset(water, {name: (name, [0.0, 4.0 * sign], {"positive": positive})}).to_netcdf(path, engine="h5netcdf")
+    np.testing.assert_array_equal(read_profile(path).depth, [0, 4])
+    xr.Dataset(water, {name: (name, [0.0, -4.0 * sign], {"positive": positive})}).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(UserError, match="depth = -4 must not be negative"):
+        read_profile(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("z,a,b\n0,1,1\n-2,1,1\n-9999,1,1\n", "line 4: 1 depths of 9999 m, far from all others, must not stand for"),
+        ("depth_km,a,b\n0,1,1\n13,1,1\n", "line 3: 1 depths of 13000 m, beyond 12000 m, must not stand for missing"),
+    ],
+)
+def test_depths_of_no_sea_are_rejected(tmp_path, text, message):
+    (tmp_path / "water.csv").write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_profile(tmp_path / "water.csv")
+
+
+def test_depths_in_feet_of_us_surveys(tmp_path):
+    (tmp_path / "water.csv").write_text("Depth (ftUS);a;b\n0;0,1;0,2\n3937;0,1;NA\n3937;0,3;0,2\n")
+    np.testing.assert_allclose(read_profile(tmp_path / "water.csv").depth, [0, 1200], rtol=1e-15)
 
 
 def test_invalid_netcdf_files_are_rejected(tmp_path):

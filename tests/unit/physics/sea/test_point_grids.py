@@ -1,17 +1,15 @@
-"""Surveys: headings and separators of tables of points, grids of BAG files, and refused files."""
+"""Tables of points: headings, separators, missing values, their own grids, and triangulation."""
 
 import logging
 import os
 
-import h5py
 import numpy as np
 import pytest
-from array_inputs import write_bag
 
-from mitransient_lidar.core import survey_files
+from mitransient_lidar.core import long_tables
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.survey_files import read_bag, read_points
 from mitransient_lidar.physics.sea.height_maps import read_height_map
+from mitransient_lidar.physics.sea.point_grids import read_points
 
 POINTS = np.array([[1.0, 10.0, -3.0], [2.5, 11.0, -3.5], [4.0, 13.0, -4.0]])
 
@@ -24,29 +22,55 @@ POINTS = np.array([[1.0, 10.0, -3.0], [2.5, 11.0, -3.5], [4.0, 13.0, -4.0]])
         "# survey of a bay\nx;y;z\n1;10;-3\n\n2.5;11;-3.5\n4;13;-4\n",
         "//X Y Z\n1 10 -3\n2.5 11 -3.5\n4 13 -4\n",
         "\ufeffid,Northing [m],Easting [m],Elevation_m\n1,10,1,-3\n2,11,2.5,-3.5\n3,13,4,-4\n",
-        "x\ty\tdepth\n1\t10\t-3\n9\t9\tnan\n2.5\t11\t-3.5\n4\t13\t-4\n",
+        "station,z,when,x,y\nA1,-3,2024-05-01,1,10\nA2,-3.5,2024-05-01,2.5,11\nA3,-4,2024-05-02,4,13\n",
+        "x;y;z\n1;10;-3\n2,5;11;-3,5\n4;13;-4\n",
+        '"x"\t"y"\t"z"\n"1"\t"10"\t"-3"\n"2,5"\t"11"\t"-3,5"\n"4"\t"13"\t"-4"\n',
+        '"x","y","z"\n"1","10","-3"\n"2,5","11","-3,5"\n4,13,-4\n',
+        " 1  10 -3 # first\n# second\n2,5 11 -3,5\n 4  13 -4\n",
+        "x,y,z\n1,10,-3,\n2.5,11,-3.5,\n4,13,-4,\n",
+        "x,y,z\nm,m,m\n1,10,-3\n2.5,11,-3.5\n4,13,-4\n",
     ],
 )
 def test_points_have_the_columns_that_their_heading_names(tmp_path, text):
     (tmp_path / "a.xyz").write_text(text, "utf-8")
-    np.testing.assert_array_equal(read_points(tmp_path / "a.xyz"), POINTS)
+    np.testing.assert_array_equal(read_points(tmp_path / "a.xyz")[0], POINTS)
+
+
+@pytest.mark.parametrize("missing", ["", "NA", "nan", "N/A", "#N/A", "null", "--", " "])
+def test_points_without_a_height_are_left_out(tmp_path, missing, caplog):
+    rows = "\n".join(f"{x},{y},{-5 if x + y else missing}" for x in range(4) for y in range(4))
+    (tmp_path / "a.csv").write_text(f"x,y,z\n{rows}\n")
+    assert np.isnan(read_points(tmp_path / "a.csv")[0][0, 2])
+    assert read_height_map(tmp_path / "a.csv", holes="fill").heights.min() == -5
+    assert f"{tmp_path}/a.csv: 1 of 16 points have no height and are left out" in caplog.messages
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "has no points"),
-        ("# nothing\n", "has no points"),
-        ("1 2\n3 4\n", "is not a table of points x, y and z"),
-        ("1 2 3\n4 x 6\n", "is not a table of points x, y and z"),
-        ("name depth\n1 2\n", "line 1: 'name depth' must be numbers, or names x, y and z"),
-        ("lon,lat,z\n1,2,3\n", "has columns of degrees"),
-        ("1 inf 3\n", "has the point 1, inf, 3: points must be finite"),
-        ("1 2 3\n" * 7, "has more than 5 points"),
+        ("", "has no rows of numbers"),
+        ("# nothing\n", "has no rows of numbers"),
+        ("1 2\n3 4\n", "is not a table of x, y, z: line 1 has 2 values, '1 2'"),
+        ("1 2 3\n4 x 6\n", "is not a table of x, y, z: line 2 is '4 x 6'"),
+        ("1 2 3\n4 5 6 7\n", "is not a table of x, y, z: line 2 is '4 5 6 7'"),
+        ("x,y,z\n1,5,2,5,-3,2\n1,5,3,5,-3,2\n", "line 2 has 6 values, '1 5 2 5 -3 2'"),
+        ("x,y,z\n1,5,2,-3\n", "line 2 has 4 values, '1 5 2 -3'"),
+        ("name depth\n1 2\n", r"has no heading with known columns \(found: name, depth\): allowed are x, y, z"),
+        ("lon,lat,z\n1,2,3\n", r"has columns of degrees \(lon, lat, z\): positions must be projected"),
+        ("Longitude [deg];Latitude [deg];Depth [m]\n1;2;3\n", "has columns of degrees"),
+        ("1 2 3\n\n# a\n1 inf 3\n", "line 4: the point 1, inf, 3 must be finite"),
+        ("1 2 3\n" * 7, "has more than 5 rows"),
+        ("x,y,depth,height\n1,2,3,4\n", "has 2 columns depth and height that may be z or depth: allowed is one"),
+        ("x,y,easting,z\n1,2,3,4\n", "has 2 columns x and easting that may be x: allowed is one"),
+        ("x,y,depth_uncertainty\n1,2,3\n", r"has no column z or depth \(found: x, y, depth_uncertainty\)"),
+        ("x,y,z_std\n1,2,3\n", "has no column z or depth"),
+        ("x,y,z [hPa]\n1,2,3\n", r"has an unknown unit in column 'z \[hPa\]' .*allowed are z, depth \[m, cm, mm, km"),
+        ("x_m,y_ft,z\n1,2,3\n", "has x in m and y in ft: they must be the same"),
+        ("x_m,y,z\n1,2,3\n", "has x in m and y in no unit: they must be the same"),
     ],
 )
 def test_other_tables_are_refused(tmp_path, monkeypatch, text, message):
-    monkeypatch.setattr(survey_files, "_MOST_POINTS", 5)
+    monkeypatch.setattr(long_tables, "_MOST_ROWS", 5)
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=message):
         read_points(tmp_path / "a.csv")
@@ -55,60 +79,8 @@ def test_other_tables_are_refused(tmp_path, monkeypatch, text, message):
 def test_a_table_of_a_billion_points_is_refused_by_its_size(tmp_path):
     (tmp_path / "a.csv").touch()
     os.truncate(tmp_path / "a.csv", 30 * 10**9)
-    with pytest.raises(UserError, match=r"a\.csv has 2\.861e\+04 MiB: a table of points may have 512 MiB"):
+    with pytest.raises(UserError, match=r"a\.csv has 2\.861e\+04 MiB: a table may have 512 MiB"):
         read_points(tmp_path / "a.csv")
-
-
-HEIGHTS = np.array([[-1.0, -2, -3], [-4, -5, 1e6]])
-
-
-@pytest.mark.parametrize("corners", [None, "499999,5999998.5 500005,6000001.5"], ids=["centres", "edges"])
-def test_bag_has_its_first_row_in_the_south(tmp_path, corners):
-    changes = {} if corners is None else {"corners": corners}
-    path = write_bag(tmp_path / "a.bag", HEIGHTS, (500000.0, 5999999.25), (2.0, 1.5), **changes)
-    grid = read_bag(path)
-    np.testing.assert_array_equal(grid.values, np.where(HEIGHTS == 1e6, np.nan, HEIGHTS))
-    assert grid.first == (500000.0, 5999999.25)
-    assert grid.cell == (2.0, 1.5)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"corners": "0,0 7,1"}, r"has 3 cells along x, but corners that are 7 cells apart"),
-        ({"corners": "0 1"}, "is damaged, or is not a Bathymetric Attributed Grid"),
-        ({"system": "GEOGCS[]"}, "has coordinates in degrees"),
-        ({"head": "<!DOCTYPE a [<!ENTITY b 'c'>]>"}, "its metadata holds a DOCTYPE"),
-    ],
-)
-def test_bag_with_other_metadata_is_refused(tmp_path, changes, message):
-    write_bag(tmp_path / "a.bag", HEIGHTS, (0.0, 0.0), (1.0, 1.0), **changes)
-    with pytest.raises(UserError, match=message):
-        read_bag(tmp_path / "a.bag")
-
-
-def test_bag_without_one_grid_is_refused(tmp_path):
-    path = tmp_path / "a.bag"
-    path.write_bytes(b"not HDF5")
-    with pytest.raises(UserError, match="is damaged"):
-        read_bag(path)
-    for change, message in (("varres_refinements", "variable resolution"), ("elevation", "is damaged")):
-        write_bag(path, HEIGHTS, (0.0, 0.0), (1.0, 1.0))
-        with h5py.File(path, "a") as file:
-            file["BAG_root"].pop(change, None)
-            file["BAG_root"][change] = [1, 2]
-        with pytest.raises(UserError, match=message):
-            read_bag(path)
-
-
-def test_bag_that_declares_a_million_rows_is_refused_before_it_is_read(tmp_path):
-    path = write_bag(tmp_path / "a.bag", HEIGHTS, (0.0, 0.0), (1.0, 1.0))
-    with h5py.File(path, "a") as file:
-        del file["BAG_root/elevation"]
-        file["BAG_root"].create_dataset("elevation", (10**6, 10**6), "f4", chunks=(1000, 1000))
-    assert path.stat().st_size < 10**5
-    with pytest.raises(UserError, match=r"holds arrays of 7\.629e\+06 MiB, and 256 MiB are the most"):
-        read_bag(path)
 
 
 def write_points(path, points):
@@ -180,17 +152,3 @@ def test_points_that_are_no_map_are_refused(tmp_path, points, options, message):
     path = write_points(tmp_path / "a.xyz", points)
     with pytest.raises(UserError, match=message):
         read_height_map(path, **options)
-
-
-def test_a_cell_of_another_file_is_refused(tmp_path):
-    write_bag(tmp_path / "a.bag", HEIGHTS, (0.0, 0.0), (1.0, 1.0))
-    with pytest.raises(UserError, match=r"map_cell = 1.0 must not be given: .* is not a table of points"):
-        read_height_map(tmp_path / "a.bag", cell=1.0)
-
-
-def test_bag_is_a_height_map_about_its_centre(tmp_path):
-    write_bag(tmp_path / "a.bag", HEIGHTS[:, :2], (500000.0, 6000000.0), (2.0, 1.0))
-    read = read_height_map(tmp_path / "a.bag")
-    np.testing.assert_array_equal(read.heights, HEIGHTS[:, :2])
-    np.testing.assert_array_equal(read.x, [-1, 1])
-    assert read.origin == (500001.0, 6000000.5)
