@@ -237,9 +237,9 @@ class Seabed(mi.Mesh):
                                       Default: ``refuse``
     map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
                                       or their mean spacing
-    origin_x, origin_y        float   Point of the map, in its coordinates, that lies at x = y = 0 [m]. Default: the
-                                      centre of an .asc, .tif or .bag, or of points; positions in other files are those
-                                      of the scene
+    origin_x, origin_y        float   Point in the coordinates of the map that lies at x = y = 0 [m]. Default: of an
+                                      .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the centre;
+                                      positions in other files are those of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
@@ -311,6 +311,11 @@ class Seabed(mi.Mesh):
         """Reflectance of bottom and patches, None where they differ."""
         values = {self.bottom.reflectance, *(patch.reflectance for patch in self.bottom.patches)}
         return float(values.pop()) if len(values) == 1 else None
+
+    @property
+    def map_origin(self) -> tuple[float, float] | None:
+        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
+        return None if self.bottom.terrain is None else self.bottom.terrain.origin
 
     def to_string(self) -> str:
         """Return a description."""

@@ -16,6 +16,7 @@ from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
@@ -320,10 +321,11 @@ class RunRenderer:
 
 
 def record_of(campaign: Campaign) -> SceneRecord:
-    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be loaded."""
-    record = open_scene(campaign.scene, None, instrument=campaign.instrument).record
-    assert record is not None
-    return record
+    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be read.
+
+    It is not loaded: files that are its defaults may be missing where the runs have others.
+    """
+    return read_record(campaign.scene, campaign.fixed, campaign.instrument)
 
 
 def _check_parameters(campaign: Campaign, columns: Mapping[str, Column], known: Collection[str]) -> None:

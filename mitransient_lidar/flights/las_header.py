@@ -73,6 +73,16 @@ def coordinate_system_wkt(crs: str | None) -> str:
     return wkt
 
 
+def check_same_system(crs: str, epsg: int) -> None:
+    """Raise `UserError` if positions are not in the horizontal part of a system of `coordinate_system_wkt`."""
+    import pyproj
+
+    whole = pyproj.CRS.from_user_input(crs)
+    level = next(iter(whole.sub_crs_list), whole)
+    if not level.equals(pyproj.CRS.from_epsg(epsg), ignore_axis_order=True):
+        raise UserError(f"epsg = {epsg} of the platform must be the coordinate system of the points, crs = {crs!r}")
+
+
 def las_header(
     point_format: int, first: tuple[float, float], wkt: str, notes: str, descriptor: bytes = b""
 ) -> laspy.LasHeader:

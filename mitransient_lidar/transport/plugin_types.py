@@ -145,6 +145,10 @@ class SeabedShape(Protocol):
     def uniform_reflectance(self) -> float | None:
         """Reflectance of bottom and patches, None where they differ."""
 
+    @property
+    def map_origin(self) -> tuple[float, float] | None:
+        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
+
 
 @runtime_checkable
 class GatedFilm(Protocol):
