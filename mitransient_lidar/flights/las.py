@@ -21,7 +21,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
 from mitransient_lidar.core.validation import finite_array, integer, positive
-from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, coordinate_system_wkt, las_header
+from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
+from mitransient_lidar.flights.poses.times import ADJUSTMENT_S
 from mitransient_lidar.flights.waveform_packets import PacketWriter
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         Points of the flight, or chunks of them, of which one is in memory at a time. Variables over ``point``:
 
         - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
-        - ``gps_time``: time of the pulse [s], from the beginning of the flight;
+        - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.times.TIME_SYSTEMS`, is
+          ``flight`` by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found. The last is
           flagged as synthetic, since no echo is there;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
@@ -79,7 +81,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
     wkt = coordinate_system_wkt(crs)
     first, chunks = _first(points)
     with replacing(path) as temporary:
-        return _write(temporary, las_header(6, _place(first), wkt, _notes(first)), ((chunk, {}) for chunk in chunks))
+        header = las_header(6, _place(first), wkt, _notes(first), time_system=_time_system(first))
+        return _write(temporary, header, ((chunk, {}) for chunk in chunks))
 
 
 def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chunks, crs: str | None = None) -> int:
@@ -116,7 +119,8 @@ def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chu
     (first, chunks), (first_waveforms, packets) = _first(points), _first(waveforms)
     with together(), replacing(path) as las, replacing(path.with_suffix(".wdp")) as wdp, open(wdp, "wb") as file:
         writer = PacketWriter(file, first_waveforms)
-        header = las_header(9, _place(first), wkt, _notes(first), writer.descriptor)
+        about = _place(first), wkt, _notes(first), writer.descriptor
+        header = las_header(9, *about, time_system=_time_system(first))
         pairs = zip(chunks, packets, strict=True)
         count = _write(las, header, ((chunk, writer.append(packet, chunk)) for chunk, packet in pairs))
         writer.finish()
@@ -145,12 +149,17 @@ def _place(first: xr.Dataset) -> tuple[float, float]:
     return x, y
 
 
+def _time_system(first: xr.Dataset) -> str:
+    """Return the system of the times of points."""
+    return str(first["gps_time"].attrs.get("time_system", "flight"))
+
+
 def _notes(first: xr.Dataset) -> str:
     intensity = first["intensity"].attrs
     step = positive("full_scale", intensity["full_scale"]) / _LAST_INTENSITY
     return (
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
-        "GPS time: seconds from the beginning of the flight, not of a GPS week. "
+        f"GPS time: {TIME_NOTES[_time_system(first)]}. "
         "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
         "no echo is there). Return numbers count the echoes of a pulse in one pixel. Depths and uncertainties "
         "(1 sigma) are NaN where unknown."
@@ -216,7 +225,8 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
     extra = {item.name: points[item.name].values for item in EXTRA_BYTES if item.dtype == "f4"}
     return {
         **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
-        "gps_time": finite_array("gps_time", points["gps_time"].values),
+        "gps_time": finite_array("gps_time", points["gps_time"].values)
+        - ADJUSTMENT_S * (_time_system(points) == "gps"),
         "classification": kind,
         "synthetic": kind == NO_BOTTOM,
         "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),

@@ -20,6 +20,14 @@ SCENE_WKT = (
     'AXIS["x",EAST],AXIS["y",NORTH],AXIS["z",UP]]'
 )
 
+#: What the times of points are, by their system (`poses.times.TIME_SYSTEMS`).
+TIME_NOTES = {
+    "flight": "seconds as in the trajectory of the flight, not of a known GPS week",
+    "gps_week": "seconds of the GPS week",
+    "gps": "adjusted standard GPS time, seconds since 6 January 1980 less 1e9",
+    "adjusted_gps": "adjusted standard GPS time, seconds since 6 January 1980 less 1e9",
+}
+
 _DESCRIPTOR = struct.Struct("<2xBB32s4xd16x8x16x8x16x8x16x8x16x32s")
 _NO_DATA = 1  # bit of the options: the value for missing data is relevant
 
@@ -84,7 +92,13 @@ def check_same_system(crs: str, epsg: int) -> None:
 
 
 def las_header(
-    point_format: int, first: tuple[float, float], wkt: str, notes: str, descriptor: bytes = b""
+    point_format: int,
+    first: tuple[float, float],
+    wkt: str,
+    notes: str,
+    descriptor: bytes = b"",
+    *,
+    time_system: str = "flight",
 ) -> laspy.LasHeader:
     """Return the header of a file of LAS 1.4.
 
@@ -100,8 +114,11 @@ def las_header(
         Text for the reader, as Text Area Description.
     descriptor : bytes
         Waveform Packet Descriptor of format 9.
+    time_system : str
+        System of the times of the pulses, of `TIME_NOTES`.
     """
     import laspy
+    from laspy.header import GpsTimeType
 
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = f"mitransient-lidar {__version__}"[:32]
@@ -109,6 +126,8 @@ def las_header(
     header.scales = [SCALE_M] * 3
     header.offsets = [*(1000.0 * math.floor(value / 1000) for value in first), 0.0]
     header.global_encoding.wkt = True
+    since_1980 = time_system in ("gps", "adjusted_gps")
+    header.global_encoding.gps_time_type = GpsTimeType.STANDARD if since_1980 else GpsTimeType.WEEK_TIME
     if descriptor:  # setting False sets the bit before laspy 2.7
         header.global_encoding.waveform_data_packets_external = True
     header.add_extra_dims([laspy.ExtraBytesParams(name=extra.name, type=extra.dtype) for extra in EXTRA_BYTES])

@@ -16,10 +16,11 @@ from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
-from mitransient_lidar.core.validation import finite_array, in_range, integer, non_negative, positive, shown
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, non_negative, positive, shown
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.flights.poses.times import time_system
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 
@@ -200,8 +201,13 @@ class FlightPlan:
             raise UserError(
                 f"the flight has {times.size} pulses: at most {MOST_PULSES} may be; set most or every in [pulses]"
             )
+        self.time_system(times)
         mounting = Mounting.of(table("mounting", given.get("mounting", {})))
         return pulse_poses(trajectory, mounting, Scanner.of(scanner), times)
+
+    def time_system(self, times: FloatArray) -> str:
+        """Return the system of the times [s] of the pulses, as of `times.time_system`."""
+        return time_system(json.loads(self.text)["platform"], times)
 
     @property
     def stated_origin(self) -> tuple[float, float] | None:

@@ -40,13 +40,13 @@ def input_columns(poses: PulsePoses) -> dict[str, Column]:
         row = int(np.argmax(poses.axis[:, 2]))
         angle = np.degrees(np.arccos(-poses.axis[row, 2]))
         raise UserError(
-            f"pulse {row} at {poses.time_s[row]:g} s looks {angle:.4g} degrees from nadir: at most 87 may be"
+            f"pulse {row} at {poses.time_s[row]:.10g} s looks {angle:.4g} degrees from nadir: at most 87 may be"
         )
     if np.any(poses.origin[:, 2] <= 1):
         row = int(np.argmin(poses.origin[:, 2]))
         raise UserError(
-            f"pulse {row} at {poses.time_s[row]:g} s is sent from a height of {poses.origin[row, 2]:g} m: the scanner "
-            "must be more than 1 m above the mean sea level"
+            f"pulse {row} at {poses.time_s[row]:.10g} s is sent from a height of {poses.origin[row, 2]:g} m: the "
+            "scanner must be more than 1 m above the mean sea level"
         )
     places = poses.ground_point()[:, :2]
     if (farthest := float(np.abs(places).max())) > FARTHEST:

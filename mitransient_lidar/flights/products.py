@@ -236,6 +236,7 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
         placed[name] = placed[name] + first
     placed["number_of_returns"] = placed["number_of_returns"].clip(min=1)
     placed["return_number"] = placed["return_number"].clip(min=1)
+    placed["gps_time"].attrs["time_system"] = plan.time_system(flown.values("time_s"))
     brightest = float(np.nanmax(placed["intensity"].values, initial=0.0))
     placed["intensity"].attrs["full_scale"] = brightest or 1.0
     paths = [folder / "points.laz", folder / "waveforms.las", folder / "waveforms.wdp"]

@@ -20,6 +20,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
+from mitransient_lidar.flights.poses.times import tell_time_system
 from mitransient_lidar.flights.preparation import input_columns, lidar_of, record_of, shot_poses
 from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -104,6 +105,7 @@ class FlightRenderer:
             outside the record.
         """
         poses = plan.poses()
+        tell_time_system(plan.time_system(poses.time_s), poses.time_s)
         scene = scene_of(plan)
         if plan.corrections != "none":
             corrections_for(scene.instrument or "", plan.corrections)

@@ -115,6 +115,30 @@ def test_read_from_the_specification(
         np.testing.assert_array_equal(read_column(file, name).astype(np.float32), points[name].astype(np.float32))
 
 
+@pytest.mark.parametrize(
+    ("system", "less", "bit", "text"),
+    [
+        ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
+        ("gps_week", 0, 0, "seconds of the GPS week"),
+        ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
+        ("gps", 1e9, 1, "adjusted standard GPS time"),
+    ],
+)
+def test_times_their_type_and_the_notes_agree(
+    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, system: str, less: float, bit: int, text: str
+) -> None:
+    """Adjusted standard GPS time is GPS time less 10^9 s (LAS 1.4 R15, table 4, bit 0 of the global encoding)."""
+    points["gps_time"] = points["gps_time"] + less + 1000
+    points["gps_time"].attrs["time_system"] = system
+    write_points(tmp_path / "points.las", points)
+    write_waveforms(tmp_path / "waveforms.las", points, waveforms)
+    for name in ("points.las", "waveforms.las"):
+        file = las_reader.read(tmp_path / name)
+        assert file.encoding & 1 == bit
+        assert text in file.records["LASF_Spec", 3].decode("ascii")
+        np.testing.assert_array_equal(read_column(file, "gps_time"), points["gps_time"] - less)
+
+
 def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset) -> None:
     points["intensity"].values[:3] = [-0.1, 7.0, np.nan]
     write_points(tmp_path / "points.las", points)
