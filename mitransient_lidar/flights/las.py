@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 BOTTOM, WATER_SURFACE, SUBMERGED_OBJECT, NO_BOTTOM = 40, 41, 43, 45
 
 _MOST_POINTS = 2**32 - 1  # what programs with 32-bit counters open
-_MOST_RETURNS = 15
+#: Most scanner channels, and returns of a pulse in one of them.
+MOST_CHANNELS, MOST_RETURNS = 4, 15
 _SCAN_ANGLE_DEG = 0.006
 _LAST_INTENSITY = 2**16 - 1
 
@@ -56,7 +57,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
           flagged as synthetic, since no echo is there;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
-        - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a pixel;
+        - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
+        - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a channel;
         - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
@@ -161,8 +163,9 @@ def _notes(first: xr.Dataset) -> str:
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
         f"GPS time: {TIME_NOTES[_time_system(first)]}. "
         "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
-        "no echo is there). Return numbers count the echoes of a pulse in one pixel. Depths and uncertainties "
-        "(1 sigma) are NaN where unknown."
+        "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
+        "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
+        "Depths and uncertainties (1 sigma) are NaN where unknown."
     )
 
 
@@ -212,8 +215,8 @@ def _written(path: Path) -> Iterator[IO[bytes]]:
 
 def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float) -> dict[str, npt.NDArray[Any]]:
     """Return the values of a chunk by laspy's names of fields."""
-    returns = _whole(points, "number_of_returns", 1, _MOST_RETURNS)
-    number = _whole(points, "return_number", 1, _MOST_RETURNS)
+    returns = _whole(points, "number_of_returns", 1, MOST_RETURNS)
+    number = _whole(points, "return_number", 1, MOST_RETURNS)
     if np.any(number > returns):
         bad = np.argmax(number > returns)
         raise UserError(f"return_number = {number[bad]} must be at most number_of_returns, {returns[bad]}")
@@ -230,6 +233,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         "classification": kind,
         "synthetic": kind == NO_BOTTOM,
         "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),
+        "scanner_channel": _whole(points, "channel", 0, MOST_CHANNELS - 1),
         "return_number": number,
         "number_of_returns": returns,
         "scan_angle": np.round(angle / _SCAN_ANGLE_DEG),

@@ -17,10 +17,10 @@ from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.las import write_points, write_waveforms
+from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
+from mitransient_lidar.flights.positions import PointClass, fit_surface, numbered_returns, positions
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
 
@@ -234,8 +234,7 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     placed = points.copy()
     for name, first in zip("xyz", plan.origin, strict=True):
         placed[name] = placed[name] + first
-    placed["number_of_returns"] = placed["number_of_returns"].clip(min=1)
-    placed["return_number"] = placed["return_number"].clip(min=1)
+    placed = with_channels(placed, len(flown.coordinate("pixel")))
     placed["gps_time"].attrs["time_system"] = plan.time_system(flown.values("time_s"))
     brightest = float(np.nanmax(placed["intensity"].values, initial=0.0))
     placed["intensity"].attrs["full_scale"] = brightest or 1.0
@@ -243,6 +242,26 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     write_points(paths[0], placed, plan.crs)
     write_waveforms(paths[1], _with_packets(flown, placed), _packets(flown), plan.crs)
     return paths
+
+
+def with_channels(points: xr.Dataset, pixels: int) -> xr.Dataset:
+    """Return points with the scanner channels and return numbers of LAS.
+
+    Up to four pixels are the channels, and more are four groups of neighbours, whose returns of a pulse are numbered
+    together from the highest on. Those after the fifteenth have its number.
+    """
+    pixel, shot = points["pixel"].values, points["shot"].values
+    if pixels <= MOST_CHANNELS:
+        return points.assign(channel=("point", pixel))
+    channel = pixel * MOST_CHANNELS // pixels
+    order = np.lexsort((-points["z"].values, channel, shot))
+    found = {"channel": channel}
+    for name, values in zip(
+        ("return_number", "number_of_returns"), numbered_returns(shot[order], channel[order]), strict=True
+    ):
+        found[name] = np.empty(shot.size, dtype=np.int64)
+        found[name][order] = np.minimum(values, MOST_RETURNS)
+    return points.assign({name: ("point", values) for name, values in found.items()})
 
 
 def _chunks(flown: Flown) -> Iterator[slice]:

@@ -44,6 +44,7 @@ def points() -> xr.Dataset:
         "scan_angle_deg": rng.uniform(-21, 21, count),
         "line": 1 + pulse // 100,
         "pixel": pulse % PIXELS,
+        "channel": pulse % PIXELS,
         "shot": pulse // PIXELS,
         "depth": depth,
         **{f"{name}_uncertainty": rng.uniform(0.01, 0.5, count) for name in ("depth", "horizontal", "vertical")},
@@ -155,6 +156,14 @@ def test_points_without_an_echo_are_synthetic(tmp_path: Path, points: xr.Dataset
     file = las_reader.read(tmp_path / "points.las")
     assert {point.flags for point in file.points if point.classification == 45} == {1}
     assert {point.flags for point in file.points if point.classification != 45} == {0}
+
+
+def test_pixels_of_a_pulse_are_told_apart_by_standard_fields(tmp_path: Path, points: xr.Dataset) -> None:
+    write_points(tmp_path / "points.laz", points)
+    read = laspy.read(tmp_path / "points.laz")
+    np.testing.assert_array_equal(read.scanner_channel, points["pixel"])
+    keys = np.stack([read.gps_time, read.scanner_channel, read.return_number], axis=1)
+    assert len(np.unique(keys, axis=0)) == points.sizes["point"]
 
 
 def test_extra_bytes_are_described_and_missing_numbers_are_nan(tmp_path: Path, points: xr.Dataset) -> None:
@@ -352,6 +361,7 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
         ("kind", 256, "kind = 256 must lie between 0 and 255"),
         ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
         ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
+        ("channel", 4, "channel = 4 must lie between 0 and 3"),
         ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
         ("line", 70000, "line = 70000 must lie between 0 and 65535"),
         ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),
