@@ -94,6 +94,8 @@ def _prepare(plan: FlightPlan, path: Path, shard_size: int | None) -> Store:
         columns = store.inputs(slice(0, store.count))
         if not store.is_of("flight", plan.text, columns, lambda: scene_of(plan)):
             raise UserError(f"{path} holds another flight, or its scene has changed: choose another folder")
+        if shard_size not in (None, store.shard_size):
+            raise UserError(f"shard_size = {shard_size} must be that of {path}, {store.shard_size}")
         return store
     renderer, columns = FlightRenderer.of(plan)
     arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})

@@ -1,12 +1,14 @@
 """What is said of a flight before its first render: places of maps, coverage, corrections, cost and gain."""
 
 import re
+from types import SimpleNamespace
 
 import mitsuba as mi
 import pytest
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.fly import STORE, _prepare
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import check_maps
 from mitransient_lidar.flights.renderer import scene_of
@@ -95,3 +97,16 @@ def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
     for wrong in ({"crs": "EPSG:32633"}, {"origin": [500021.0, 6500015.0, 0.0]}):
         with pytest.raises(UserError, match=r"origin = \[500020.0, .* of the platform must have the x and y of that"):
             from_file(tmp_path, place, **wrong).poses()
+
+
+def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
+    """As that of a campaign: another size is refused instead of being ignored."""
+    store = SimpleNamespace(count=3, shard_size=16, inputs=lambda rows: {}, is_of=lambda *about: True)
+    monkeypatch.setattr("mitransient_lidar.flights.fly.Store", lambda path: store)
+    (tmp_path / STORE).mkdir()
+    for size in (None, 16, 8):
+        if size == 8:
+            with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*flight\.zarr, 16"):
+                _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size)
+        else:
+            assert _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size) is store
