@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
@@ -316,6 +316,11 @@ class Seabed(mi.Mesh):
     def map_origin(self) -> tuple[float, float] | None:
         """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
         return None if self.bottom.terrain is None else self.bottom.terrain.origin
+
+    def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return whether places [m] lie beyond the height map; nowhere without one."""
+        terrain = self.bottom.terrain
+        return np.zeros(np.shape(x), dtype=bool) if terrain is None else ~terrain.covers(x, y)
 
     def to_string(self) -> str:
         """Return a description."""

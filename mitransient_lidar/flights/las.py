@@ -62,6 +62,7 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
+        - ``quality``: sum of `products.Quality`, 0 to 255; ``withheld``: whether maps should leave the point out;
         - ``depth``, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m]; NaN if unknown.
     crs : str, optional
         Projected coordinate system in metres, such as 'EPSG:32633' or 'EPSG:32633+5773'; otherwise the scene's frame.
@@ -165,6 +166,8 @@ def _notes(first: xr.Dataset) -> str:
         "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
         "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
+        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections. "
+        "Points of saturated echoes and poor fits are withheld. "
         "Depths and uncertainties (1 sigma) are NaN where unknown."
     )
 
@@ -232,6 +235,8 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         - ADJUSTMENT_S * (_time_system(points) == "gps"),
         "classification": kind,
         "synthetic": kind == NO_BOTTOM,
+        "withheld": points["withheld"].values,
+        "quality": _whole(points, "quality", 0, 255),
         "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),
         "scanner_channel": _whole(points, "channel", 0, MOST_CHANNELS - 1),
         "return_number": number,

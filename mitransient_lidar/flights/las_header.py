@@ -44,6 +44,7 @@ class ExtraBytes(NamedTuple):
 EXTRA_BYTES = (
     ExtraBytes("pixel", "u2", 3, "index of the receiver's pixel"),
     ExtraBytes("shot", "u4", 5, "number of the laser pulse"),
+    ExtraBytes("quality", "u1", 1, "bits, see text area description"),
     ExtraBytes("depth", "f4", 9, "water depth, positive down [m]"),
     ExtraBytes("depth_uncertainty", "f4", 9, "depth, 1 sigma [m]"),
     ExtraBytes("horizontal_uncertainty", "f4", 9, "horizontal position, 1 sigma [m]"),

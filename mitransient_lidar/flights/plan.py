@@ -23,6 +23,7 @@ from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.times import time_system
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.flights.refracted_paths import PoseErrors
+from mitransient_lidar.physics.receiver.receiver_files import Setting
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
@@ -58,7 +59,7 @@ class FlightPlan:
         is rendered.
     receiver
         Receiver as of `analysis.receiver.detect_waveforms`, None for that of the instrument; `gain`, `optical_density`
-        and `background_power_w` are those of it.
+        (numbers or 'auto', which is chosen once for the flight) and `background_power_w` are those of it.
     estimator
         Estimator of `echo_table.extract`.
     corrections
@@ -90,8 +91,8 @@ class FlightPlan:
     most: int
     every: int
     receiver: str | None
-    gain: float | None
-    optical_density: float | None
+    gain: Setting | None
+    optical_density: Setting | None
     background_power_w: float
     estimator: str
     corrections: str
@@ -146,6 +147,8 @@ class FlightPlan:
         except (TypeError, ValueError):
             raise UserError("the flight must hold numbers, texts, lists and tables only") from None
         gain, density = receiver.get("gain"), receiver.get("optical_density")
+        if gain == density == "auto":
+            raise UserError("gain = 'auto' and optical_density = 'auto' are alternatives: give one of them")
         x, y, z = origin.tolist()
         plan = cls(
             scene=_path(scene, folder, ".xml"),
@@ -155,8 +158,8 @@ class FlightPlan:
             most=integer("most", pulses.get("most", MOST_PULSES), 1, MOST_PULSES),
             every=integer("every", pulses.get("every", 1), 1, 10**9),
             receiver=receiver.get("chain"),
-            gain=None if gain is None else positive("gain", gain),
-            optical_density=None if density is None else in_range("optical_density", density, 0, 12),
+            gain=gain if gain in (None, "auto") else positive("gain", gain),
+            optical_density=density if density in (None, "auto") else in_range("optical_density", density, 0, 12),
             background_power_w=non_negative("background_power_w", receiver.get("background_power_w", 0.0)),
             estimator=estimator,
             corrections=_path(given.get("corrections", "none"), folder, ".nc"),

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import logging
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+import xarray as xr
 
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray
 from mitransient_lidar.flights.plan import SAME_PLACE_M, FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses, poses_of
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.transport.scene import LidarScene
+
+_LOG = logging.getLogger(__name__)
 
 #: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
 _ANGLES, _HEIGHTS = 2.0, 1.1
@@ -85,8 +90,10 @@ def input_columns(poses: PulsePoses) -> dict[str, Column]:
     return {name: column[order] for name, column in columns.items()}
 
 
-def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column]) -> TimeAxis:
+def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column]) -> tuple[TimeAxis, int]:
     """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
+
+    The number is that of pulses which meet the bottom beyond its height map.
 
     Raises
     ------
@@ -96,6 +103,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
     from mitransient_lidar.rendering.shot_truth import solids_below
+    from mitransient_lidar.transport.plugin_types import SeabedShape
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     angle, height, *aim = lidar_of(inputs)
@@ -120,6 +128,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
             f"the bottom does not cover the flight: {missed} of {bottom.size} pulses miss it, the first one, pulse "
             f"{inputs['pulse'][row]}, at x = {poses.places[row, 0]:.1f} m, y = {poses.places[row, 1]:.1f} m"
         )
+    beyond = sum(np.count_nonzero(bed.is_beyond_map(x, y)) for bed in lidar.bottoms if isinstance(bed, SeabedShape))
     # The places of the extremes of depth, and others.
     depths = np.argsort(bottom)
     chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
@@ -128,7 +137,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
     if not film.is_fixed:
         own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
-        return TimeAxis.covering(first, last, own.bin_width_ns)
+        return TimeAxis.covering(first, last, own.bin_width_ns), beyond
     way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
     arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
     if arrival > film.axis.end_ns:
@@ -137,7 +146,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
             f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
         )
     fixed: TimeAxis = film.axis
-    return fixed
+    return fixed, beyond
 
 
 def check_maps(plan: FlightPlan, scene: mi.Scene) -> None:
@@ -159,6 +168,55 @@ def check_maps(plan: FlightPlan, scene: mi.Scene) -> None:
             f"the map of shape {shape.id()} has its point ({found[0]:.10g}, {found[1]:.10g}) at x = y = 0, where the "
             f"flight has its origin ({x:.10g}, {y:.10g}): {cure}the flight the origin of the map"
         )
+
+
+def beyond_angles(angle_deg: FloatArray, table: xr.Dataset) -> BoolArray:
+    """Return which angles from nadir [deg] are outside those of a table of corrections by more than half of a group."""
+    low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
+    return np.asarray((angle_deg < low - _ANGLES / 2) | (angle_deg > high + _ANGLES / 2))
+
+
+def warn_of_angles(angle_deg: FloatArray, table: xr.Dataset) -> None:
+    """Warn of pulses outside the angles from nadir of a table of corrections."""
+    low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
+    if outside := np.count_nonzero(beyond_angles(angle_deg, table)):
+        _LOG.warning(
+            f"{outside} of {angle_deg.size} pulses have corrections beyond the angles of their table, {low:g} to "
+            f"{high:g} degrees from nadir: set corrections to none, or to a table of depth-bias with these angles"
+        )
+
+
+@contextlib.contextmanager
+def telling_errors_alone() -> Iterator[None]:
+    """Keep the package from telling of a scene what it has told of it before."""
+    logger = logging.getLogger("mitransient_lidar")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def warn_of_maps(beyond: int, pulses: int) -> None:
+    """Warn of pulses beyond the height map of a bottom."""
+    if beyond:
+        _LOG.warning(
+            "%d of %d pulses meet the bottom beyond its height map, whose edge continues there", beyond, pulses
+        )
+
+
+def tell_forecast(saturated: int, sampled: int, pulses: int, seconds: float) -> None:
+    """Log how many pulses of a sample saturate, and the processor time of a flight by that of one of them [s]."""
+    if saturated:
+        _LOG.warning(
+            "%d of %d sampled pulses saturate the receiver, %.0f %% of the flight; saturated echoes are withheld, "
+            "and gain = 'auto' in [receiver] avoids most of it",
+            *(saturated, sampled, 100 * saturated / sampled),
+        )
+    else:
+        _LOG.info("none of %d sampled pulses saturates the receiver", sampled)
+    _LOG.info("%d pulses take about %.2g s of processor time, by those of the sample", pulses, pulses * seconds)
 
 
 def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -21,11 +23,28 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.poses.times import tell_time_system
-from mitransient_lidar.flights.preparation import input_columns, lidar_of, record_of, shot_poses
-from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
+from mitransient_lidar.flights.preparation import (
+    input_columns,
+    lidar_of,
+    record_of,
+    shot_poses,
+    tell_forecast,
+    telling_errors_alone,
+    warn_of_angles,
+    warn_of_maps,
+)
+from mitransient_lidar.flights.recording import (
+    SETTINGS,
+    chosen_settings,
+    has_automatic_settings,
+    pooled_errors,
+    record,
+    saturated_pulses,
+)
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
 
 if TYPE_CHECKING:
@@ -38,8 +57,9 @@ _BATCH, _STILL_S = 64, 0.05
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
 
-#: Pulses of a flight that automatic settings of its receiver are chosen from, and passes of each.
-_PROBES, _PROBE_PASSES = 128, 4
+#: Pulses of a flight that automatic settings of its receiver are chosen from, those of another one that are sampled
+#: before it, and passes of each.
+_PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
 
 #: Inputs of each pulse: unit and description.
 _INPUTS = {
@@ -95,8 +115,11 @@ class FlightRenderer:
         return self.plan.text
 
     @classmethod
-    def of(cls, plan: FlightPlan) -> tuple[FlightRenderer, dict[str, Column]]:
-        """Return the renderer of a new flight, and the inputs of its pulses, in groups.
+    def of(cls, plan: FlightPlan, progress: ProgressCallback | None = None) -> tuple[FlightRenderer, dict[str, Column]]:
+        """Return the renderer of a new flight, and the inputs of its pulses, in groups; tell what is known before it.
+
+        That is what poses are beyond the corrections, and by a sample of pulses the time that the flight takes and how
+        many pulses saturate. `progress` is called with a `Progress` of the groups, and of the sample.
 
         Raises
         ------
@@ -107,21 +130,34 @@ class FlightRenderer:
         poses = plan.poses()
         tell_time_system(plan.time_system(poses.time_s), poses.time_s)
         scene = scene_of(plan)
-        if plan.corrections != "none":
-            corrections_for(scene.instrument or "", plan.corrections)
         columns = input_columns(poses)
-        longest, start = None, np.empty(len(poses.time_s))
-        for group in np.unique(columns["group"]):
-            rows = np.flatnonzero(columns["group"] == group)
-            own = record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
-            start[rows] = own.start_ns
-            if longest is None or own.bin_count > longest.bin_count:
-                longest = own
-        renderer = cls(plan, scene, longest)
-        columns["record_start_ns"] = start
-        if has_automatic_settings(plan, scene.instrument):
-            settings = chosen_settings(renderer._probes(columns), plan)
-            columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
+        if plan.corrections != "none":
+            warn_of_angles(columns["group_angle_deg"], corrections_for(scene.instrument or "", plan.corrections))
+        longest, start, beyond = None, np.empty(len(poses.time_s)), 0
+        groups = np.unique(columns["group"])
+        with contextlib.ExitStack() as quiet:
+            for number, group in enumerate(groups):
+                rows = np.flatnonzero(columns["group"] == group)
+                own, missed = record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
+                beyond += missed
+                start[rows] = own.start_ns
+                if longest is None or own.bin_count > longest.bin_count:
+                    longest = own
+                if number == 0:
+                    quiet.enter_context(telling_errors_alone())
+                if progress is not None:
+                    progress(Progress(done=number + 1, planned=len(groups), unit="preparing group"))
+        warn_of_maps(beyond, start.size)
+        with telling_errors_alone():
+            renderer = cls(plan, scene, longest)
+            columns["record_start_ns"] = start
+            is_automatic = has_automatic_settings(plan, scene.instrument)
+            probes = renderer._probes(columns, _PROBES if is_automatic else _SAMPLED, progress)
+            settings = chosen_settings((series for series, _ in probes), plan) if is_automatic else {}
+            saturated = saturated_pulses((series for series, _ in probes), plan, settings)
+        columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
+        sampled = sum(series.sizes["shot"] for series, _ in probes)
+        tell_forecast(saturated, sampled, start.size, float(np.median([seconds for _, seconds in probes])))
         return renderer, columns
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
@@ -198,16 +234,34 @@ class FlightRenderer:
         share = share_for_error(error)
         return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
 
-    def _probes(self, columns: Mapping[str, Column]) -> Iterator[xr.Dataset]:
-        """Return the waveforms of pulses that are spread over the flight, those of a group together."""
+    def _probes(
+        self, columns: Mapping[str, Column], most: int, progress: ProgressCallback | None
+    ) -> list[tuple[xr.Dataset, float]]:
+        """Return the waveforms of pulses that are spread over the flight, those of a group together.
+
+        Each part has the processor time of a pulse with as many passes as its error needs [s].
+        """
+        from mitransient_lidar.rendering.shot_batches import relative_errors
+
         count = len(columns["pulse"])
-        rows = np.unique(np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int))
+        rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+        found: list[tuple[xr.Dataset, float]] = []
         for group in np.unique(columns["group"][rows]):
             own = rows[columns["group"][rows] == group]
             for part in np.array_split(own, -(-own.size // _BATCH)):
-                yield self._render(
-                    {name: column[part] for name, column in columns.items()}, self._passes(until_error=False)
-                )[0]
+                inputs = {name: column[part] for name, column in columns.items()}
+                window, began = self._scene_of(inputs).window, time.process_time()
+                series = self._render(inputs, self._passes(until_error=False))[0]
+                took = (time.process_time() - began) / part.size
+                power, stderr = (
+                    series[name].transpose("shot", "pixel", "time").values for name in ("waveform", "waveform_stderr")
+                )
+                error = float(np.median(relative_errors(power, stderr, window)))
+                found.append((series, took * max((error / self.plan.target_error) ** 2, 1.0)))
+                if progress is not None:
+                    done = sum(one.sizes["shot"] for one, _ in found)
+                    progress(Progress(done=done, planned=rows.size, unit="sampling pulse"))
+        return found
 
     def _scene_of(self, inputs: Mapping[str, Column]) -> ShotScene:
         """Return the loaded scene of the lidar of pulses of one group."""

@@ -48,6 +48,8 @@ def points() -> xr.Dataset:
         "shot": pulse // PIXELS,
         "depth": depth,
         **{f"{name}_uncertainty": rng.uniform(0.01, 0.5, count) for name in ("depth", "horizontal", "vertical")},
+        "quality": np.where(pulse % 7 == 0, 1, 12 * (kind == 40)),
+        "withheld": pulse % 7 == 0,
         "packet": np.where(pulse % 5 == 4, -1, pulse),
         "time_in_packet_ns": rng.uniform(0, SAMPLES, count),
     }
@@ -151,11 +153,13 @@ def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset)
     assert np.max(np.abs(step * read[3:] - points["intensity"][3:])) <= 0.5001 * step
 
 
-def test_points_without_an_echo_are_synthetic(tmp_path: Path, points: xr.Dataset) -> None:
+def test_points_without_an_echo_are_synthetic_and_doubtful_ones_withheld(tmp_path: Path, points: xr.Dataset) -> None:
     write_points(tmp_path / "points.las", points)
     file = las_reader.read(tmp_path / "points.las")
-    assert {point.flags for point in file.points if point.classification == 45} == {1}
-    assert {point.flags for point in file.points if point.classification != 45} == {0}
+    synthetic, withheld = ([point.flags >> bit & 1 for point in file.points] for bit in (0, 2))
+    assert synthetic == [point.classification == 45 for point in file.points]
+    np.testing.assert_array_equal(withheld, points["withheld"])
+    np.testing.assert_array_equal(read_column(file, "quality"), points["quality"])
 
 
 def test_pixels_of_a_pulse_are_told_apart_by_standard_fields(tmp_path: Path, points: xr.Dataset) -> None:
@@ -361,6 +365,7 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
         ("kind", 256, "kind = 256 must lie between 0 and 255"),
         ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
         ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
+        ("quality", 256, "quality = 256 must lie between 0 and 255"),
         ("channel", 4, "channel = 4 must lie between 0 and 3"),
         ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
         ("line", 70000, "line = 70000 must lie between 0 and 65535"),

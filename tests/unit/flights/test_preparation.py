@@ -1,16 +1,18 @@
 """What is said of a flight before its first render: places of maps, coverage, corrections, cost and gain."""
 
+import logging
 import re
 from types import SimpleNamespace
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.fly import STORE, _prepare
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.preparation import check_maps
+from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
 from mitransient_lidar.flights.renderer import scene_of
 
 LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
@@ -82,6 +84,17 @@ def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
     assert ("origin_x" in scene_of(FlightPlan.of(given, tmp_path)).text) == bool(own)
 
 
+def test_places_beyond_a_map(tmp_path, caplog):
+    """Cells of 10 m about centres from -15 to 15 and -10 to 10 m; the mesh of the bottom is 1000 m wide."""
+    bed = loaded_scene(tmp_path).shapes()[0]
+    x, y = np.array([0.0, 19.0, 21.0, 0.0]), np.array([0.0, -14.0, 0.0, 16.0])
+    assert bed.is_beyond_map(x, y).tolist() == [False, False, True, True]
+    warn_of_maps(2, 4)
+    assert caplog.messages == ["2 of 4 pulses meet the bottom beyond its height map, whose edge continues there"]
+    plane = mi.load_dict({"type": "seabed"})
+    assert not plane.is_beyond_map(x, y).any()
+
+
 def test_a_map_without_coordinates_and_a_flight_without_them_go_together(tmp_path):
     check_maps(FlightPlan.of(FLIGHT), loaded_scene(tmp_path))
     check_maps(
@@ -110,3 +123,22 @@ def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
                 _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size)
         else:
             assert _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size) is store
+
+
+def test_what_is_told_before_a_flight(caplog):
+    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
+        tell_forecast(16, 64, 3000, 0.1)
+        tell_forecast(0, 64, 3000, 0.1)
+    told = [record.getMessage() for record in caplog.records]
+    assert told[0].startswith("16 of 64 sampled pulses saturate the receiver, 25 % of the flight; ")
+    assert told[1] == told[3] == "3000 pulses take about 3e+02 s of processor time, by those of the sample"
+    assert told[2] == "none of 64 sampled pulses saturates the receiver"
+
+
+def test_what_is_told_once(caplog):
+    logger = logging.getLogger("mitransient_lidar.physics")
+    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
+        with telling_errors_alone():
+            logger.info("again")
+        logger.info("anew")
+    assert [record.getMessage() for record in caplog.records] == ["anew"]
