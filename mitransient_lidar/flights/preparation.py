@@ -128,7 +128,9 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
             f"the bottom does not cover the flight: {missed} of {bottom.size} pulses miss it, the first one, pulse "
             f"{inputs['pulse'][row]}, at x = {poses.places[row, 0]:.1f} m, y = {poses.places[row, 1]:.1f} m"
         )
-    beyond = sum(np.count_nonzero(bed.is_beyond_map(x, y)) for bed in lidar.bottoms if isinstance(bed, SeabedShape))
+    beyond = sum(
+        int(np.count_nonzero(bed.is_beyond_map(x, y))) for bed in lidar.bottoms if isinstance(bed, SeabedShape)
+    )
     # The places of the extremes of depth, and others.
     depths = np.argsort(bottom)
     chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
