@@ -12,7 +12,7 @@ from mitransient_lidar.flights.fly import fly
 
 pytestmark = pytest.mark.slow
 
-#: Middle of the survey in EPSG:32633, and height of the lidar above the sea [m].
+#: End of the flight line in EPSG:32633, and height of the lidar above the sea [m].
 PLACE, HEIGHT = (500_040.0, 6_500_040.0), 75.0
 
 #: Time of the first record in its GPS week [s].
@@ -41,10 +41,10 @@ def write_geotiff(path):
 
 
 def write_sbet(path):
-    """Write a second of level flight along grid east at 40 m/s, centred on the place, with records of 5 ms."""
+    """Write a second of level flight along grid east at 40 m/s up to the place, with records of 5 ms."""
     pyproj = pytest.importorskip("pyproj")
     time = START + np.arange(201) * 5e-3
-    x, y = PLACE[0] - 20 + 40 * (time - START), np.full(time.shape, PLACE[1])
+    x, y = PLACE[0] - 40 + 40 * (time - START), np.full(time.shape, PLACE[1])
     grid = pyproj.CRS.from_epsg(32633)
     longitude, latitude = pyproj.Transformer.from_crs(grid, 4326, always_xy=True).transform(x, y)
     # Grid north is the true heading of the meridian convergence.
@@ -83,7 +83,7 @@ def test_points_lie_where_map_and_trajectory_have_them(tmp_path):
         # Forward at 14 degrees from nadir: to the east, and refracted at the surface from which the depth counts.
         surface, sine = places[row, 2] + depths[row], math.sin(math.radians(14))
         ahead = (HEIGHT - surface) * math.tan(math.radians(14)) + depths[row] * math.tan(math.asin(sine / 1.34))
-        by_hand = PLACE[0] - 20 + 40 * (times[row] - START) + ahead, PLACE[1]
+        by_hand = PLACE[0] - 40 + 40 * (times[row] - START) + ahead, PLACE[1]
         np.testing.assert_allclose(places[row, :2], by_hand, atol=0.01)
         assert abs(surface) < 0.2
     x, _, z = places[bottom].T
