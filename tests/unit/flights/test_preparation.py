@@ -11,6 +11,7 @@ import pytest
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.fly import STORE, _prepare
+from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
 from mitransient_lidar.flights.renderer import scene_of
@@ -142,3 +143,11 @@ def test_what_is_told_once(caplog):
             logger.info("again")
         logger.info("anew")
     assert [record.getMessage() for record in caplog.records] == ["anew"]
+
+
+def test_an_sbet_file_is_in_the_system_of_the_points():
+    pytest.importorskip("pyproj")
+    for crs in ("EPSG:32633", "EPSG:32633+5773"):
+        check_same_system(crs, 32633)
+        with pytest.raises(UserError, match=r"epsg = 32634 of the platform must be .* crs = 'EPSG:32633"):
+            check_same_system(crs, 32634)
