@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
@@ -239,8 +239,8 @@ class Seabed(mi.Mesh):
     map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
                                       or their mean spacing
     origin_x, origin_y        float   Point of the map, in its coordinates in metres, that lies at x = y = 0. Default:
-                                      the centre of an .asc, .tif or .bag, or of points; positions in other files are
-                                      those of the scene
+                                      of an .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the
+                                      centre; positions in other files are those of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
@@ -312,6 +312,16 @@ class Seabed(mi.Mesh):
         """Reflectance of bottom and patches, None where they differ."""
         values = {self.bottom.reflectance, *(patch.reflectance for patch in self.bottom.patches)}
         return float(values.pop()) if len(values) == 1 else None
+
+    @property
+    def map_origin(self) -> tuple[float, float] | None:
+        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
+        return None if self.bottom.terrain is None else self.bottom.terrain.origin
+
+    def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return whether places [m] lie beyond the height map; nowhere without one."""
+        terrain = self.bottom.terrain
+        return np.zeros(np.shape(x), dtype=bool) if terrain is None else ~terrain.covers(x, y)
 
     def to_string(self) -> str:
         """Return a description."""

@@ -20,6 +20,7 @@ from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
@@ -325,10 +326,11 @@ class RunRenderer:
 
 
 def record_of(campaign: Campaign) -> SceneRecord:
-    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be loaded."""
-    record = open_scene(campaign.scene, None, instrument=campaign.instrument).record
-    assert record is not None
-    return record
+    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be read.
+
+    It is not loaded: files that are its defaults may be missing where the runs have others.
+    """
+    return read_record(campaign.scene, campaign.fixed, campaign.instrument)
 
 
 def check_names(campaign: Campaign) -> None:

@@ -94,6 +94,7 @@ def find_shots(
 def shots(
     scene: SceneOrResult,
     define: Define = None,
+    instrument: Instrument = None,
     count: Annotated[
         int | None, typer.Option(help="Number of shots at random places, 2 to 100 000; 20 by default.")
     ] = None,
@@ -134,6 +135,10 @@ def shots(
     where = {name: value for name, value in every.items() if value is not None}
     if is_result(scene) and where:
         raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}.")
+    if instrument is not None:
+        if is_result(scene):
+            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument.")
+        options["instrument"] = instrument
     default = {} if is_result(scene) else {"count": 20}
     render = render_again if is_result(scene) else study.render_shots
     with DeferredInterrupt(at_once=False):

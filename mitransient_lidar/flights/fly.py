@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.preparation import telling_errors_alone
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -78,23 +79,27 @@ def fly(
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
     folder = Path(folder)
     coordinate_system_wkt(plan.crs, plan.origin[:2])
-    store = complete(lambda: _prepare(plan, folder / STORE, shard_size), workers, scheduler, False, progress)
+    store = complete(lambda: _prepare(plan, folder / STORE, shard_size, progress), workers, scheduler, False, progress)
     flown = Flown.of(store)
-    points = points_of(flown, plan)
+    with telling_errors_alone():
+        points = points_of(flown, plan)
     write_files(flown, plan, points, folder)
     return points
 
 
-def _prepare(plan: FlightPlan, path: Path, shard_size: int | None) -> Store:
+def _prepare(plan: FlightPlan, path: Path, shard_size: int | None, progress: ProgressCallback | None = None) -> Store:
     """Return the store of a flight, a new one if there is none."""
     if path.exists():
         store = Store(path)
         columns = store.inputs(slice(0, store.count))
         if not store.is_of("flight", plan.text, columns, lambda: scene_of(plan)):
             raise UserError(f"{path} holds another flight, or its scene has changed: choose another folder")
+        if shard_size not in (None, store.shard_size):
+            raise UserError(f"shard_size = {shard_size} must be that of {path}, {store.shard_size}")
         return store
-    renderer, columns = FlightRenderer.of(plan)
-    arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
+    renderer, columns = FlightRenderer.of(plan, progress)
+    with telling_errors_alone():
+        arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
     count = len(columns["pulse"])
     size = min(max(-(-count // _SHARDS), _FEWEST), _MOST, count) if shard_size is None else shard_size
     return Store.create(path, renderer, columns, arrays, coordinates, size, attributes)

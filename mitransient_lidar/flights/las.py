@@ -21,7 +21,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
 from mitransient_lidar.core.validation import finite_array, integer, positive
-from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, coordinate_system_wkt, las_header
+from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
+from mitransient_lidar.flights.poses.times import ADJUSTMENT_S
 from mitransient_lidar.flights.waveform_packets import PacketWriter
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 BOTTOM, WATER_SURFACE, SUBMERGED_OBJECT, NO_BOTTOM = 40, 41, 43, 45
 
 _MOST_POINTS = 2**32 - 1  # what programs with 32-bit counters open
-_MOST_RETURNS = 15
+#: Most scanner channels, and returns of a pulse in one of them.
+MOST_CHANNELS, MOST_RETURNS = 4, 15
 _SCAN_ANGLE_DEG = 0.006
 _LAST_INTENSITY = 2**16 - 1
 
@@ -49,15 +51,18 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         Points of the flight, or chunks of them, of which one is in memory at a time. Variables over ``point``:
 
         - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
-        - ``gps_time``: time of the pulse [s], from the beginning of the flight;
+        - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.times.TIME_SYSTEMS`, is
+          ``flight`` by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found. The last is
           flagged as synthetic, since no echo is there;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
-        - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a pixel;
+        - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
+        - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a channel;
         - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
+        - ``quality``: sum of `products.Quality`, 0 to 255; ``withheld``: whether maps should leave the point out;
         - ``depth``, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m]; NaN if unknown.
     crs : str, optional
         Projected coordinate system in metres, such as 'EPSG:32633' or 'EPSG:32633+5773'; otherwise the scene's frame.
@@ -79,7 +84,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
     first, chunks = _first(points)
     wkt = coordinate_system_wkt(crs, _place(first))
     with replacing(path) as temporary:
-        return _write(temporary, las_header(6, _place(first), wkt, _notes(first)), ((chunk, {}) for chunk in chunks))
+        header = las_header(6, _place(first), wkt, _notes(first), time_system=_time_system(first))
+        return _write(temporary, header, ((chunk, {}) for chunk in chunks))
 
 
 def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chunks, crs: str | None = None) -> int:
@@ -116,7 +122,8 @@ def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chu
     wkt = coordinate_system_wkt(crs, _place(first))
     with together(), replacing(path) as las, replacing(path.with_suffix(".wdp")) as wdp, open(wdp, "wb") as file:
         writer = PacketWriter(file, first_waveforms)
-        header = las_header(9, _place(first), wkt, _notes(first), writer.descriptor)
+        about = _place(first), wkt, _notes(first), writer.descriptor
+        header = las_header(9, *about, time_system=_time_system(first))
         pairs = zip(chunks, packets, strict=True)
         count = _write(las, header, ((chunk, writer.append(packet, chunk)) for chunk, packet in pairs))
         writer.finish()
@@ -145,15 +152,23 @@ def _place(first: xr.Dataset) -> tuple[float, float]:
     return x, y
 
 
+def _time_system(first: xr.Dataset) -> str:
+    """Return the system of the times of points."""
+    return str(first["gps_time"].attrs.get("time_system", "flight"))
+
+
 def _notes(first: xr.Dataset) -> str:
     intensity = first["intensity"].attrs
     step = positive("full_scale", intensity["full_scale"]) / _LAST_INTENSITY
     return (
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
-        "GPS time: seconds from the beginning of the flight, not of a GPS week. "
+        f"GPS time: {TIME_NOTES[_time_system(first)]}. "
         "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
-        "no echo is there). Return numbers count the echoes of a pulse in one pixel. Depths and uncertainties "
-        "(1 sigma) are NaN where unknown."
+        "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
+        "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
+        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections. "
+        "Points of saturated echoes and poor fits are withheld. "
+        "Depths and uncertainties (1 sigma) are NaN where unknown."
     )
 
 
@@ -203,8 +218,8 @@ def _written(path: Path) -> Iterator[IO[bytes]]:
 
 def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float) -> dict[str, npt.NDArray[Any]]:
     """Return the values of a chunk by laspy's names of fields."""
-    returns = _whole(points, "number_of_returns", 1, _MOST_RETURNS)
-    number = _whole(points, "return_number", 1, _MOST_RETURNS)
+    returns = _whole(points, "number_of_returns", 1, MOST_RETURNS)
+    number = _whole(points, "return_number", 1, MOST_RETURNS)
     if np.any(number > returns):
         bad = np.argmax(number > returns)
         raise UserError(f"return_number = {number[bad]} must be at most number_of_returns, {returns[bad]}")
@@ -216,10 +231,14 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
     extra = {item.name: points[item.name].values for item in EXTRA_BYTES if item.dtype == "f4"}
     return {
         **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
-        "gps_time": finite_array("gps_time", points["gps_time"].values),
+        "gps_time": finite_array("gps_time", points["gps_time"].values)
+        - ADJUSTMENT_S * (_time_system(points) == "gps"),
         "classification": kind,
         "synthetic": kind == NO_BOTTOM,
+        "withheld": points["withheld"].values,
+        "quality": _whole(points, "quality", 0, 255),
         "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),
+        "scanner_channel": _whole(points, "channel", 0, MOST_CHANNELS - 1),
         "return_number": number,
         "number_of_returns": returns,
         "scan_angle": np.round(angle / _SCAN_ANGLE_DEG),

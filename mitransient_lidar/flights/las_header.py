@@ -22,6 +22,14 @@ SCENE_WKT = (
     'AXIS["x",EAST],AXIS["y",NORTH],AXIS["z",UP]]'
 )
 
+#: What the times of points are, by their system (`poses.times.TIME_SYSTEMS`).
+TIME_NOTES = {
+    "flight": "seconds as in the trajectory of the flight, not of a known GPS week",
+    "gps_week": "seconds of the GPS week",
+    "gps": "adjusted standard GPS time, seconds since 6 January 1980 less 1e9",
+    "adjusted_gps": "adjusted standard GPS time, seconds since 6 January 1980 less 1e9",
+}
+
 _DESCRIPTOR = struct.Struct("<2xBB32s4xd16x8x16x8x16x8x16x8x16x32s")
 _SOFTWARE = "mitransient-lidar"
 _NO_DATA = 1  # bit of the options: the value for missing data is relevant
@@ -39,6 +47,7 @@ class ExtraBytes(NamedTuple):
 EXTRA_BYTES = (
     ExtraBytes("pixel", "u2", 3, "index of the receiver's pixel"),
     ExtraBytes("shot", "u4", 5, "number of the laser pulse"),
+    ExtraBytes("quality", "u1", 1, "bits, see text area description"),
     ExtraBytes("depth", "f4", 9, "water depth, positive down [m]"),
     ExtraBytes("depth_uncertainty", "f4", 9, "depth, 1 sigma [m]"),
     ExtraBytes("horizontal_uncertainty", "f4", 9, "horizontal position, 1 sigma [m]"),
@@ -75,8 +84,24 @@ def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = N
     return wkt
 
 
+def check_same_system(crs: str, epsg: int) -> None:
+    """Raise `UserError` if positions are not in the horizontal part of a system of `coordinate_system_wkt`."""
+    import pyproj
+
+    whole = pyproj.CRS.from_user_input(crs)
+    level = next(iter(whole.sub_crs_list), whole)
+    if not level.equals(pyproj.CRS.from_epsg(epsg), ignore_axis_order=True):
+        raise UserError(f"epsg = {epsg} of the platform must be the coordinate system of the points, crs = {crs!r}")
+
+
 def las_header(
-    point_format: int, first: tuple[float, float], wkt: str, notes: str, descriptor: bytes = b""
+    point_format: int,
+    first: tuple[float, float],
+    wkt: str,
+    notes: str,
+    descriptor: bytes = b"",
+    *,
+    time_system: str = "flight",
 ) -> laspy.LasHeader:
     """Return the header of a file of LAS 1.4.
 
@@ -92,8 +117,11 @@ def las_header(
         Text for the reader, as Text Area Description.
     descriptor : bytes
         Waveform Packet Descriptor of format 9.
+    time_system : str
+        System of the times of the pulses, of `TIME_NOTES`.
     """
     import laspy
+    from laspy.header import GpsTimeType
 
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = f"{_SOFTWARE} {__version__}"[:32]
@@ -101,6 +129,8 @@ def las_header(
     header.scales = [SCALE_M] * 3
     header.offsets = [*(1000.0 * math.floor(value / 1000) for value in first), 0.0]
     header.global_encoding.wkt = True
+    since_1980 = time_system in ("gps", "adjusted_gps")
+    header.global_encoding.gps_time_type = GpsTimeType.STANDARD if since_1980 else GpsTimeType.WEEK_TIME
     if descriptor:  # setting False sets the bit before laspy 2.7
         header.global_encoding.waveform_data_packets_external = True
     header.add_extra_dims([laspy.ExtraBytesParams(name=extra.name, type=extra.dtype) for extra in EXTRA_BYTES])

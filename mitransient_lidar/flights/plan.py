@@ -10,18 +10,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
-from mitransient_lidar.core.validation import finite_array, in_range, integer, non_negative, positive, shown
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, non_negative, positive, shown
+from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.flights.poses.times import time_system
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.flights.refracted_paths import PoseErrors
+from mitransient_lidar.physics.receiver.receiver_files import Setting
+
+#: Parameters of the scene that the poses of the pulses replace.
+POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
 
 #: Most pulses of a flight.
 MOST_PULSES = 1_000_000
+
+#: Largest difference of coordinates of one place [m], that of the rounding in files.
+SAME_PLACE_M = 1e-3
 
 #: Keys of a plan, of its table of pulses, and of that of the receiver.
 _KEYS = (
@@ -48,7 +59,7 @@ class FlightPlan:
         is rendered.
     receiver
         Receiver as of `analysis.receiver.detect_waveforms`, None for that of the instrument; `gain`, `optical_density`
-        and `background_power_w` are those of it.
+        (numbers or 'auto', which is chosen once for the flight) and `background_power_w` are those of it.
     estimator
         Estimator of `echo_table.extract`.
     corrections
@@ -80,8 +91,8 @@ class FlightPlan:
     most: int
     every: int
     receiver: str | None
-    gain: float | None
-    optical_density: float | None
+    gain: Setting | None
+    optical_density: Setting | None
     background_power_w: float
     estimator: str
     corrections: str
@@ -136,6 +147,8 @@ class FlightPlan:
         except (TypeError, ValueError):
             raise UserError("the flight must hold numbers, texts, lists and tables only") from None
         gain, density = receiver.get("gain"), receiver.get("optical_density")
+        if gain == density == "auto":
+            raise UserError("gain = 'auto' and optical_density = 'auto' are alternatives: give one of them")
         x, y, z = origin.tolist()
         plan = cls(
             scene=_path(scene, folder, ".xml"),
@@ -145,8 +158,8 @@ class FlightPlan:
             most=integer("most", pulses.get("most", MOST_PULSES), 1, MOST_PULSES),
             every=integer("every", pulses.get("every", 1), 1, 10**9),
             receiver=receiver.get("chain"),
-            gain=None if gain is None else positive("gain", gain),
-            optical_density=None if density is None else in_range("optical_density", density, 0, 12),
+            gain=gain if gain in (None, "auto") else positive("gain", gain),
+            optical_density=density if density in (None, "auto") else in_range("optical_density", density, 0, 12),
             background_power_w=non_negative("background_power_w", receiver.get("background_power_w", 0.0)),
             estimator=estimator,
             corrections=_path(given.get("corrections", "none"), folder, ".nc"),
@@ -161,7 +174,7 @@ class FlightPlan:
             folder=folder,
             text=text,
         )
-        for name in ("aim_x", "aim_y", "altitude", "off_nadir_deg"):
+        for name in POSE_PARAMETERS:
             if name in plan.parameters:
                 raise UserError(
                     f"parameter {name!r} follows from the poses of the pulses: leave it out of [parameters]"
@@ -179,18 +192,47 @@ class FlightPlan:
         Raises
         ------
         UserError
-            For a platform, a scanner or a mounting that is invalid, and for too many pulses.
+            For a platform, a scanner or a mounting that is invalid, a platform in other coordinates than the points,
+            and too many pulses.
         """
         given = json.loads(self.text)
         platform, scanner = (table(name, required("a flight", given, name)) for name in ("platform", "scanner"))
         trajectory = Trajectory.of(platform, self.folder)
+        self._check_coordinates(platform)
         times = trajectory.pulse_times(self.rate_hz)[:: self.every][: self.most]
         if times.size > MOST_PULSES:
             raise UserError(
                 f"the flight has {times.size} pulses: at most {MOST_PULSES} may be; set most or every in [pulses]"
             )
+        self.time_system(times)
         mounting = Mounting.of(table("mounting", given.get("mounting", {})))
         return pulse_poses(trajectory, mounting, Scanner.of(scanner), times)
+
+    def time_system(self, times: FloatArray) -> str:
+        """Return the system of the times [s] of the pulses, as of `times.time_system`."""
+        return time_system(json.loads(self.text)["platform"], times)
+
+    @property
+    def stated_origin(self) -> tuple[float, float] | None:
+        """Map coordinates x, y [m] of the scene's origin; None where neither crs, origin nor platform has them."""
+        given = json.loads(self.text)
+        if self.crs is not None or "origin" in given:
+            return self.origin[:2]
+        own = given["platform"].get("origin")
+        return None if own is None else (float(own[0]), float(own[1]))
+
+    def _check_coordinates(self, platform: Mapping[str, Any]) -> None:
+        """Raise `UserError` if the coordinates of a platform, which is valid, are not those of the points."""
+        if self.crs is not None and platform["kind"] == "sbet":
+            check_same_system(self.crs, platform["epsg"])
+        own, wanted = platform.get("origin"), self.stated_origin
+        if own is None or wanted is None:
+            return
+        if np.abs(np.subtract(own[:2], wanted)).max() > SAME_PLACE_M:
+            raise UserError(
+                f"origin = {shown(list(own))} of the platform must have the x and y of that of the flight, "
+                f"{shown(list(self.origin))}: both are the place of the scene's origin on the map"
+            )
 
 
 def flights() -> list[str]:

@@ -163,7 +163,7 @@ def positions(
     variance = paths.variance(errors, rotations[:, shot], sides, surface.slope_deviation)
     x, y, z = paths.place.T
     sigma_x, sigma_y, sigma_z = np.sqrt(variance).T
-    number, count = _returns(shot, pixel)
+    number, count = numbered_returns(shot, pixel)
     depth_errors = (table.value(f"depth_m_{kind}", shot, pixel, echo) for kind in ("stderr", "method_error"))
     values = {
         "x": x,
@@ -301,8 +301,8 @@ def _beam_width(echoes: xr.Dataset, ranges: FloatArray) -> float:
     return 1e-3 * float(np.median(ranges)) * min((one for one in widths if one is not None), default=0.0)
 
 
-def _returns(shot: IntArray, pixel: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the number of each point in its waveform, from 1, and the number of points there."""
+def numbered_returns(shot: IntArray, pixel: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the number of each point among those of its shot and pixel, which follow each other, and how many."""
     starts = np.flatnonzero(np.r_[True, (np.diff(shot) != 0) | (np.diff(pixel) != 0)][: shot.size])
     counts = np.diff(np.r_[starts, shot.size])
     return np.arange(shot.size) - np.repeat(starts, counts) + 1, np.repeat(counts, counts)

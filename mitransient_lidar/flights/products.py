@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntFlag
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.las import write_points, write_waveforms
+from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
+from mitransient_lidar.flights.positions import PointClass, fit_surface, numbered_returns, positions
+from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
-
-_LOG = logging.getLogger(__name__)
-
-#: Distance of a group's angle from those of a table of corrections that needs no warning [deg]: half of a group.
-_BESIDE = 1.0
 
 #: Pulses of a chunk of a file.
 _CHUNK = 4096
@@ -38,6 +36,19 @@ _COUNTS = 65000
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")
+
+
+#: Echo of a point by its class.
+_ECHO_OF = {PointClass.SURFACE: "surface", PointClass.OBJECT: "target", PointClass.BOTTOM: "bottom"}
+
+
+class Quality(IntFlag):
+    """What is to be known of a point before it is used."""
+
+    SATURATED = 1  # its echo, or that of the surface from which its depth counts, is clipped
+    POOR_FIT = 2  # too few usable samples, a fit that has not converged, or one with a doubtful amplitude
+    CORRECTED = 4  # its depth is corrected by a table
+    BEYOND_TABLE = 8  # its angle from nadir or its depth is outside the table
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,8 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     flown
         The pulses.
     corrections
-        ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`.
+        ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With them there is ``beyond_table``:
+        whether the angle of the pulse or the depth is outside the table.
     """
     attributes, store = flown.attributes, flown.store
     later = flown.values("time_offset_ns")
@@ -120,7 +132,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     kinds, kind = np.unique(np.stack([flown.values("group"), turns]), axis=1, return_inverse=True)
     table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
     if table is not None:
-        warn_of_angles(angle, table)
+        uncorrected = echoes["depth_m"]
         parts, places = [], []
         for number, turn in enumerate(kinds[1].tolist()):
             place = np.flatnonzero(kind.reshape(-1) == number)
@@ -129,6 +141,9 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
             places.append(place)
         order = np.argsort(np.concatenate(places))
         echoes = xr.concat(parts, "shot", combine_attrs="override").isel(shot=order)
+        depths = table["depth"].values
+        beyond = xr.DataArray(beyond_angles(angle, table), dims="shot") | (uncorrected > depths[-1])
+        echoes["beyond_table"] = beyond | (uncorrected < depths[0])
     # Depths were measured along the line of sight of the group's lidar.
     index = float(attributes["refractive_index"])
     ratio = cos_in_water(flown.values("axis_z"), index) / cos_in_water(np.cos(np.radians(angle)), index)
@@ -137,24 +152,14 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     return echoes
 
 
-def warn_of_angles(angle_deg: FloatArray, table: xr.Dataset) -> None:
-    """Warn of pulses outside the angles from nadir of a table of corrections."""
-    low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
-    outside = np.count_nonzero((angle_deg < low - _BESIDE) | (angle_deg > high + _BESIDE))
-    if outside:
-        _LOG.warning(
-            f"{outside} of {angle_deg.size} pulses have corrections beyond the angles of their table, {low:g} to "
-            f"{high:g} degrees from nadir: set corrections to none, or to a table of depth-bias with these angles"
-        )
-
-
 def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     """Return the points of all echoes, in coordinates of the scene.
 
     Returns
     -------
     xarray.Dataset
-        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, and the truth: ``true_z`` [m], the mean
+        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
+        ``withheld``, whether the echo is saturated or its fit poor; and the truth: ``true_z`` [m], the mean
         height of the surface in the beam or, for points below it, that of the highest solid at x and y;
         ``true_target``, whether that solid is a target; and of the pulse ``true_surface_height``,
         ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
@@ -178,7 +183,45 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
     points["line"] = ("point", flown.values("line")[shot], {"units": "1"})
+    points = points.assign(_quality(points, echoes))
     return points.assign(_truth(flown, plan, points))
+
+
+def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
+    """Return the quality of points, and whether they are withheld from maps."""
+    place = points["shot"].values, points["pixel"].values
+    flags = points["flags"].values
+
+    def of_echo(name: str) -> npt.NDArray[Any]:
+        values = echoes[name].transpose("shot", "pixel", "echo").sel(echo=list(_ECHO_OF.values())).values
+        found = np.zeros(flags.shape, dtype=values.dtype)
+        for number, kind in enumerate(_ECHO_OF):
+            own = points["kind"].values == kind
+            found[own] = values[..., number][place][own]
+        return found
+
+    silent = points["kind"].values == PointClass.NO_ECHO
+    clipped = (flags & int(EchoFlag.SATURATED)) > 0
+    of_surface = echoes["flags"].sel(echo="surface").transpose("shot", "pixel").values[place]
+    poor = ((flags & int(EchoFlag.POOR_FIT)) > 0) & ~silent
+    quality = np.where(clipped | ((of_surface & int(EchoFlag.SATURATED)) > 0), int(Quality.SATURATED), 0)
+    quality |= np.where(poor, int(Quality.POOR_FIT), 0)
+    if "beyond_table" in echoes:
+        behind = ~silent & (points["kind"].values != PointClass.SURFACE)
+        corrected = behind & np.isfinite(of_echo("depth_correction_m"))
+        quality |= np.where(corrected, int(Quality.CORRECTED), 0)
+        quality |= np.where(behind & of_echo("beyond_table"), int(Quality.BEYOND_TABLE), 0)
+    meanings = {
+        "units": "1",
+        "long_name": "quality of the point",
+        "flag_masks": [int(one) for one in Quality],
+        "flag_meanings": " ".join(str(one.name).lower() for one in Quality),
+    }
+    withheld = {"units": "1", "long_name": "whether the echo is saturated or its fit poor"}
+    return {
+        "quality": ("point", quality.astype(np.uint8), meanings),
+        "withheld": ("point", ~silent & (clipped | poor), withheld),
+    }
 
 
 def describe_points(points: xr.Dataset) -> list[str]:
@@ -188,11 +231,13 @@ def describe_points(points: xr.Dataset) -> list[str]:
     stated = points["vertical_uncertainty"].values
     target = points["true_target"].values.astype(bool)
     kind = points["kind"].values
+    withheld = points["withheld"].values.astype(bool)
     rows = {
-        "water surface": kind == PointClass.SURFACE,
-        "bottom": (kind == PointClass.BOTTOM) & ~target,
-        "bottom, above a target": (kind == PointClass.BOTTOM) & target,
-        "object": kind == PointClass.OBJECT,
+        "water surface": (kind == PointClass.SURFACE) & ~withheld,
+        "bottom": (kind == PointClass.BOTTOM) & ~target & ~withheld,
+        "bottom, above a target": (kind == PointClass.BOTTOM) & target & ~withheld,
+        "object": (kind == PointClass.OBJECT) & ~withheld,
+        **({"withheld": withheld} if withheld.any() else {}),
         "no echo": kind == PointClass.NO_ECHO,
     }
     for name, chosen in rows.items():
@@ -236,14 +281,36 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     placed = points.copy()
     for name, first in zip("xyz", plan.origin, strict=True):
         placed[name] = placed[name] + first
-    placed["number_of_returns"] = placed["number_of_returns"].clip(min=1)
-    placed["return_number"] = placed["return_number"].clip(min=1)
-    brightest = float(np.nanmax(placed["intensity"].values, initial=0.0))
+    placed = with_channels(placed, len(flown.coordinate("pixel")))
+    placed["gps_time"].attrs["time_system"] = plan.time_system(flown.values("time_s"))
+    # The amplitude of a clipped echo is what its flanks make of it.
+    clear = (placed["quality"].values & int(Quality.SATURATED)) == 0
+    brightest = float(np.nanmax(placed["intensity"].values, initial=0.0, where=clear))
     placed["intensity"].attrs["full_scale"] = brightest or 1.0
     paths = [folder / "points.laz", folder / "waveforms.las", folder / "waveforms.wdp"]
     write_points(paths[0], placed, plan.crs)
     write_waveforms(paths[1], _with_packets(flown, placed), _packets(flown), plan.crs)
     return paths
+
+
+def with_channels(points: xr.Dataset, pixels: int) -> xr.Dataset:
+    """Return points with the scanner channels and return numbers of LAS.
+
+    Up to four pixels are the channels, and more are four groups of neighbours, whose returns of a pulse are numbered
+    together from the highest on. Those after the fifteenth have its number.
+    """
+    pixel, shot = points["pixel"].values, points["shot"].values
+    if pixels <= MOST_CHANNELS:
+        return points.assign(channel=("point", pixel))
+    channel = pixel * MOST_CHANNELS // pixels
+    order = np.lexsort((-points["z"].values, channel, shot))
+    found = {"channel": channel}
+    for name, values in zip(
+        ("return_number", "number_of_returns"), numbered_returns(shot[order], channel[order]), strict=True
+    ):
+        found[name] = np.empty(shot.size, dtype=np.int64)
+        found[name][order] = np.minimum(values, MOST_RETURNS)
+    return points.assign({name: ("point", values) for name, values in found.items()})
 
 
 def _chunks(flown: Flown) -> Iterator[slice]:

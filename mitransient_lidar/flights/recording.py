@@ -63,6 +63,16 @@ def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str,
     }
 
 
+def saturated_pulses(probes: Iterable[xr.Dataset], plan: FlightPlan, settings: Mapping[str, float]) -> int:
+    """Return how many of rendered pulses have saturated samples, with the settings of automatic channels."""
+    count = 0
+    for series in probes:
+        inputs = {"pulse": np.zeros(1, dtype=np.int64), **{name: np.array([value]) for name, value in settings.items()}}
+        saturated = record(series, plan, inputs)["saturated"]
+        count += int(np.count_nonzero(saturated.any([dim for dim in saturated.dims if dim != "shot"])))
+    return count
+
+
 def has_automatic_settings(plan: FlightPlan, instrument: str | None) -> bool:
     """Return whether the receiver of a flight with the scene's instrument chooses a gain or a filter."""
     receiver = _receiver(xr.Dataset(attrs={"instrument": instrument or ""}), plan)

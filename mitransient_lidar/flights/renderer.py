@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,25 +19,38 @@ from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.poses.mounting import PulsePoses, pixel_turns, poses_of
-from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
+from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
+from mitransient_lidar.flights.poses.times import tell_time_system
+from mitransient_lidar.flights.preparation import (
+    input_columns,
+    lidar_of,
+    record_of,
+    shot_poses,
+    tell_forecast,
+    telling_errors_alone,
+    warn_of_angles,
+    warn_of_maps,
+)
+from mitransient_lidar.flights.recording import (
+    SETTINGS,
+    chosen_settings,
+    has_automatic_settings,
+    pooled_errors,
+    record,
+    saturated_pulses,
+)
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.rendering.shot_series import FARTHEST
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shot_batches import ShotBatches
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.rendering.shot_scene import ShotScene
-    from mitransient_lidar.transport.scene import LidarScene
-
-#: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
-_ANGLES, _HEIGHTS = 2.0, 1.1
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
@@ -43,14 +58,9 @@ _BATCH, _STILL_S = 64, 0.05
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
 
-#: Pulses of a flight that automatic settings of its receiver are chosen from, and passes of each.
-_PROBES, _PROBE_PASSES = 128, 4
-
-#: Places of a group of pulses that decide how long their record is.
-_PLACES = 6
-
-#: Margin of a record on both sides [ns], for waves and for poses that differ from that of the group.
-_MARGIN_NS = 15.0
+#: Pulses of a flight that automatic settings of its receiver are chosen from, those of another one that are sampled
+#: before it, and passes of each.
+_PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
 
 #: Inputs of each pulse: unit and description.
 _INPUTS = {
@@ -107,8 +117,11 @@ class FlightRenderer:
 
     @classmethod
     @alone
-    def of(cls, plan: FlightPlan) -> tuple[FlightRenderer, dict[str, Column]]:
-        """Return the renderer of a new flight, and the inputs of its pulses, in groups.
+    def of(cls, plan: FlightPlan, progress: ProgressCallback | None = None) -> tuple[FlightRenderer, dict[str, Column]]:
+        """Return the renderer of a new flight, and the inputs of its pulses, in groups; tell what is known before it.
+
+        That is what poses are beyond the corrections, and by a sample of pulses the time that the flight takes and how
+        many pulses saturate. `progress` is called with a `Progress` of the groups, and of the sample.
 
         Raises
         ------
@@ -117,22 +130,38 @@ class FlightRenderer:
             outside the record.
         """
         poses = plan.poses()
+        tell_time_system(plan.time_system(poses.time_s), poses.time_s)
         scene = scene_of(plan)
+        columns = input_columns(poses)
         if plan.corrections != "none":
-            corrections_for(scene.instrument or "", plan.corrections)
-        columns = _columns(poses)
-        longest, start = None, np.empty(len(poses.time_s))
-        for group in np.unique(columns["group"]):
-            rows = np.flatnonzero(columns["group"] == group)
-            own = _record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
-            start[rows] = own.start_ns
-            if longest is None or own.bin_count > longest.bin_count:
-                longest = own
-        renderer = cls(plan, scene, longest)
-        columns["record_start_ns"] = start
-        if has_automatic_settings(plan, scene.instrument):
-            settings = chosen_settings(renderer._probes(columns), plan)
-            columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
+            warn_of_angles(columns["group_angle_deg"], corrections_for(scene.instrument or "", plan.corrections))
+        longest, start, beyond = None, np.empty(len(poses.time_s)), 0
+        groups = np.unique(columns["group"])
+        with contextlib.ExitStack() as quiet:
+            for number, group in enumerate(groups):
+                rows = np.flatnonzero(columns["group"] == group)
+                own, missed = record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
+                beyond += missed
+                start[rows] = own.start_ns
+                if longest is None or own.bin_count > longest.bin_count:
+                    longest = own
+                if number == 0:
+                    quiet.enter_context(telling_errors_alone())
+                if progress is not None:
+                    progress(Progress(done=number + 1, planned=len(groups), unit="preparing group"))
+        warn_of_maps(beyond, start.size)
+        with telling_errors_alone():
+            renderer = cls(plan, scene, longest)
+            columns["record_start_ns"] = start
+            is_automatic = has_automatic_settings(plan, scene.instrument)
+            probes = renderer._probes(columns, _PROBES if is_automatic else _SAMPLED, progress)
+            settings = chosen_settings((series for series, _ in probes), plan) if is_automatic else {}
+            saturated = saturated_pulses((series for series, _ in probes), plan, settings)
+        columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
+        sampled = sum(series.sizes["shot"] for series, _ in probes)
+        # The first part compiles kernels.
+        seconds = float(np.quantile([seconds for _, seconds in probes], 0.5, method="lower"))
+        tell_forecast(saturated, sampled, start.size, seconds)
         return renderer, columns
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
@@ -211,25 +240,43 @@ class FlightRenderer:
         share = share_for_error(error)
         return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
 
-    def _probes(self, columns: Mapping[str, Column]) -> Iterator[xr.Dataset]:
-        """Return the waveforms of pulses that are spread over the flight, those of a group together."""
+    def _probes(
+        self, columns: Mapping[str, Column], most: int, progress: ProgressCallback | None
+    ) -> list[tuple[xr.Dataset, float]]:
+        """Return the waveforms of pulses that are spread over the flight, those of a group together.
+
+        Each part has the processor time of a pulse with as many passes as its error needs [s].
+        """
+        from mitransient_lidar.rendering.shot_batches import relative_errors
+
         count = len(columns["pulse"])
-        rows = np.unique(np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int))
+        rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+        found: list[tuple[xr.Dataset, float]] = []
         for group in np.unique(columns["group"][rows]):
             own = rows[columns["group"][rows] == group]
             for part in np.array_split(own, -(-own.size // _BATCH)):
-                yield self._render(
-                    {name: column[part] for name, column in columns.items()}, self._passes(until_error=False)
-                )[0]
+                inputs = {name: column[part] for name, column in columns.items()}
+                window, began = self._scene_of(inputs).window, time.process_time()
+                series = self._render(inputs, self._passes(until_error=False))[0]
+                took = (time.process_time() - began) / part.size
+                power, stderr = (
+                    series[name].transpose("shot", "pixel", "time").values for name in ("waveform", "waveform_stderr")
+                )
+                error = float(np.median(relative_errors(power, stderr, window)))
+                found.append((series, took * max((error / self.plan.target_error) ** 2, 1.0)))
+                if progress is not None:
+                    done = sum(one.sizes["shot"] for one, _ in found)
+                    progress(Progress(done=done, planned=rows.size, unit="sampling pulse"))
+        return found
 
     def _scene_of(self, inputs: Mapping[str, Column]) -> ShotScene:
         """Return the loaded scene of the lidar of pulses of one group."""
         return _shot_scene(self, *self._lidar_and_record(inputs))
 
     def _lidar_and_record(self, inputs: Mapping[str, Column]) -> tuple[float, float, float, float, TimeAxis]:
-        """Return the lidar of pulses of one group, as of `_lidar_of`, and its time bins."""
+        """Return the lidar of pulses of one group, as of `lidar_of`, and its time bins."""
         assert self.axis is not None
-        return *_lidar_of(inputs), replace(self.axis, start_ns=float(inputs["record_start_ns"][0]))
+        return *lidar_of(inputs), replace(self.axis, start_ns=float(inputs["record_start_ns"][0]))
 
     def _with_turned_pixels(self, recorded: xr.Dataset, inputs: Mapping[str, Column]) -> xr.Dataset:
         """Return the record of pulses of one group with the lines of sight of pixels that are turned about the axis."""
@@ -248,7 +295,7 @@ class FlightRenderer:
 
         plan = self.plan
         scene = self._scene_of(inputs)
-        poses = _shot_poses(scene.lidar, inputs)
+        poses = shot_poses(scene.lidar, inputs)
         # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
         further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * scene.lidar.axis.bin_width_ns
         poses = poses.delayed(further % width)
@@ -280,11 +327,10 @@ def scene_of(plan: FlightPlan) -> SceneRecord:
     Raises
     ------
     UserError
-        If it cannot be loaded, or lacks a parameter.
+        If it cannot be read, or lacks a parameter.
     """
-    record = open_scene(plan.scene, None, instrument=plan.instrument).record
-    assert record is not None
-    for name in ("aim_x", "aim_y", "altitude", "off_nadir_deg", *plan.parameters):
+    record = read_record(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
+    for name in POSE_PARAMETERS:
         if name not in record.parameters:
             raise UserError(f"scene {plan.scene} has no parameter {name}, which the flight sets")
     return record
@@ -315,130 +361,6 @@ def _turned_lines(
 def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
     """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
     return scene.batches(passes, share, error)
-
-
-def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
-    """Return the angle from nadir [deg], the height, and the place of the lidar of pulses of one group [m]."""
-    angle, height, x, y = (float(inputs[f"group_{name}"][0]) for name in ("angle_deg", "height", "x", "y"))
-    return angle, height, x, y
-
-
-def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
-    """Return the poses of pulses of one group."""
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
-
-    return ShotPoses.of_receiver(lidar, poses_of(inputs.__getitem__))
-
-
-def _columns(poses: PulsePoses) -> dict[str, Column]:
-    """Return the inputs of pulses but the start of their record, in groups of similar angles from nadir and heights."""
-    if np.any(poses.axis[:, 2] >= -0.05):
-        row = int(np.argmax(poses.axis[:, 2]))
-        angle = np.degrees(np.arccos(-poses.axis[row, 2]))
-        raise UserError(
-            f"pulse {row} at {poses.time_s[row]:g} s looks {angle:.4g} degrees from nadir: at most 87 may be"
-        )
-    if np.any(poses.origin[:, 2] <= 1):
-        row = int(np.argmin(poses.origin[:, 2]))
-        raise UserError(
-            f"pulse {row} at {poses.time_s[row]:g} s is sent from a height of {poses.origin[row, 2]:g} m: the scanner "
-            "must be more than 1 m above the mean sea level"
-        )
-    places = poses.ground_point()[:, :2]
-    if (farthest := float(np.abs(places).max())) > FARTHEST:
-        raise UserError(
-            f"the flight reaches {farthest:g} m from the origin of the scene: at most {FARTHEST:g} m may be; give "
-            "the platform an origin near it"
-        )
-    angle, height = np.degrees(np.arccos(-poses.axis[:, 2])), np.log(poses.origin[:, 2])
-    # Near the horizon, ranges change more than angles.
-    ratio, range_per_height = float(np.log(_HEIGHTS)), -np.log(-poses.axis[:, 2])
-    bands = [_bands(*pair) for pair in ((angle, _ANGLES), (height, ratio), (range_per_height, ratio))]
-    _, group = np.unique(np.stack(bands), axis=1, return_inverse=True)
-    group = group.reshape(-1)
-    order = np.lexsort((np.arange(group.size), group))
-    columns: dict[str, Column] = {
-        "pulse": np.arange(group.size),
-        "time_s": poses.time_s,
-        **{
-            f"{name}_{axis}": getattr(poses, name)[:, number]
-            for name in ("origin", "axis", "far", "left")
-            for number, axis in enumerate("xyz")
-        },
-        "scan_angle_deg": poses.scan_angle_deg,
-        "line": poses.line.astype(np.int64),
-        "group": group.astype(np.int64),
-    }
-    # A level lidar in the middle of each group.
-    middle = np.empty((group.size, 2))
-    place = np.empty((group.size, 2))
-    for one in np.unique(group):
-        rows = np.flatnonzero(group == one)
-        middle[rows] = [0.5 * (np.min(each[rows]) + np.max(each[rows])) for each in (angle, poses.origin[:, 2])]
-        place[rows] = places[rows[0]]
-    columns |= {"group_angle_deg": middle[:, 0], "group_height": middle[:, 1]}
-    columns |= {"group_x": place[:, 0], "group_y": place[:, 1]}
-    return {name: column[order] for name, column in columns.items()}
-
-
-def _bands(values: FloatArray, step: float) -> IntArray:
-    """Return the numbers of bands of equal width, at most a step, into which values fall."""
-    low, high = float(values.min()), float(values.max())
-    count = max(int(np.ceil((high - low) / step)), 1)
-    return np.minimum(((values - low) / max((high - low) / count, 1e-12)).astype(np.int64), count - 1)
-
-
-def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column]) -> TimeAxis:
-    """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
-
-    Raises
-    ------
-    UserError
-        If the bottom does not cover the places of the pulses, or its light arrives after the record.
-    """
-    from mitransient_lidar.rendering.describe import axis_on_bottom
-    from mitransient_lidar.rendering.shot_truth import solids_below
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
-    angle, height, *aim = _lidar_of(inputs)
-    params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": aim[0], "aim_y": aim[1]}
-    session = open_scene(record, params)
-    lidar = find_lidar_scene(session.scene, session.sensor)
-    if lidar.receiver.pixels.grid is not None:
-        raise UserError(f"scene {plan.scene} has an imager: a flight needs a receiver whose pixels are a list")
-    poses = _shot_poses(lidar, inputs)
-    bottom = axis_on_bottom(lidar, poses=poses.in_scene)[:, 2]
-    if not lidar.bottoms:
-        raise UserError(f"scene {plan.scene} has no bottom below the flight")
-    # The axis may meet a target before the bottom.
-    level = float(np.nanmedian(bottom)) if np.isfinite(bottom).any() else -1.0
-    given = poses_of(inputs.__getitem__)
-    x, y = lidar.level_sea.at_height(given.origin, given.axis, level).T
-    bottom = np.where(np.isnan(bottom), solids_below(lidar, x, y, bottoms=True)[0], bottom)
-    if missed := np.count_nonzero(np.isnan(bottom)):
-        row = int(np.argmax(np.isnan(bottom)))
-        raise UserError(
-            f"the bottom does not cover the flight: {missed} of {bottom.size} pulses miss it, the first one, pulse "
-            f"{inputs['pulse'][row]}, at x = {poses.places[row, 0]:.1f} m, y = {poses.places[row, 1]:.1f} m"
-        )
-    # The places of the extremes of depth, and others.
-    depths = np.argsort(bottom)
-    chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
-    shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
-    film = session.sensor.film()
-    if not film.is_fixed:
-        own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
-        first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
-        return TimeAxis.covering(first, last, own.bin_width_ns)
-    way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
-    arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
-    if arrival > film.axis.end_ns:
-        raise UserError(
-            f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "
-            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
-        )
-    fixed: TimeAxis = film.axis
-    return fixed
 
 
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:

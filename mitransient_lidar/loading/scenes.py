@@ -6,9 +6,10 @@ import contextlib
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
@@ -20,6 +21,7 @@ from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -92,6 +94,67 @@ def load(
     return loaded
 
 
+def read_record(
+    scene: str | os.PathLike[str],
+    params: Mapping[str, Any] | None,
+    instrument: str | None,
+    origin: tuple[float, float] | None = None,
+) -> SceneRecord:
+    """Return the record of an XML scene with an instrument, and of its files with given parameters, without loading it.
+
+    Its parameters have the values of the scene and the instrument. Where the scene has an origin in map coordinates
+    [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments, and
+    errors, are those of `load`, but for what only loading finds.
+    """
+    check_params(params)
+    document = _document(scene, instrument)
+    filled = _filled(document, params)
+    record = SceneRecord.of_document(filled if origin is None else _with_maps_about(filled, origin))
+    return replace(record, parameters=dict(document.parameters))
+
+
+def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> SceneDocument:
+    """Return a scene whose seabeds with a map in map coordinates have an ``origin_x`` and ``origin_y`` [m]."""
+    assert document.root.ownerDocument is not None
+    copied = document.root.ownerDocument.cloneNode(True)
+    assert isinstance(copied, minidom.Document)
+    assert copied.documentElement is not None
+    changed = replace(document, root=copied.documentElement, source=None)
+    seabeds = {id(one.element) for one in changed.settings if one.attribute == "type" and one.value == "seabed"}
+    maps = [
+        one.element.parentNode
+        for one in changed.settings
+        if one.owner == "filename" and Path(one.value).suffix.lower() in IN_MAP_COORDINATES
+    ]
+    placed = False
+    for seabed in maps:
+        if not isinstance(seabed, minidom.Element) or id(seabed) not in seabeds:
+            continue
+        names = [child.getAttribute("name") for child in seabed.getElementsByTagName("float")]
+        if "origin_x" in names or "origin_y" in names:
+            continue
+        placed = True
+        for name, value in zip(("origin_x", "origin_y"), origin, strict=True):
+            number = copied.createElement("float")
+            number.setAttribute("name", name)
+            number.setAttribute("value", repr(value))
+            seabed.appendChild(number)
+    return changed if placed else document
+
+
+def _document(scene: SceneRecord | str | os.PathLike[str], instrument: str | None) -> SceneDocument:
+    """Return the document of an XML scene, with the laser and the receiver of an instrument."""
+    document = scene.document() if isinstance(scene, SceneRecord) else read_document(scene_path(scene))
+    return document if instrument is None else mount(instrument, document)
+
+
+def _filled(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocument:
+    """Return a document with values of its parameters, after all checks that need no loading."""
+    filled = fill(document, params)
+    check(filled)
+    return filled
+
+
 def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     """Load a scene given as a dict, or its record."""
     import mitsuba as mi
@@ -112,15 +175,8 @@ def _load_xml(
     """Load an XML scene by the steps of `loading.document`."""
     import mitsuba as mi
 
-    if isinstance(scene, SceneRecord):
-        former, document = scene, scene.document()
-    else:
-        former, document = None, read_document(scene_path(scene))
-    if instrument is not None:
-        document = mount(instrument, document)
-    document = fill(document, params)
-    check(document)
-    record = SceneRecord.of_document(document, former)
+    document = _filled(_document(scene, instrument), params)
+    record = SceneRecord.of_document(document, scene if isinstance(scene, SceneRecord) else None)
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: _with_dollars(mi.parser.parse_string(config, text)))

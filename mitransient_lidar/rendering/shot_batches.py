@@ -84,7 +84,7 @@ class ShotBatches:
 
     The frame of the lidar is that of the scene, and a place is that of the aim. The sea is refined about each place,
     and the patches lie beside each other in one mesh. Solids are met at the place itself, except those that go with the
-    lidar. A plume of bubbles cannot be displaced: such scenes are loaded again for each shot.
+    lidar. A plume of bubbles is that of one shot: such scenes have a batch for each.
 
     Parameters
     ----------
@@ -100,8 +100,6 @@ class ShotBatches:
         Relative standard error of the median bin of a batch that ends its passes, and the bins that count.
     companions
         Solids that go with the lidar.
-    loaded_at
-        Returns the renderer of the scene loaded at a place (x, y) [m].
     """
 
     def __init__(
@@ -112,11 +110,9 @@ class ShotBatches:
         share: float,
         goal: tuple[float, ErrorWindow] | None,
         companions: Sequence[mi.Shape],
-        loaded_at: Callable[[float, float], PassRenderer],
     ) -> None:
         lidar = renderer.scene
         has_plume = lidar.water is not None and isinstance(lidar.water.plume, BubblePlume)
-        self._loaded_at = loaded_at if has_plume else None
         self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
@@ -139,14 +135,13 @@ class ShotBatches:
 
     def at(self, shots: ShotPoses) -> Callable[[int], PassRenderer]:
         """Return a function that returns the renderer of shots, each several times."""
-        if (loaded_at := self._loaded_at) is not None:
-            return lambda _: loaded_at(*map(float, shots.places[0])).scaled(self.share)
         parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
         for sea in self._seas:
             positions = sea.move(shots.places)
             parts.append((sea.shapes, positions))
         parts += [] if self._fixed is None else [(self._fixed, shots.places)]
         lidar = self._renderer.scene
+        water = shots.water(lidar.water, self._aim)
         surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
 
         def scene_of(copies: int) -> LidarScene:
@@ -158,9 +153,8 @@ class ShotBatches:
                 for shapes, positions in parts
             )
             receiver, transmitter = all_shots.receiver, all_shots.transmitter
-            return replace(
-                lidar, parts=moved, surfaces=surfaces, receiver_poses=receiver, transmitter_poses=transmitter
-            )
+            placed = replace(lidar, parts=moved, surfaces=surfaces, water=water)
+            return replace(placed, receiver_poses=receiver, transmitter_poses=transmitter)
 
         placed = self._renderer.of_shots(scene_of(1), len(shots))
         return lambda copies: placed.repeated(scene_of(copies), copies)

@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
@@ -101,6 +103,13 @@ class ShotPoses:
         by = positions - np.stack([turned.real, turned.imag], axis=-1)
         cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
         return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
+
+    def water(self, water: Water | None, aim: FloatArray) -> Water | None:
+        """Return the water of a lidar at a place (x, y) [m] as the shots meet it; a plume of bubbles, as the first."""
+        if water is None or not isinstance(water.plume, BubblePlume):
+            return water
+        turn = 1 + 0j if self.turns is None else complex(*self.turns[0])
+        return replace(water, plume=water.plume.displaced(self.places[0], aim, turn))
 
     def extra_range(self, lidar: LidarScene) -> FloatArray:
         """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).

@@ -112,16 +112,12 @@ class ShotScene:
         pairs = zip(self.session.scene.shapes(), other.shapes(), strict=True)
         return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
 
-    def _loaded_at(self, x: float, y: float) -> PassRenderer:
-        """Return the renderer of the scene loaded at a place [m]."""
-        return self._prepare(self._open(self._at(x, y)))
-
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
         """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
         from mitransient_lidar.rendering.shot_batches import ShotBatches
 
         goal = None if error is None else (error, self.window)
-        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions, self._loaded_at)
+        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""

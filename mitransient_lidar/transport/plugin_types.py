@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -144,6 +144,13 @@ class SeabedShape(Protocol):
     @property
     def uniform_reflectance(self) -> float | None:
         """Reflectance of bottom and patches, None where they differ."""
+
+    @property
+    def map_origin(self) -> tuple[float, float] | None:
+        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
+
+    def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return whether places [m] lie beyond the height map; nowhere without one."""
 
 
 @runtime_checkable

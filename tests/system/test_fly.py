@@ -216,7 +216,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
     ("change", "message"),
     [
         ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
-        ({"parameters": {"bottom_dept": 3}}, "has no parameter bottom_dept"),
+        ({"parameters": {"bottom_dept": 3}}, "parameter 'bottom_dept' is not one of scene flight"),
         ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
         ({"instrument": "published_mast", "corrections": "auto"}, "no shipped corrections of the instrument"),
         (

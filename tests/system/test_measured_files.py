@@ -84,12 +84,12 @@ def test_files_render_like_the_same_values_typed(tmp_path, measured):
         np.testing.assert_array_equal(results[0][name], results[1][name])
 
 
-def test_an_origin_outside_the_map_is_refused_before_anything_is_written(tmp_path, measured):
+def test_an_origin_far_outside_the_map_is_refused_before_anything_is_written(tmp_path, measured):
     scene, options = measured
     done = run("render", scene, *options[:-1], "-Dmap_x=412345", "--passes", 2, "-o", tmp_path / "out")
     assert done.exit_code == 2
     # Above it is what the log tells of the other files.
     last = done.stderr.splitlines()[-1]
-    allowed = f"origin_x = 412345 must lie between 512335 and 512365, within {tmp_path / 'bottom.asc'}."
+    allowed = f"origin_x = 412345 must lie within 10 km of {tmp_path / 'bottom.asc'}, whose x is 512335 to 512365."
     assert last == f"{allowed} (origin_x is set by map_x = 412345)"
     assert not (tmp_path / "out").exists()

@@ -97,6 +97,14 @@ class Records:
         """Width of the bins [ns]."""
         return float(self.time_ns[-1] - self.time_ns[0]) / (self.time_ns.size - 1)
 
+    def without(self, unusable: BoolArray) -> Records:
+        """Return the waveforms with samples that do not count, shape (n, time)."""
+        if not unusable.any():
+            return self
+        # Far above what a clipped echo may have been.
+        noise = 1e3 * np.max(np.abs(self.power), axis=1, keepdims=True)
+        return replace(self, noise=np.where(unusable, noise, self.noise))
+
     def time_of(self, bins: IntArray) -> FloatArray:
         """Return the centres of bins [ns]; of bins outside the record, that of the nearest one inside."""
         return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
@@ -109,6 +117,35 @@ class Records:
         power = np.take_along_axis(self.power, clipped, axis=1)
         noise = np.take_along_axis(np.broadcast_to(self.noise, self.power.shape), clipped, axis=1)
         return power, noise, inside
+
+
+def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:
+    """Return how many bins are clipped about echoes, 0 of those without a saturated sample within an echo width.
+
+    Parameters
+    ----------
+    saturated
+        Whether samples are saturated, shape (n, time).
+    bins
+        Bins of the peaks, -1 without an echo, shape (echo, n).
+    width
+        Echo width in bins, by which runs of saturated samples may be apart to count as one.
+    """
+    count, index = saturated.shape[1], np.arange(saturated.shape[1])
+    if not saturated.any():
+        return np.zeros(bins.shape)
+    before = np.maximum.accumulate(np.where(saturated, index, -1), axis=1)
+    after = np.minimum.accumulate(np.where(saturated, index, count)[:, ::-1], axis=1)[:, ::-1]
+    # Samples between two saturated ones that are near each other are in one run.
+    inside = saturated | ((before >= 0) & (after < count) & (after - before <= width))
+    first = np.maximum.accumulate(np.where(inside, -1, index), axis=1) + 1
+    last = np.minimum.accumulate(np.where(inside, count, index)[:, ::-1], axis=1)[:, ::-1] - 1
+    half, lines = int(np.ceil(width)), np.arange(len(saturated))
+    low, top = np.clip(bins - half, 0, count - 1), np.clip(bins + half, 0, count - 1)
+    left, right = after[lines, low], before[lines, top]
+    found = (bins >= 0) & (left <= right)
+    ends = last[lines, np.maximum(right, 0)] - first[lines, np.minimum(left, count - 1)] + 1
+    return np.where(found, ends, 0).astype(np.float64)
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     DetectedEchoes,
     Echoes,
     EchoFlag,
-    IntArray,
     Records,
     find_echoes,
+    saturated_spans,
 )
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
@@ -35,6 +35,7 @@ _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
 _TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
+_OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
@@ -142,11 +143,13 @@ def extract(
     targets and bottoms below 3 standard errors as ``poor_fit``, surfaces as ``no_echo``, timed by the column's onset,
     as are all beyond 60 degrees from nadir.
 
-    ``depth_m_stderr`` is the error by noise and by the jitter of the record's trigger and clocks, which cancels where
-    the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
-    the typical error by scattered light that arrives later, by the light's distribution in the pixel, which the surface
-    echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from 40 random level
-    seas and 36 shots on waves, its dependence on sqrt(K bb) also from one lidar in Jerlov waters. In other renders the
+    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the time that is clipped.
+
+    ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of the record's trigger and clocks, which
+    cancels where the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for
+    ``gaussian`` the typical error by scattered light that arrives later, by the light's distribution in the pixel,
+    which the surface echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from
+    40 random level seas and 36 shots on waves, its dependence on sqrt(K bb) also from one lidar. In other renders the
     root mean squares of error over both errors together were 1.0 to 1.2: seven hexagonal pixels over level and tilted
     bottoms in six waters, imagers of 32x32 and 128x128 pixels over a slope of 8 degrees, and 60 shots at 6 m/s (1.0 to
     1.3 in each 20 of them). The error has the sign of the biases below: over bottoms that rise away from the lidar by 8
@@ -241,8 +244,11 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
     reference = time[surface]
     gain = waveforms.gain(rows)
-    column = column_fit(records, start, end, reference, gain)
-    found = replace(found, flags=found.flags | _saturation(waveforms, rows, records, found.bins))
+    saturated = waveforms.saturated_samples(rows, records)
+    spans = records.bin_ns * saturated_spans(saturated, found.bins, waveforms.echo_fwhm_ns / records.bin_ns)
+    found = replace(found, flags=found.flags | np.where(spans > 0, int(EchoFlag.SATURATED), 0))
+    clear = records.without(saturated)
+    column = column_fit(clear, start, end, reference, gain)
     sharp = None
     if "deconvolution" in settings.estimators:
         sharp = deconvolution.richardson_lucy(
@@ -250,7 +256,8 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         )
     quantities = []
     for estimator in settings.estimators:
-        echoes = _estimate(estimator, waveforms, records, found, column, sharp, settings)
+        usable = clear if estimator == "gaussian" else records
+        echoes = _estimate(estimator, waveforms, usable, found, column, sharp, settings)
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
         quantities.append([echoes[0], _column(records, column, start, end, surface_ns - reference), *echoes[1:]])
@@ -259,12 +266,16 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         for name in vars(quantities[0][0])
     }
     table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
+    # The peak may be anywhere in the time that is clipped.
+    for echo, span in zip((0, 2, 3), spans[:, :, np.newaxis], strict=True):
+        error = table["time_ns_stderr"][..., echo]
+        error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
     table |= {"attenuation": column.decay * per_metre, "attenuation_stderr": column.decay_stderr * per_metre}
     table["attenuation_chi2"] = column.chi2
     if settings.layers:
-        changes = change_points(records, start, end, gain, layers=settings.layers, blur_ns=width)
+        changes = change_points(clear, start, end, gain, layers=settings.layers, blur_ns=width)
         table |= {
             "layer_time_ns": changes.time_ns,
             "layer_p_value": changes.p_value,
@@ -324,6 +335,8 @@ def _with_depths(
         faint = np.isnan(measured)
         if estimator == "gaussian":
             weak = table["amplitude"][:, number] < _SIGNIFICANT * table["amplitude_stderr"][:, number]
+            # The height of a clipped echo is not known.
+            weak &= (table["flags"][:, number] & int(EchoFlag.SATURATED)) == 0
             faint |= weak[:, 0]
             table["flags"][:, number, 2:] |= np.where(weak[:, 2:], int(EchoFlag.POOR_FIT), 0)
         found = surface_times(
@@ -429,19 +442,6 @@ def _label(
         "echo_contrast": settings.contrast,
     }
     return xr.Dataset(data, coords, {**dataset.attrs, **provenance})
-
-
-def _saturation(waveforms: Waveforms, rows: slice, records: Records, bins: IntArray) -> IntArray:
-    """Return `EchoFlag.SATURATED` of echoes with saturated samples near their peaks, shape (echo, waveforms)."""
-    baseline = waveforms.baseline[np.arange(rows.start, rows.stop) % waveforms.baseline.size, np.newaxis]
-    high = records.power + baseline >= waveforms.saturation_level
-    if waveforms.saturated is not None:
-        high |= waveforms.saturated[rows]
-    sums = np.cumsum(np.pad(high, ((0, 0), (1, 0))), axis=1)
-    half = int(np.ceil(waveforms.echo_fwhm_ns / records.bin_ns))
-    low, top = np.clip(bins - half, 0, high.shape[1]), np.clip(bins + half + 1, 0, high.shape[1])
-    lines = np.arange(len(high))
-    return np.where((bins >= 0) & (sums[lines, top] > sums[lines, low]), int(EchoFlag.SATURATED), 0)
 
 
 def _estimate(

@@ -230,6 +230,12 @@ class Waveforms:
             return spreading
         return spreading * self.focusing.at(lines.depth_of_time(np.broadcast_to(self.time_ns, spreading.shape)))
 
+    def saturated_samples(self, rows: slice, records: Records) -> npt.NDArray[np.bool_]:
+        """Return which samples of some of the waveforms are saturated, shape (waveforms, time)."""
+        baseline = self.baseline[np.arange(rows.start, rows.stop) % self.baseline.size, np.newaxis]
+        high: npt.NDArray[np.bool_] = records.power + baseline >= self.saturation_level
+        return high if self.saturated is None else high | self.saturated[rows]
+
     def records(self, rows: slice) -> Records:
         """Return some of the waveforms less their baseline."""
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size

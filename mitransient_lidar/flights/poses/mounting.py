@@ -96,7 +96,8 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
         For a time that is not finite or on no flight line.
     """
     platform = trajectory.at(times)
-    scan = scanner.directions(platform.time_s)
+    parts = np.split(platform.time_s, np.flatnonzero(np.diff(platform.line)) + 1)
+    scan = (np.concatenate(one) for one in zip(*map(scanner.directions, parts), strict=True))
     turned = platform.rotation @ mounting.rotation
     axis, far, left = (np.einsum("nij,nj->ni", turned, one) for one in scan)
     # Horizontal part of the forward axis; a platform that points up or down has none, and its scan angle is 0.

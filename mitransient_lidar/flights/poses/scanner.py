@@ -78,7 +78,10 @@ class Scanner(ABC):
         return SCANNER_KINDS[kind](**values)
 
     def directions(self, times: npt.ArrayLike) -> ScanDirections:
-        """Return the directions of pulses at times [s], shape (n,); raise `UserError` for times that are not finite."""
+        """Return the directions of pulses at times [s], shape (n,); raise `UserError` for times that are not finite.
+
+        The times are those of a flight line, from its first pulse on.
+        """
         nadir_angle, azimuth = self._angles(np.atleast_1d(finite_array("times", times)))
         sin, cos, sin_azimuth, cos_azimuth = (f(angle) for angle in (nadir_angle, azimuth) for f in (np.sin, np.cos))
         axis = np.column_stack([sin * sin_azimuth, sin * cos_azimuth, -cos])
@@ -212,7 +215,8 @@ class Raster(Scanner):
 
     The outer axis points to the right, and turns the beam from the nadir forward by the angle along; the inner one
     turns it to the right by the angle across. All points of a line follow each other, then those of the next line, at
-    equal times: a pulse rate of rate_hz * lines * points gives one pulse to each point.
+    equal times: a pulse rate of rate_hz * lines * points gives one pulse to each point, also at GPS times, which are
+    rounded. A flight line begins with a whole point.
 
     Parameters
     ----------
@@ -246,7 +250,11 @@ class Raster(Scanner):
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         count = self.lines * self.points
-        index = np.floor(times * self.rate_hz * count + _EARLY) % count
+        rate = self.rate_hz * count
+        # Differences from the first time are whole intervals but for the rounding of times.
+        early = max(_EARLY, 2 * float(np.spacing(np.abs(times).max(initial=0.0))) * rate)
+        first = np.floor(times[:1] * rate + early)
+        index = (first + np.floor((times - times[:1]) * rate + early)) % count
         line, point = np.divmod(index, self.points)
         along = np.radians(_between(self.along_deg, line, self.lines))
         across = np.radians(_between(self.across_deg, point, self.points))

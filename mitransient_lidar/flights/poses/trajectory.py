@@ -121,8 +121,8 @@ class Trajectory:
             `straight_lines.fixed_platform`; ``csv`` has ``file`` and ``rotation_spec`` (``ARINC 705``, as HELIOS++),
             ``sbet`` has ``file`` and ``epsg``. Files may also have ``origin``, the position of the origin of the scene
             in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); ``interpolation``
-            (``cubic``); and ``lines_s``, a list of the first and last time of each flight line [s] (one line, of all
-            records).
+            (``cubic``); ``lines_s``, a list of the first and last time of each flight line [s] (one line, of all
+            records); and ``time``, as of `times.time_system`.
         folder
             Folder from which relative paths of files count.
 
@@ -140,7 +140,7 @@ class Trajectory:
         if kind == "mast":
             return cls(*fixed_platform(given))
         where, own = f"a platform of kind {kind!r}", "rotation_spec" if kind == "csv" else "epsg"
-        check_keys(where, given, ("kind", "file", own, "origin", "interpolation", "lines_s"))
+        check_keys(where, given, ("kind", "file", own, "origin", "interpolation", "lines_s", "time"))
         file = required(where, given, "file")
         if not isinstance(file, str):
             raise UserError(f"file = {shown(file)} must be the path of a trajectory")
@@ -161,7 +161,7 @@ class Trajectory:
         outside = (line < 0) | (time > self.lines[line, 1])
         for row in np.flatnonzero(outside)[:1]:
             raise UserError(
-                f"time = {time[row]:g} s (number {row + 1}) is on no flight line: the lines are {self._lines_text()}"
+                f"time = {time[row]:.10g} s (number {row + 1}) is on no flight line: the lines are {self._lines_text()}"
             )
         values = self._interpolated(time)
         position, (roll, pitch, yaw) = values[:, :3], values[:, 3:].T
@@ -195,7 +195,9 @@ class Trajectory:
             For a rate [Hz] that is not positive or gives more than 10^8 pulses.
         """
         rate = positive("pulse_rate_hz", pulse_rate_hz)
-        counts = np.floor((self.lines[:, 1] - self.lines[:, 0]) * rate + _LAST_PULSE) + 1
+        # Times since 1980 are rounded by a tenth of a microsecond.
+        rounding = 2 * np.spacing(np.abs(self.lines).max()) * rate
+        counts = np.floor((self.lines[:, 1] - self.lines[:, 0]) * rate + max(_LAST_PULSE, rounding)) + 1
         if counts.sum() > _MOST_PULSES:
             raise UserError(
                 f"pulse_rate_hz = {rate:g} gives {counts.sum():.3g} pulses: at most {_MOST_PULSES:g} may be"
@@ -216,7 +218,7 @@ class Trajectory:
             raise UserError(f"the times of the flight lines, {self._lines_text()}, must increase")
         if lines[0, 0] < first or lines[-1, 1] > last:
             raise UserError(
-                f"the flight lines, {self._lines_text()}, must lie in the trajectory, {first:g} to {last:g} s"
+                f"the flight lines, {self._lines_text()}, must lie in the trajectory, {first:.10g} to {last:.10g} s"
             )
 
     def _lines_text(self) -> str:

@@ -24,6 +24,9 @@ logger = logging.getLogger(__name__)
 _Contents = tuple[Array, dict[str, Array], Stated]
 """Heights, positions by the names x and y as far as the file has them, and what it states of both."""
 
+#: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
+_FARTHEST = 1e4
+
 _Given = tuple[str | None, str | None, float | None]
 """Sign, unit and value for no data of `heights_in_metres`."""
 
@@ -104,8 +107,8 @@ def read_height_map(
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.
     origin : (float, float), optional
-        Point (x, y) of the map [m], within it, that lies at x = y = 0 of the result. Default: the centre of an .asc,
-        .tif, .bag or of points; other positions are kept.
+        Point (x, y) of the map [m], within 10 km of it, that lies at x = y = 0 of the result. Default: the centre of
+        an .asc, .tif, .bag or of points; other positions are kept.
     values : {'heights', 'depths'}, optional
         Whether the values are positive up or down. Default: what the file states, or heights.
     holes : {'refuse', 'fill'}
@@ -125,9 +128,9 @@ def read_height_map(
         If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
         columns, or with holes; heights beyond 12 000 m, or of an undeclared value for no data; units unknown or not
         stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or of another scale than
-        the ground; `size` not positive, missing or superfluous; `origin` outside the map, or given for a file without
-        positions; `cell` for another file than points, or more than half of their extent; or points on a line, or too
-        many.
+        the ground; `size` not positive, missing or superfluous; `origin` far outside the map, or given for a file
+        without positions; `cell` for another file than points, or more than half of their extent; or points on a line,
+        or too many.
 
     Notes
     -----
@@ -250,21 +253,30 @@ def _moved(
     """
     heights, axes = terrain.heights, (terrain.x, terrain.y)
     if centre is None and origin is None:
-        if not all(axis[0] <= 0 <= axis[-1] for axis in axes):
-            logger.warning(
-                "%s: x from %.10g to %.10g and y from %.10g to %.10g m do not contain x = y = 0, where the lidar"
-                " aims by default; origin_x and origin_y of a seabed move the map",
-                *(path, axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]),
-            )
+        _warn_beside(path, axes)
         return terrain
     middle = centre or (0.0, 0.0)
     point = middle if origin is None else origin
     for name, axis, zero, value in zip("xy", axes, middle, point, strict=True):
         low, high = zero + float(axis[0]), zero + float(axis[-1])
-        if not low <= finite(f"origin_{name}", value) <= high:
-            raise UserError(f"origin_{name} = {value:.10g} must lie between {low:.10g} and {high:.10g}, within {path}.")
+        if not low - _FARTHEST <= finite(f"origin_{name}", value) <= high + _FARTHEST:
+            raise UserError(
+                f"origin_{name} = {value:.10g} must lie within {_FARTHEST / 1000:g} km of {path}, whose {name} is "
+                f"{low:.10g} to {high:.10g}."
+            )
     x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
+    _warn_beside(path, (x, y))
     return HeightMap(heights, x, y, point, terrain.filled)
+
+
+def _warn_beside(path: Path, axes: tuple[FloatArray, FloatArray]) -> None:
+    """Warn of a map that does not contain x = y = 0."""
+    if not all(axis[0] <= 0 <= axis[-1] for axis in axes):
+        logger.warning(
+            "%s: x from %.10g to %.10g and y from %.10g to %.10g m do not contain x = y = 0, where the lidar"
+            " aims by default; origin_x and origin_y of a seabed move the map",
+            *(path, axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]),
+        )
 
 
 def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatArray:
@@ -326,3 +338,6 @@ def _read_exr(path: Path) -> _Contents:
 _READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": read_netcdf_heights}
 _GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff, ".bag": read_bag}
 _POINTS = (".xyz", ".csv", ".txt")
+
+#: Suffixes of maps that lie about their centre, in coordinates of their own, where no origin is given.
+IN_MAP_COORDINATES = (*_GRID_READERS, *_POINTS)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import finite, in_range
+from mitransient_lidar.core.validation import FloatArray, finite, in_range
 from mitransient_lidar.transport.opaque import opaque, opaque_point
 
 
@@ -53,6 +53,11 @@ class BubblePlume:
             in_range("plume_depth", props.get("plume_depth", 2.0), 0.01, 100.0),
         )
         return plume if plume.scattering > 0 else None
+
+    def displaced(self, place: FloatArray, aim: FloatArray, turn: complex) -> BubblePlume:
+        """Return the plume in a frame that is turned by `turn`, of modulus 1, and has a place (x, y) at `aim` [m]."""
+        stern = (complex(self.x, self.y) - complex(*place)) / turn + complex(*aim)
+        return replace(self, x=stern.real, y=stern.imag, bearing=float(self.bearing - np.angle(turn)))
 
     def _from_stern(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float]:
         """Return the distances of a point from the stern, astern and across [m]."""

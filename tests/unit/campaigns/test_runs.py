@@ -41,6 +41,19 @@ def test_record_of_the_campaign():
     assert renderer({"bottom_depth": [3, 15]}, fixed).axis is None
 
 
+def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
+    """The file of the default is nowhere; the one of the campaign, and its SHA-256, are in the record."""
+    (tmp_path / "own.xml").write_text(
+        '<scene version="3.0.0"><default name="map_file" value="nowhere.npy"/>'
+        '<shape type="seabed"><string name="filename" value="$map_file"/></shape></scene>'
+    )
+    np.save(tmp_path / "map.npy", np.full((3, 3), -5.0))
+    fixed = {"map_file": str(tmp_path / "map.npy")}
+    record = record_of(Campaign.of({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
+    assert record.parameters == {"map_file": "nowhere.npy"}
+    assert [path for path, _ in record.files.values()] == [str(tmp_path / "map.npy")]
+
+
 @pytest.mark.slow
 def test_random_seas_are_of_the_run():
     runs = renderer({"bottom_depth": [3.0, 4.0]})

@@ -45,9 +45,12 @@ def points() -> xr.Dataset:
         "scan_angle_deg": rng.uniform(-21, 21, count),
         "line": 1 + pulse // 100,
         "pixel": pulse % PIXELS,
+        "channel": pulse % PIXELS,
         "shot": pulse // PIXELS,
         "depth": depth,
         **{f"{name}_uncertainty": rng.uniform(0.01, 0.5, count) for name in ("depth", "horizontal", "vertical")},
+        "quality": np.where(pulse % 7 == 0, 1, 12 * (kind == 40)),
+        "withheld": pulse % 7 == 0,
         "packet": np.where(pulse % 5 == 4, -1, pulse),
         "time_in_packet_ns": rng.uniform(0, SAMPLES, count),
     }
@@ -116,6 +119,30 @@ def test_read_from_the_specification(
         np.testing.assert_array_equal(read_column(file, name).astype(np.float32), points[name].astype(np.float32))
 
 
+@pytest.mark.parametrize(
+    ("system", "less", "bit", "text"),
+    [
+        ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
+        ("gps_week", 0, 0, "seconds of the GPS week"),
+        ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
+        ("gps", 1e9, 1, "adjusted standard GPS time"),
+    ],
+)
+def test_times_their_type_and_the_notes_agree(
+    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, system: str, less: float, bit: int, text: str
+) -> None:
+    """Adjusted standard GPS time is GPS time less 10^9 s (LAS 1.4 R15, table 4, bit 0 of the global encoding)."""
+    points["gps_time"] = points["gps_time"] + less + 1000
+    points["gps_time"].attrs["time_system"] = system
+    write_points(tmp_path / "points.las", points)
+    write_waveforms(tmp_path / "waveforms.las", points, waveforms)
+    for name in ("points.las", "waveforms.las"):
+        file = las_reader.read(tmp_path / name)
+        assert file.encoding & 1 == bit
+        assert text in file.records["LASF_Spec", 3].decode("ascii")
+        np.testing.assert_array_equal(read_column(file, "gps_time"), points["gps_time"] - less)
+
+
 def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset) -> None:
     points["intensity"].values[:3] = [-0.1, 7.0, np.nan]
     write_points(tmp_path / "points.las", points)
@@ -127,11 +154,21 @@ def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset)
     assert np.max(np.abs(step * read[3:] - points["intensity"][3:])) <= 0.5001 * step
 
 
-def test_points_without_an_echo_are_synthetic(tmp_path: Path, points: xr.Dataset) -> None:
+def test_points_without_an_echo_are_synthetic_and_doubtful_ones_withheld(tmp_path: Path, points: xr.Dataset) -> None:
     write_points(tmp_path / "points.las", points)
     file = las_reader.read(tmp_path / "points.las")
-    assert {point.flags for point in file.points if point.classification == 45} == {1}
-    assert {point.flags for point in file.points if point.classification != 45} == {0}
+    synthetic, withheld = ([point.flags >> bit & 1 for point in file.points] for bit in (0, 2))
+    assert synthetic == [point.classification == 45 for point in file.points]
+    np.testing.assert_array_equal(withheld, points["withheld"])
+    np.testing.assert_array_equal(read_column(file, "quality"), points["quality"])
+
+
+def test_pixels_of_a_pulse_are_told_apart_by_standard_fields(tmp_path: Path, points: xr.Dataset) -> None:
+    write_points(tmp_path / "points.laz", points)
+    read = laspy.read(tmp_path / "points.laz")
+    np.testing.assert_array_equal(read.scanner_channel, points["pixel"])
+    keys = np.stack([read.gps_time, read.scanner_channel, read.return_number], axis=1)
+    assert len(np.unique(keys, axis=0)) == points.sizes["point"]
 
 
 def test_extra_bytes_are_described_and_missing_numbers_are_nan(tmp_path: Path, points: xr.Dataset) -> None:
@@ -328,6 +365,8 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
         ("kind", 256, "kind = 256 must lie between 0 and 255"),
         ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
         ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
+        ("quality", 256, "quality = 256 must lie between 0 and 255"),
+        ("channel", 4, "channel = 4 must lie between 0 and 3"),
         ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
         ("line", 70000, "line = 70000 must lie between 0 and 65535"),
         ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),

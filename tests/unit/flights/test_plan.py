@@ -7,7 +7,8 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.plan import FlightPlan, flights
-from mitransient_lidar.flights.renderer import FlightRenderer, _columns
+from mitransient_lidar.flights.preparation import input_columns
+from mitransient_lidar.flights.renderer import FlightRenderer
 
 LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
 PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0}
@@ -32,7 +33,8 @@ def test_shipped_flights_have_poses(name):
         ({"pulses": {"rate_hz": -1}}, "rate_hz"),
         ({"pulses": {"rate_hz": 100, "most": 0}}, "most = 0 must"),
         ({"receiver": {"gian": 1}}, "'gian' is no key of"),
-        ({"receiver": {"gain": "auto"}}, "gain"),
+        ({"receiver": {"gain": "best"}}, "gain = 'best' must be a number"),
+        ({"receiver": {"gain": "auto", "optical_density": "auto"}}, "are alternatives: give one of them"),
         ({"receiver": {"optical_density": 20}}, "optical_density = 20"),
         ({"estimator": "best"}, "estimator = 'best' must be one of"),
         ({"errors": {"rol_deg": 1}}, "rol_deg"),
@@ -64,13 +66,13 @@ def test_a_name_that_is_not_shipped():
 )
 def test_poses_that_cannot_be_rendered(change, message):
     with pytest.raises(UserError, match=message):
-        _columns(FlightPlan.of({**FLIGHT, **change}).poses())
+        input_columns(FlightPlan.of({**FLIGHT, **change}).poses())
 
 
 def test_pulses_of_one_group_have_similar_poses():
     scanner = {"kind": "oscillating", "half_angle_deg": 15.0, "rate_hz": 5.3}
     plan = FlightPlan.of({**FLIGHT, "scanner": scanner})
-    columns = _columns(plan.poses())
+    columns = input_columns(plan.poses())
     angle = np.degrees(np.arccos(-columns["axis_z"]))
     assert np.all(np.abs(angle - columns["group_angle_deg"]) <= 1.0)
     assert np.array_equal(np.sort(columns["pulse"]), np.arange(len(angle)))
@@ -83,7 +85,7 @@ def test_pulses_of_one_group_have_similar_poses():
 @pytest.mark.parametrize(("still", "longest"), [(False, 0.05), (True, 0.64)])
 def test_batches_are_of_one_group_and_one_sea(still, longest):
     plan = FlightPlan.of({**FLIGHT, "still_sea": still})
-    columns = _columns(plan.poses())
+    columns = input_columns(plan.poses())
     batches = list(FlightRenderer(plan, None, None).batches(columns))
     assert [row for batch in batches for row in batch] == list(range(len(columns["pulse"])))
     for batch in batches:

@@ -9,7 +9,13 @@ from significance import largest_count
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.recording import chosen_settings, has_automatic_settings, pooled_errors, record
+from mitransient_lidar.flights.recording import (
+    chosen_settings,
+    has_automatic_settings,
+    pooled_errors,
+    record,
+    saturated_pulses,
+)
 
 FLIGHT = {"scene": "flight", "platform": {}, "scanner": {}, "pulses": {"rate_hz": 100}}
 
@@ -42,6 +48,18 @@ def test_all_pulses_have_the_gain_of_the_brightest_probe():
     np.testing.assert_allclose(low[0] / high[0], 0.2, rtol=0.02)
     # A pulse brighter than all probes saturates.
     assert record(rendered("published_airborne", pixels, 3e-4), plan, inputs)["saturated"].any()
+
+
+def test_pulses_that_saturate_are_counted():
+    """Three pulses of the peak power that just fits a gain, a third more, and a third less, in one of two pixels."""
+    pixels = ["red", "green"]
+    fits = detect_waveforms(rendered("", pixels, 1e-4), "apd", gain="auto").attrs["gain"]
+    probes = [rendered("", pixels, 1e-4, 1.5e-4), rendered("", pixels, 0.7e-4)]
+    for gain, count in ((0.9 * fits, 1), (2 * fits, 3), ("auto", 0)):
+        plan = FlightPlan.of({**FLIGHT, "receiver": {"chain": "apd", "gain": gain}})
+        settings = chosen_settings(probes, plan)
+        assert bool(settings) == has_automatic_settings(plan, None) == (gain == "auto")
+        assert saturated_pulses(probes, plan, settings) == count
 
 
 def test_each_channel_has_its_own_gain():

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 
 PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 50.0}
 ARC = {"kind": "semi_arc", "nadir_angle_deg": 20.0, "rate_hz": 10.0}
@@ -80,6 +82,30 @@ def test_raster_visits_each_point_in_turn():
     np.testing.assert_allclose(along, [*np.repeat([60, 70, 80], 5), 60], atol=1e-12)
     across = np.degrees(np.arcsin(axis[:, 0]))
     np.testing.assert_allclose(across, [*np.tile([-10, -5, 0, 5, 10], 3), -10], atol=1e-12)
+
+
+@pytest.mark.parametrize("start", [0.0, 302_400.123, 604_799.0, 340_000_000.25, 1.38e9 + 0.1, 1.38e9 + 0.7654321])
+@pytest.mark.parametrize("rate", [1000.0, 200_000.0])
+def test_raster_keeps_its_points_at_gps_times(start, rate):
+    """Times since 1980 are rounded by 0.1 us, a fiftieth of the interval of 200 kHz."""
+    scanner = Scanner.of({**RASTER, "lines": 20, "points": 50, "rate_hz": rate / 1000})
+    line = Trajectory(np.array([start, start + 1.0]), np.zeros((2, 3)), *np.zeros((3, 2)))
+    times = line.pulse_times(rate)
+    assert len(times) == rate + 1
+    rasters = scanner.directions(times[:-1]).axis.round(9).reshape(-1, 1000, 3)
+    assert len(np.unique(rasters[0], axis=0)) == 1000
+    assert np.all(rasters == rasters[0])
+
+
+def test_every_line_of_a_flight_begins_with_a_whole_point():
+    """The second line begins at a time that the rounding puts before or after a point: by chance, pulse by pulse."""
+    start, rate = 1.38e9, 200_000.0
+    lines = np.array([[start, start + 0.01], [start + 0.1 + 0.999 / rate, start + 0.11 + 0.999 / rate]])
+    flown = Trajectory(np.array([start, start + 1.0]), np.zeros((2, 3)), *np.zeros((3, 2)), lines=lines)
+    scanner = Scanner.of({**RASTER, "lines": 20, "points": 50, "rate_hz": rate / 1000})
+    poses = pulse_poses(flown, Mounting(), scanner, flown.pulse_times(rate))
+    for line in (0, 1):
+        assert len(np.unique(poses.axis[poses.line == line][:1000].round(9), axis=0)) == 1000
 
 
 def test_raster_of_one_point_looks_to_the_middle():

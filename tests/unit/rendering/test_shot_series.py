@@ -391,6 +391,15 @@ def test_invalid_input_is_refused_before_rendering(rendered, scene, options, mes
     assert not rendered
 
 
+def test_command_mounts_an_instrument(monkeypatch, tmp_path):
+    def asked(scene, **options):
+        raise UserError(f"instrument {options.get('instrument')}")
+
+    monkeypatch.setattr(shot_series, "render_shots", asked)
+    assert_refused(run("shots", "table1", "--instrument", "riegl_vq840gl", "-o", tmp_path / "a.nc"), "riegl_vq840gl")
+    assert_refused(run("shots", "table1", "-o", tmp_path / "a.nc"), "instrument None")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -319,8 +319,11 @@ def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
     ("options", "message"),
     [
         ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
-        ({"origin": (6000007.5, 500001)}, r"origin_x = 6000007.5 must lie between 499998 and 500004, within .*map.asc"),
-        ({"origin": (5e5, 6000009.75)}, r"origin_y = 6000009.75 must lie between 6000005.5 and 6000009.5, within"),
+        (
+            {"origin": (6000007.5, 500001)},
+            r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is 499998 to",
+        ),
+        ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
         ({"origin": (np.nan, 0)}, "origin_x = nan must be finite"),
         ({"values": "fathoms"}, "map_values = 'fathoms' must be heights or depths"),
         ({"holes": "keep"}, "map_holes = 'keep' must be refuse or fill"),
@@ -329,6 +332,13 @@ def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
 def test_invalid_placements_are_rejected(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
+
+
+def test_an_origin_beside_the_map_is_warned_of(tmp_path, caplog):
+    """A lidar aims there by default; a survey may count its places from any round number."""
+    found = read_height_map(write_ascii_grid(tmp_path / "map.asc"), origin=(499990.0, 6000000.0))
+    assert (found.x[0], found.y[0]) == (8, 5.5)
+    assert "do not contain x = y = 0, where the lidar aims by default" in caplog.text
 
 
 def test_origin_needs_positions(tmp_path):

@@ -1,0 +1,78 @@
+"""Times of trajectories: seconds of a flight, of a GPS week, or since the beginning of GPS time."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, shown
+
+_LOG = logging.getLogger(__name__)
+
+#: Systems of times: from any beginning, that of a GPS week, 6 January 1980, and 10^9 s later, in 2011.
+TIME_SYSTEMS = ("flight", "gps_week", "gps", "adjusted_gps")
+
+#: What adjusted GPS times are less than those since 1980 [s].
+ADJUSTMENT_S = 1e9
+
+#: Latest time of a week whose flight ends on the next day, and earliest adjusted time [s], of January 2012.
+_LATEST_OF_WEEK, _EARLIEST_ADJUSTED = 8 * 86_400, 1e7
+
+#: Earliest time that may be Unix time [s], of September 2020, and GPS time of 2030.
+_MAY_BE_UNIX = 1.6e9
+
+#: Unix time less GPS time [s], with the 18 leap seconds since 2017.
+_UNIX_LESS_GPS = 315_964_782
+
+_EPOCH = datetime.datetime(1980, 1, 6)
+
+
+def time_system(platform: Mapping[str, Any], time_s: FloatArray) -> str:
+    """Return the system of the times of a platform, one of `TIME_SYSTEMS`.
+
+    Without ``time`` in its table, times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times.
+    Smaller ones are of a week in an SBET file, up to a day after its end, and of the flight in a text file. Other
+    platforms begin with their flight.
+
+    Parameters
+    ----------
+    platform
+        Table ``[platform]`` of a plan.
+    time_s
+        Times [s], not empty.
+
+    Raises
+    ------
+    UserError
+        If ``time`` is no system, or the times may be Unix times.
+    """
+    given, latest = platform.get("time"), float(np.max(time_s))
+    if given is not None:
+        if given not in TIME_SYSTEMS:
+            raise UserError(f"time = {shown(given)} of a platform must be one of {', '.join(TIME_SYSTEMS)}")
+        return str(given)
+    if platform["kind"] not in ("csv", "sbet"):
+        return "flight"
+    if latest >= _MAY_BE_UNIX:
+        raise UserError(
+            f"the times of {platform['file']}, up to {latest:.10g} s, may be Unix times, which are {_UNIX_LESS_GPS} s "
+            "more than GPS times: convert them, or give time = 'gps' in [platform]"
+        )
+    if latest >= _EARLIEST_ADJUSTED:
+        return "gps" if latest >= ADJUSTMENT_S else "adjusted_gps"
+    return "gps_week" if platform["kind"] == "sbet" and latest <= _LATEST_OF_WEEK else "flight"
+
+
+def tell_time_system(system: str, time_s: FloatArray) -> None:
+    """Log what GPS times are taken for, with their day."""
+    if system in ("gps", "adjusted_gps"):
+        since = float(np.min(time_s)) + ADJUSTMENT_S * (system == "adjusted_gps")
+        day = (_EPOCH + datetime.timedelta(seconds=since)).date()
+        _LOG.info(
+            "times of the flight are %s times, from %s on", system.replace("_gps", " GPS").replace("gps", "GPS"), day
+        )

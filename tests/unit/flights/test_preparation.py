@@ -1,0 +1,153 @@
+"""What is said of a flight before its first render: places of maps, coverage, corrections, cost and gain."""
+
+import logging
+import re
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar import scenes
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.fly import STORE, _prepare
+from mitransient_lidar.flights.las_header import check_same_system
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
+from mitransient_lidar.flights.renderer import scene_of
+
+LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
+FLIGHT = {
+    "scene": "flight",
+    "platform": LINE,
+    "scanner": {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0},
+    "pulses": {"rate_hz": 100},
+}
+
+#: 4 x 3 cells of 10 m, whose centre is the point (500020, 6500015).
+GRID = "ncols 4\nnrows 3\nxllcorner 500000\nyllcorner 6500000\ncellsize 10\n" + "-4 -5 -6 -7\n" * 3
+
+#: A trajectory of two records in map coordinates.
+RECORDS = "t,roll,pitch,yaw,x,y,z\n0,0,0,90,500005,6500015,200\n1,0,0,90,500035,6500015,200\n"
+
+
+def from_file(folder, place, **others):
+    """Return a flight along the records, whose platform has this origin."""
+    (folder / "line.csv").write_text(RECORDS)
+    platform = {"kind": "csv", "file": "line.csv", "origin": place}
+    return FlightPlan.of({**FLIGHT, "platform": platform, **others}, folder)
+
+
+def loaded_scene(folder, **parameters):
+    (folder / "step.asc").write_text(GRID)
+    bed = {"type": "seabed", "id": "bed", "filename": str(folder / "step.asc"), **parameters}
+    return mi.load_dict({"type": "scene", "bed": bed})
+
+
+@pytest.mark.parametrize("own", [{}, {"origin_x": 500010.0, "origin_y": 6500015.0}])
+def test_a_map_lies_where_the_flight_has_its_points(tmp_path, own):
+    """Without an origin a map lies about its centre: 10 m beside where its points would be written."""
+    scene, place = loaded_scene(tmp_path, **own), [*(own.values() or (500020.0, 6500015.0)), 0.0]
+    check_maps(from_file(tmp_path, place, crs="EPSG:32633", origin=place), scene)
+    # Without coordinates of points, the trajectory's own ones count.
+    check_maps(from_file(tmp_path, place), scene)
+    other = [place[0], place[1] - 10, 0.0]
+    for plan in (from_file(tmp_path, other, crs="EPSG:32633", origin=other), from_file(tmp_path, other)):
+        with pytest.raises(UserError, match=r"the map of shape bed has .*: give the seabed origin_x = 5000\d0 and"):
+            check_maps(plan, scene)
+
+
+OWN_SCENE = """<scene version="3.0.0">
+    <default name="map_file" value="nowhere.tif"/>
+    <include filename="{shared}/_lidar.xml"/>
+    <include filename="{shared}/_sea.xml"/>
+    <shape type="seabed"><string name="filename" value="$map_file"/>{own}</shape>
+</scene>
+"""
+
+
+@pytest.mark.parametrize(
+    ("own", "place"),
+    [("", (500000.0, 6500000.0)), ('<float name="origin_x" value="1"/><float name="origin_y" value="2"/>', (1.0, 2.0))],
+)
+def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
+    """A flight replaces defaults before anything is loaded: the file of the default is nowhere."""
+    (tmp_path / "step.asc").write_text(GRID)
+    (tmp_path / "own.xml").write_text(OWN_SCENE.format(shared=scenes.__path__[0], own=own))
+    given = {**FLIGHT, "scene": "own.xml", "parameters": {"map_file": str(tmp_path / "step.asc")}}
+    record = scene_of(FlightPlan.of({**given, "crs": "EPSG:32633", "origin": [500000.0, 6500000.0, 0.0]}, tmp_path))
+    text = record.document().filled(lambda setting: setting.value)
+    found = tuple(float(re.search(f'name="origin_{axis}" value="(.*?)"', text)[1]) for axis in "xy")
+    assert found == place
+    assert record.parameters["map_file"] == "nowhere.tif"
+    assert [path for path, _ in record.files.values()] == [str(tmp_path / "step.asc")]
+    # Without map coordinates the map lies as it does in a render.
+    assert ("origin_x" in scene_of(FlightPlan.of(given, tmp_path)).text) == bool(own)
+
+
+def test_places_beyond_a_map(tmp_path, caplog):
+    """Cells of 10 m about centres from -15 to 15 and -10 to 10 m; the mesh of the bottom is 1000 m wide."""
+    bed = loaded_scene(tmp_path).shapes()[0]
+    x, y = np.array([0.0, 19.0, 21.0, 0.0]), np.array([0.0, -14.0, 0.0, 16.0])
+    assert bed.is_beyond_map(x, y).tolist() == [False, False, True, True]
+    warn_of_maps(2, 4)
+    assert caplog.messages == ["2 of 4 pulses meet the bottom beyond its height map, whose edge continues there"]
+    plane = mi.load_dict({"type": "seabed"})
+    assert not plane.is_beyond_map(x, y).any()
+
+
+def test_a_map_without_coordinates_and_a_flight_without_them_go_together(tmp_path):
+    check_maps(FlightPlan.of(FLIGHT), loaded_scene(tmp_path))
+    check_maps(
+        FlightPlan.of({**FLIGHT, "origin": [5e5, 6e6, 0]}), mi.load_dict({"type": "scene", "b": {"type": "seabed"}})
+    )
+
+
+def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
+    place = [500020.0, 6500015.0, 40.0]
+    # Heights may count from another datum.
+    plan = from_file(tmp_path, place, crs="EPSG:32633", origin=[*place[:2], 0.0])
+    assert plan.poses().origin[0, 0] == pytest.approx(-15)
+    for wrong in ({"crs": "EPSG:32633"}, {"origin": [500021.0, 6500015.0, 0.0]}):
+        with pytest.raises(UserError, match=r"origin = \[500020.0, .* of the platform must have the x and y of that"):
+            from_file(tmp_path, place, **wrong).poses()
+
+
+def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
+    """As that of a campaign: another size is refused instead of being ignored."""
+    store = SimpleNamespace(count=3, shard_size=16, inputs=lambda rows: {}, is_of=lambda *about: True)
+    monkeypatch.setattr("mitransient_lidar.flights.fly.Store", lambda path: store)
+    (tmp_path / STORE).mkdir()
+    for size in (None, 16, 8):
+        if size == 8:
+            with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*flight\.zarr, 16"):
+                _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size)
+        else:
+            assert _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size) is store
+
+
+def test_what_is_told_before_a_flight(caplog):
+    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
+        tell_forecast(16, 64, 3000, 0.1)
+        tell_forecast(0, 64, 3000, 0.1)
+    told = [record.getMessage() for record in caplog.records]
+    assert told[0].startswith("16 of 64 sampled pulses saturate the receiver, 25 % of the flight; ")
+    assert told[1] == told[3] == "3000 pulses take about 3e+02 s of processor time, by those of the sample"
+    assert told[2] == "none of 64 sampled pulses saturates the receiver"
+
+
+def test_what_is_told_once(caplog):
+    logger = logging.getLogger("mitransient_lidar.physics")
+    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
+        with telling_errors_alone():
+            logger.info("again")
+        logger.info("anew")
+    assert [record.getMessage() for record in caplog.records] == ["anew"]
+
+
+def test_an_sbet_file_is_in_the_system_of_the_points():
+    pytest.importorskip("pyproj")
+    for crs in ("EPSG:32633", "EPSG:32633+5773"):
+        check_same_system(crs, 32633)
+        with pytest.raises(UserError, match=r"epsg = 32634 of the platform must be .* crs = 'EPSG:32633"):
+            check_same_system(crs, 32634)

@@ -1,0 +1,52 @@
+"""Systems of the times of trajectories."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.poses.times import tell_time_system, time_system
+
+CSV, SBET, LINES = ({"kind": kind, "file": "line.txt"} for kind in ("csv", "sbet", "lines"))
+
+
+@pytest.mark.parametrize(
+    ("platform", "last", "system"),
+    [
+        (LINES, 20.0, "flight"),
+        (CSV, 302_410.0, "flight"),
+        (SBET, 302_410.0, "gps_week"),
+        (SBET, 604_810.0, "gps_week"),
+        (CSV, 389_012_346.0, "adjusted_gps"),
+        (SBET, 1_389_012_346.0, "gps"),
+        ({**CSV, "time": "gps_week"}, 302_410.0, "gps_week"),
+        ({**CSV, "time": "gps"}, 1.7e9, "gps"),
+    ],
+)
+def test_systems_of_times(platform, last, system):
+    assert time_system(platform, np.array([last - 10, last])) == system
+
+
+@pytest.mark.parametrize(
+    ("platform", "last", "message"),
+    [
+        ({**CSV, "time": "utc"}, 10.0, "time = 'utc' of a platform must be one of flight, gps_week, gps, adjusted_gps"),
+        (CSV, 1.764e9, r"the times of line\.txt, up to 1764000000 s, may be Unix times, which are 315964782 s more"),
+    ],
+)
+def test_times_that_are_not_known(platform, last, message):
+    with pytest.raises(UserError, match=message):
+        time_system(platform, np.array([last - 10, last]))
+
+
+@pytest.mark.parametrize(("system", "time"), [("gps", 1_389_012_345.0), ("adjusted_gps", 389_012_345.0)])
+def test_the_day_of_gps_times_is_told(caplog, system, time):
+    """GPS week 2296 began on 7 January 2024; the time is its Thursday, day 5 of it."""
+    week, second = divmod(1_389_012_345, 604_800)
+    assert (week, second // 86_400) == (2296, 4)
+    with caplog.at_level(logging.INFO):
+        tell_time_system(system, np.array([time]))
+        tell_time_system("flight", np.array([time]))
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert told.endswith("GPS times, from 2024-01-11 on")
