@@ -430,10 +430,11 @@ def water(
     from mitransient_lidar.studies import water_report as study
 
     check_figure(output)
-    _print(study.describe_water(kind, value, wavelength, temperature, salinity, tolerance))
-    if output is not None:
-        with announced():
+    lines = study.describe_water(kind, value, wavelength, temperature, salinity, tolerance)
+    with announced():
+        if output is not None:
             plot_water(kind, value, wavelength, temperature, salinity, tolerance, output)
+        _print(lines)
 
 
 def _print(lines: list[str]) -> None:

@@ -88,6 +88,7 @@ def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
 def test_places_beyond_a_map(tmp_path, caplog):
     """Cells of 10 m about centres from -15 to 15 and -10 to 10 m; the mesh of the bottom is 1000 m wide."""
     bed = loaded_scene(tmp_path).shapes()[0]
+    caplog.clear()
     x, y = np.array([0.0, 19.0, 21.0, 0.0]), np.array([0.0, -14.0, 0.0, 16.0])
     assert bed.is_beyond_map(x, y).tolist() == [False, False, True, True]
     warn_of_maps(2, 4)
