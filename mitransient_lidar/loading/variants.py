@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import logging
 import os
 import platform
 import re
@@ -12,6 +13,8 @@ from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.processors import usable_processors
+
+_LOG = logging.getLogger(__name__)
 
 #: Variants that the plugins support, in the order of preference.
 SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
@@ -169,6 +172,24 @@ def set_variant(name: str | None = None) -> str:
     mi.set_variant(name)
     register_plugins(None, name)
     return name
+
+
+def leave_the_gpu(what: str) -> None:
+    """Go on with ``llvm_ad_mono``, and say so, where ``cuda_ad_mono`` is active.
+
+    `what` is rendered through several Mitsuba scenes in one kernel. OptiX traces rays through the first of them only:
+    the light of the others would be missing without a word.
+
+    Raises
+    ------
+    UserError
+        If there is no LLVM.
+    """
+    import mitsuba as mi
+
+    if mi.variant() == "cuda_ad_mono":
+        _LOG.warning("%s by llvm_ad_mono: a kernel of cuda_ad_mono can trace rays through one scene only", what)
+        set_variant("llvm_ad_mono")
 
 
 def register_plugins(_old: str | None, new: str) -> None:

@@ -11,6 +11,7 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.loading import variants
 from mitransient_lidar.rendering.session import Session, check_components, choose_integrator, open_scene
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class ShotScene:
         from mitransient_lidar.rendering.shot_batches import check_size
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
+        variants.leave_the_gpu("shots are rendered")
         self._scene, self._params, self._target, self._components = scene, params, target, components
         self._derivatives = derivatives
         self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))

@@ -19,6 +19,7 @@ from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -163,6 +164,7 @@ def render_shots(
     seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
+    variants.leave_the_gpu("shots are rendered")
     session = open_scene(scene, params, instrument=instrument) if given is None or move_target else None
     target = _target_offset(session) if session is not None and move_target else None
     places = given

@@ -139,7 +139,9 @@ def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monk
     s, value = (np.array(x, dtype=np.float64) for x in series.sample(u, v))
     s_law, value_law = (np.array(x, dtype=np.float64) for x in law.sample(u, v))
     inside = s_law > 1.01e-12
-    np.testing.assert_allclose(s[inside], s_law[inside], rtol=1e-4)
+    # Logarithms and exponentials of GPUs are rounded more coarsely: 1.34e-4 was seen.
+    closeness = 1e-4 if mi.variant().startswith("llvm") else 2e-4
+    np.testing.assert_allclose(s[inside], s_law[inside], rtol=closeness)
     np.testing.assert_allclose(value[inside], value_law[inside], rtol=2e-4)
     assert np.median(np.abs(s[inside] / s_law[inside] - 1)) < 5e-7
     # What is drawn has the density that is asked for, in the cap, too: but for the rounding of ln s.

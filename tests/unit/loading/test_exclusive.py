@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 
 import mitransient_lidar
@@ -70,6 +71,7 @@ def test_an_interruption_ends_the_waiting(busy, defers):
     turn()
 
 
+@pytest.mark.skipif(mi.variant().startswith("cuda"), reason="a forked process has no GPU")
 def test_a_forked_process_does_not_wait_for_threads_that_it_lacks():
     script = """
 import os, threading

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
+import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import variants
 
@@ -49,6 +50,22 @@ def test_cuda_without_a_gpu_is_refused():
     else:
         with pytest.raises(UserError, match="needs an NVIDIA GPU"):
             variants.set_variant("cuda_ad_mono")
+
+
+def test_shots_leave_the_gpu(monkeypatch, caplog):
+    """A kernel of OptiX traces rays through one Mitsuba scene: the bottom of a series had no light, without a word."""
+    active, set_variant = ["cuda_ad_mono"], variants.set_variant
+
+    def change(name=None):
+        active[0] = name or active[0]
+        return set_variant("llvm_ad_mono")
+
+    monkeypatch.setattr(mi, "variant", lambda: active[0])
+    monkeypatch.setattr(variants, "set_variant", change)
+    with pytest.raises(UserError, match="parameter"):
+        mitransient_lidar.render_shots("table1", {"nonsense": 1}, positions=[(0, 0), (1, 1)])
+    assert active == ["llvm_ad_mono"]
+    assert caplog.text.count("shots are rendered by llvm_ad_mono: a kernel of cuda_ad_mono") == 1
 
 
 def test_old_llvm_in_the_process_says_to_import_first(monkeypatch):
