@@ -44,8 +44,9 @@ def test_images_are_pictures_taken_from_the_lidar_in_any_order_of_their_pixels()
         assert (ax.get_xlabel(), ax.get_ylabel()) == ("to the left, angle_y (mrad)", "away from nadir, angle_x (mrad)")
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., 0])
-    np.testing.assert_array_equal(pictures[0], pictures[1])
-    np.testing.assert_array_equal(pictures[0], pictures[2])
+    # Older versions of Matplotlib put the pixels where cells meet into either of them.
+    assert np.mean(pictures[0] != pictures[1]) < 0.01
+    assert np.mean(pictures[0] != pictures[2]) < 0.01
     # The values 0 (far left), 4 (far right) and 15 (near left) from black to white, in the picture's rows from the top.
     places = ax.transData.transform([(0.0, 6.0), (-12.0, 6.0), (0.0, -6.0)])
     grey = [int(pictures[0][len(pictures[0]) - 1 - int(y), int(x)]) for x, y in places]
