@@ -29,7 +29,8 @@ class LayeredWater(mi.Medium):
     chlorophyll              string  Or its chlorophyll, 0.01 to 30 mg/m^3 (Case 1 water)
     kd                       string  Or its diffuse attenuation Kd, 0.0486 to 0.738 1/m
     secchi                   string  Or its Secchi depth, 0.5 to 25 m
-    petzold                  string  Or Petzold's ``clear``, ``coastal`` or ``turbid``
+    petzold                  string  Or Petzold's ``clear``, ``coastal``, ``turbid``, or a station of the phase
+                                     function ``petzold``
     pure                     string  Or ``true``: sea water without particles, whose scattering is ``water_scattering``
     wavelength_nm            float   Wavelength of these waters [nm]: 532, or 400 to 700 for ``chlorophyll`` and
                                      ``pure``, 514 to 533 for ``petzold``; or of the columns of a profile that has

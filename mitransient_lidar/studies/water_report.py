@@ -40,7 +40,7 @@ _TITLES = {
     "chlorophyll": "chlorophyll {} mg/m³",
     "kd": "Kd {} 1/m",
     "secchi": "Secchi depth {} m",
-    "petzold": "Petzold's {} water",
+    "petzold": "Petzold's water {}",
     "pure": "pure sea water",
 }
 

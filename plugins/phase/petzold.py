@@ -21,13 +21,14 @@ class Petzold(TabulatedPhaseFunction):
     Parameter  Type    Meaning
     =========  ======  =================================================================================================
     water      string  ``average_particle``, or one of the measured waters ``clear`` (ocean off the Bahamas, bb/b
-                       0.044), ``coastal`` (off California, 0.013) and ``turbid`` (San Diego harbour, 0.020). Default:
-                       ``average_particle``
+                       0.044), ``coastal`` (off California, 0.013), ``turbid`` (San Diego harbour, 0.020), ``autec_7``
+                       (0.025), ``autec_9`` (0.038), ``haoce_5`` (0.014), ``nuc_2200`` (0.019) and ``nuc_2240``
+                       (0.018). Default: ``average_particle``
     =========  ======  =================================================================================================
 
     Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised, with power laws below 0.1 degrees.
     The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
-    0.0183 and a mean cosine of 0.924. The three waters include the scattering of pure water.
+    0.0183 and a mean cosine of 0.924. The waters include the scattering of pure water.
 
     .. code-block:: xml
 

@@ -116,6 +116,23 @@ def test_every_instrument_has_a_receiver_with_sources():
     assert isinstance(receiver("icesat2_atlas").default.chain.detector, SinglePhotonDetector)
 
 
+def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
+    """ATL03 photons over calm, deep water: 244 594 of the surface, and these by nanoseconds after their mean."""
+    edges = np.array([3, 5, 8, 13, 18, 24, 32, 60, 100, 125, 150, 175, 200, 225, 250, 300, 420])
+    seen = np.array([2753, 874, 555, 1469, 147, 703, 144, 137, 226, 255, 374, 377, 376, 266, 261, 142]) / 244594
+    detector = receiver("icesat2_atlas").default.chain.detector
+    part, weak = 0.125, 1e-3
+    time = np.arange(-8, 500, part)
+    pulse = np.exp(-0.5 * (time / (1.5 / 2.3548)) ** 2)
+    events = detector.with_tail(weak * pulse / pulse.sum(), np.zeros(1), part)
+    counts, _ = detector.moments(events, part, 1)
+    # What comes at once belongs to the surface.
+    surface = time < 2.5
+    time = time - np.average(time[surface], weights=counts[surface])
+    share = np.histogram(time, edges, weights=counts)[0] / counts[time < 2.5].sum()
+    np.testing.assert_allclose(share, seen, rtol=0.07)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
