@@ -314,9 +314,9 @@ class Seabed(mi.Mesh):
         return float(values.pop()) if len(values) == 1 else None
 
     @property
-    def map_origin(self) -> tuple[float, float] | None:
-        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
-        return None if self.bottom.terrain is None else self.bottom.terrain.origin
+    def height_map(self) -> HeightMap | None:
+        """Height map of the bottom; None without one."""
+        return self.bottom.terrain
 
     def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return whether places [m] lie beyond the height map; nowhere without one."""

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.validation import FloatArray, shown
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 #: Largest difference of a projection's scale from 1. UTM zones and national grids have up to 0.003, Mercator's
 #: projection beyond 8 degrees of latitude has more.
@@ -18,10 +27,36 @@ LARGEST_DISTORTION = 0.01
 _METRES_PER_FOOT = 0.3048
 
 
+@functools.cache
+def _thread() -> ThreadPoolExecutor:
+    """Return the thread in which pyproj reads the systems of maps."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(1, "pyproj")
+
+
+# A forked process has no thread but its own.
+os.register_at_fork(after_in_child=_thread.cache_clear)
+
+
+def _in_one_thread(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Run a function in a thread that lasts, and return what it does, which must hold no object of pyproj.
+
+    Mitsuba reads scenes in threads that end for Python after each plugin. pyproj then destroys what it keeps for the
+    thread, and takes it again for the next plugin: the process ended in a segmentation fault.
+    """
+
+    @functools.wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        return _thread().submit(function, *args, **kwargs).result()
+
+    return run
+
+
 class MapSystem(NamedTuple):
     """Projected coordinate system of a map."""
 
-    crs: Any  #: `pyproj.CRS` of the horizontal part; None for an old .prj file, which names units only.
+    wkt: str | None  #: WKT of the horizontal part; None for an old .prj file, which names units only.
     name: str
     unit: str  #: Unit of positions.
     metres: float  #: Its length [m].
@@ -30,20 +65,37 @@ class MapSystem(NamedTuple):
     is_down: bool | None = None  #: Whether the vertical axis points down; None without one.
     datum: str = ""  #: Name of the vertical part.
 
+    @_in_one_thread
     def check_scale(self, path: object, x: float, y: float) -> None:
         """Refuse a system whose metres at a place (x, y), in its own unit, are not metres on the ground."""
-        if self.crs is None:
+        if self.wkt is None:
             return
         import pyproj
 
-        to_degrees = pyproj.Transformer.from_crs(self.crs, self.crs.geodetic_crs, always_xy=True)
+        crs = pyproj.CRS.from_wkt(self.wkt)
+        to_degrees = pyproj.Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
         places = [np.atleast_1d(one) for one in to_degrees.transform(x, y)]
-        scale = distortions(self.crs, *places)[1][0]
+        scale = distortions(crs, *places)[1][0]
         if not abs(scale - 1) < LARGEST_DISTORTION:
             raise UserError(
                 f"{path} has coordinates in {self.name}, whose lengths at ({x:.10g}, {y:.10g}) are {scale:.4g} times"
                 f" those on the ground: they must be within {LARGEST_DISTORTION:.0%}, as in UTM."
             )
+
+    @_in_one_thread
+    def distance_from(self, other: MapSystem, x: float, y: float) -> float:
+        """Return how far a point x, y [m] of this system is from that of the same numbers in another one [m].
+
+        It is that of the farthest corner of a square of 1 km at the point.
+        """
+        if self.wkt is None or other.wkt is None:
+            return 0.0
+        import pyproj
+
+        x_m, y_m = np.array([x, x + 1e3, x, x + 1e3]), np.array([y, y, y + 1e3, y + 1e3])
+        to_other = pyproj.Transformer.from_crs(self.wkt, other.wkt, always_xy=True)
+        east, north = to_other.transform(x_m / self.metres, y_m / self.metres)
+        return float(np.hypot(other.metres * east - x_m, other.metres * north - y_m).max())
 
 
 def parsed_system(name: object, text: Any) -> Any:
@@ -64,14 +116,17 @@ def is_east_north(system: Any) -> bool:
     return directions in (["east", "north"], ["north", "north"], ["south", "south"])
 
 
-def map_system(path: object, system: Any) -> MapSystem:
-    """Return the system of a map.
+@_in_one_thread
+def map_system(path: object, text: Any, name: object = None) -> MapSystem:
+    """Return the system of a map from a code, a WKT or attributes, which are those of `name` or of the map's own file.
 
     Raises
     ------
     UserError
-        If its coordinates are degrees or geocentric, or its axes do not point to east and north.
+        If pyproj does not know it, its coordinates are degrees or geocentric, or its axes do not point to east and
+        north.
     """
+    system = parsed_system(path if name is None else name, text)
     horizontal, vertical = system, None
     if system.is_compound:
         horizontal, vertical = system.sub_crs_list[0], system.sub_crs_list[1].axis_info[0]
@@ -79,24 +134,24 @@ def map_system(path: object, system: Any) -> MapSystem:
         vertical = system.axis_info[2]
     if horizontal.is_bound:
         horizontal = horizontal.source_crs
-    name = system.name
+    called = system.name
     if horizontal.is_geographic:
-        raise UserError(f"{path} has coordinates in degrees ({name}): they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in degrees ({called}): they must be projected, in metres or feet.")
     if not horizontal.is_projected and not horizontal.is_engineering:
-        raise UserError(f"{path} has coordinates in {name}: they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in {called}: they must be projected, in metres or feet.")
     axes = horizontal.axis_info[:2]
     if horizontal.is_projected and not is_east_north(horizontal):
         directions = " and ".join(str(axis.direction) for axis in axes)
-        raise UserError(f"{path} has coordinates in {name}, to {directions}: they must be to east and north.")
+        raise UserError(f"{path} has coordinates in {called}, to {directions}: they must be to east and north.")
     unit, metres = (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else ("metre", 1.0)
-    found = MapSystem(horizontal if horizontal.is_projected else None, name, unit, metres)
+    found = MapSystem(horizontal.to_wkt() if horizontal.is_projected else None, called, unit, metres)
     if vertical is None:
         return found
     return found._replace(
         vertical_unit=str(vertical.unit_name),
         vertical_metres=float(vertical.unit_conversion_factor),
         is_down=str(vertical.direction) == "down",
-        datum=system.sub_crs_list[1].name if system.is_compound else f"the ellipsoid of {name}",
+        datum=system.sub_crs_list[1].name if system.is_compound else f"the ellipsoid of {called}",
     )
 
 
@@ -110,7 +165,7 @@ def read_prj(path: Path) -> MapSystem | None:
         return None
     text = read_text(prj).strip()
     if not text.lower().startswith("projection"):
-        return map_system(path, parsed_system(prj, text))
+        return map_system(path, text, prj)
     words = [line.split() for line in text.upper().splitlines()]
     old = {line[0]: " ".join(line[1:]) for line in words if len(line) > 1}
     if old["PROJECTION"].startswith("GEO") or old.get("UNITS") in ("DD", "DS", "DMS"):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import LARGEST_ARRAY, check_hdf5, check_size, damaged_file
-from mitransient_lidar.core.coordinate_systems import MapSystem, map_system, parsed_system, read_prj
+from mitransient_lidar.core.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text
 from mitransient_lidar.core.validation import FloatArray, integer, positive
@@ -175,7 +175,7 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
         raise UserError(_without_coordinates(path))
     if place.b != 0 or place.d != 0:
         raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
-    system = map_system(path, parsed_system(path, file.crs.to_wkt())) if file.crs else None
+    system = map_system(path, file.crs.to_wkt()) if file.crs else None
     check_size(path, 8.0 * file.width * file.height)
     values = without_no_data(file.read(1), _BAG_EMPTY if is_bag else file.nodata)
     values[file.read_masks(1) == 0] = np.nan

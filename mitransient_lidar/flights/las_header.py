@@ -75,7 +75,7 @@ def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = N
     if crs is None:
         return SCENE_WKT
     system = parsed_system("crs", crs)
-    horizontal = map_system(f"crs = {crs!r}", system)
+    horizontal = map_system(f"crs = {crs!r}", crs, "crs")
     wkt = str(system.to_wkt("WKT1_GDAL") or "")
     if any(axis.unit_name != "metre" for axis in system.axis_info) or not wkt:
         raise UserError(f"crs = {crs!r} must be a projected coordinate system in metres, such as EPSG:32633")

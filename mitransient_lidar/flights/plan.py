@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
+from mitransient_lidar.core.coordinate_systems import MapSystem, map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
@@ -220,6 +221,12 @@ class FlightPlan:
             return self.origin[:2]
         own = given["platform"].get("origin")
         return None if own is None else (float(own[0]), float(own[1]))
+
+    @property
+    def system(self) -> MapSystem | None:
+        """Coordinate system of points and positions; None if none is stated."""
+        code = self.crs or json.loads(self.text)["platform"].get("epsg")
+        return None if code is None else map_system("crs", code)
 
     def _check_coordinates(self, platform: Mapping[str, Any]) -> None:
         """Raise `UserError` if the coordinates of a platform, which is valid, are not those of the points."""

@@ -35,6 +35,9 @@ _ANGLES, _HEIGHTS = 2.0, 1.1
 #: Places of a group of pulses that decide how long their record is.
 _PLACES = 6
 
+#: Largest distance of a point in the systems of map and flight [m]: more than realisations of a datum differ.
+_SAME_SYSTEM_M = 0.1
+
 #: Margin of a record on both sides [ns], for waves and for poses that differ from that of the group.
 _MARGIN_NS = 15.0
 
@@ -152,7 +155,10 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
 
 
 def check_maps(plan: FlightPlan, scene: mi.Scene) -> None:
-    """Raise `UserError` if a height map has its own coordinates elsewhere than a flight has those of its points."""
+    """Raise `UserError` if a height map has its own coordinates elsewhere than a flight has those of its points.
+
+    Their systems may have other names, if a point has the same coordinates in both.
+    """
     from mitransient_lidar.physics.sea.height_maps import HeightMap
     from mitransient_lidar.transport.plugin_types import SeabedShape, SeaShape
 
@@ -161,8 +167,18 @@ def check_maps(plan: FlightPlan, scene: mi.Scene) -> None:
     for shape in scene.shapes():
         waves = shape.sea.waves if isinstance(shape, SeaShape) else None
         is_map = isinstance(shape, SeabedShape)
-        found = shape.map_origin if is_map else waves.origin if isinstance(waves, HeightMap) else None
-        if found is None or max(abs(one - other) for one, other in zip(found, wanted, strict=True)) <= SAME_PLACE_M:
+        terrain = shape.height_map if is_map else waves if isinstance(waves, HeightMap) else None
+        if terrain is None or (found := terrain.origin) is None:
+            continue
+        system, other = terrain.system, plan.system
+        if system is not None and other is not None:
+            distance = system.distance_from(other, *found)
+            if not distance <= _SAME_SYSTEM_M:
+                raise UserError(
+                    f"the map of shape {shape.id()} has coordinates in {system.name}, which are {distance:.3g} m beside"
+                    f" those of the flight, in {other.name}: both must be in one coordinate system"
+                )
+        if max(abs(one - own) for one, own in zip(found, wanted, strict=True)) <= SAME_PLACE_M:
             continue
         x, y = wanted
         cure = f"give the seabed origin_x = {x:.10g} and origin_y = {y:.10g}, or " if is_map else "give "

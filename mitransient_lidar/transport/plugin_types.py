@@ -12,6 +12,7 @@ from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
+from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
@@ -146,8 +147,8 @@ class SeabedShape(Protocol):
         """Reflectance of bottom and patches, None where they differ."""
 
     @property
-    def map_origin(self) -> tuple[float, float] | None:
-        """Point of the height map, in its own coordinates, at x = y = 0 [m]; None without map coordinates."""
+    def height_map(self) -> HeightMap | None:
+        """Height map of the bottom; None without one."""
 
     def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return whether places [m] lie beyond the height map; nowhere without one."""

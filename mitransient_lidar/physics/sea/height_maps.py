@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import Array, read_exr, read_npy, read_npz, readable_suffix
+from mitransient_lidar.core.coordinate_systems import MapSystem
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
@@ -40,6 +41,7 @@ class HeightMap:
     y: FloatArray  #: Positions of the rows [m], increasing, at least 2.
     origin: tuple[float, float] | None = None  #: Point of the map at x = y = 0 [m], if it is in map coordinates.
     filled: npt.NDArray[np.bool_] | None = None  #: Cells without a value of their own, shape of the heights.
+    system: MapSystem | None = None  #: Coordinate system of the file, if it states one.
 
     def covers(self, x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return whether places x, y [m] of one shape are in cells of the map that have a value of their own."""
@@ -163,7 +165,7 @@ def read_height_map(
         elif origin is not None:
             raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
     heights, filled = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
-    terrain = _moved(path, HeightMap(heights, x, y, None, filled), centre, origin)
+    terrain = _moved(path, HeightMap(heights, x, y, None, filled, stated.system), centre, origin)
     place = "" if terrain.origin is None else "; x = y = 0 is its point ({:.10g}, {:.10g})".format(*terrain.origin)
     logger.info(
         "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m%s%s; %s",
@@ -251,7 +253,7 @@ def _moved(
 
     The positions of `terrain` are relative to `centre`, or as they are in the file if it is None.
     """
-    heights, axes = terrain.heights, (terrain.x, terrain.y)
+    axes = terrain.x, terrain.y
     if centre is None and origin is None:
         _warn_beside(path, axes)
         return terrain
@@ -266,7 +268,7 @@ def _moved(
             )
     x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
     _warn_beside(path, (x, y))
-    return HeightMap(heights, x, y, point, terrain.filled)
+    return replace(terrain, x=x, y=y, origin=point)
 
 
 def _warn_beside(path: Path, axes: tuple[FloatArray, FloatArray]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mitransient_lidar.core.array_files import Array, Variable, read_netcdf
-from mitransient_lidar.core.coordinate_systems import map_system, parsed_system
+from mitransient_lidar.core.coordinate_systems import map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Stated, stated_by, without_no_data
 
@@ -54,9 +54,7 @@ def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
         units = variables[name].units if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
             raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
-    stated = stated_by(
-        None if (mapping := _mapping(variables)) is None else map_system(path, parsed_system(path, mapping))
-    )
+    stated = stated_by(None if (mapping := _mapping(variables)) is None else map_system(path, mapping))
     of_axes = {variable.units for variable in positions.values()}
     if len(of_axes) > 1:
         raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
+import pyproj
 import pytest
 
 from mitransient_lidar import scenes
@@ -55,6 +56,26 @@ def test_a_map_lies_where_the_flight_has_its_points(tmp_path, own):
     for plan in (from_file(tmp_path, other, crs="EPSG:32633", origin=other), from_file(tmp_path, other)):
         with pytest.raises(UserError, match=r"the map of shape bed has .*: give the seabed origin_x = 5000\d0 and"):
             check_maps(plan, scene)
+
+
+@pytest.mark.parametrize(
+    ("of_map", "beside"),
+    [(32633, None), (25833, None), (23033, "212"), (32632, r"3.48e\+05"), (None, None)],
+    ids=["same", "other name", "other datum", "other zone", "not stated"],
+)
+def test_maps_are_in_the_system_of_the_flight(tmp_path, of_map, beside):
+    """The numbers of the place agree: the bottom of another zone would lie below the flight without a word."""
+    if of_map is not None:
+        (tmp_path / "step.prj").write_text(pyproj.CRS(of_map).to_wkt("WKT1_ESRI"))
+    scene, place = loaded_scene(tmp_path), [500020.0, 6500015.0, 0.0]
+    plan = from_file(tmp_path, place, crs="EPSG:32633", origin=place)
+    if beside is None:
+        check_maps(plan, scene)
+    else:
+        with pytest.raises(UserError, match=rf"shape bed .* are {beside} m beside .* in WGS 84 / UTM zone 33N: both"):
+            check_maps(plan, scene)
+    # Without coordinates of points nothing is known of the flight.
+    check_maps(from_file(tmp_path, place), scene)
 
 
 OWN_SCENE = """<scene version="3.0.0">

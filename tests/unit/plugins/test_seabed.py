@@ -2,6 +2,7 @@
 
 import mitsuba as mi
 import numpy as np
+import pyproj
 import pytest
 import xarray as xr
 
@@ -205,3 +206,15 @@ def test_bottom_that_rises_through_the_sea_is_refused_only_where_the_receiver_lo
     assert float(render(8.0).impulse_response.sum()) > 0
     with pytest.raises(UserError, match="rises through the sea surface where the receiver looks: a bottom must lie"):
         render(0.3)
+
+
+def test_maps_with_coordinate_systems_are_read_again_and_again(tmp_path):
+    """Mitsuba reads shapes in threads of its own, in which pyproj took a context that it had destroyed: a crash."""
+    for name in ("one", "other"):
+        (tmp_path / f"{name}.asc").write_text(
+            "ncols 2\nnrows 2\nxllcorner 5e5\nyllcorner 6e6\ncellsize 9\n-4 -5\n-6 -7\n"
+        )
+        (tmp_path / f"{name}.prj").write_text(pyproj.CRS(32633).to_wkt("WKT1_ESRI"))
+    beds = {name: {"type": "seabed", "filename": str(tmp_path / f"{name}.asc")} for name in ("one", "other")}
+    for _ in range(20):
+        assert len(mi.load_dict({"type": "scene", **beds}).shapes()) == 2
