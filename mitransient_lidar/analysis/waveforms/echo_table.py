@@ -18,6 +18,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     Echoes,
     EchoFlag,
     Records,
+    error_of_sums,
     find_echoes,
     saturated_spans,
 )
@@ -295,7 +296,8 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
     safe = np.where(known & (total > 0), total, 1.0)
     seconds = records.bin_ns * 1e-9
     time = np.sum(power * records.time_ns, axis=1) / safe
-    time_error = np.sqrt(np.sum((noise * (records.time_ns - time[:, np.newaxis])) ** 2, axis=1)) / safe
+    offset = records.time_ns - time[:, np.newaxis]
+    time_error = error_of_sums(noise * offset, None, records.shared) / safe
     level = column.level * np.exp(-column.decay * delay)
     relative = column.level_stderr / column.level
     mixed = 2 * column.correlation * relative * delay * column.decay_stderr
@@ -310,7 +312,7 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
         half,
         time_error,
         level_error,
-        np.sqrt(np.sum(noise**2, axis=1)) * seconds,
+        error_of_sums(noise, None, records.shared) * seconds,
         half * column.decay_stderr / decay,
         np.where(known, 0, int(EchoFlag.NO_ECHO)),
     ).known_only(known)
