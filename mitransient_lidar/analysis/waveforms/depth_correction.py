@@ -316,10 +316,12 @@ def _walks(learnt: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
         rates[axis] = rate.fillna(0)
     rows = learnt["wind_speed"] == 0
     for name, own in (("ripples", learnt.isel(wind_speed=rows)), ("wind_speed", learnt.isel(wind_speed=~rows))):
-        usual = own.where(own["found"] >= _USUAL)
-        doubled = usual["uncertain"].rolling(wind_speed=2).sum().isel(wind_speed=slice(1, None))
-        steps = np.diff(own["ripples"].values)
-        change = usual["bias"].diff("wind_speed").drop_vars("wind_speed") ** 2 - doubled.drop_vars("wind_speed")
+        if own.sizes["wind_speed"] < 2:
+            rates[name] = xr.zeros_like(rates["depth"])
+            continue
+        usual, steps = own.where(own["found"] >= _USUAL), np.diff(own["ripples"].values)
+        first, second = (usual.isel(wind_speed=part).drop_vars("wind_speed") for part in (slice(-1), slice(1, None)))
+        change = (second["bias"] - first["bias"]) ** 2 - first["uncertain"] - second["uncertain"]
         change = _OF_TWO * change / xr.DataArray(steps, dims="wind_speed")
         rate = change.mean([dim for dim in change.dims if dim in ("wind_speed", "depth")]).clip(min=0)
         rate = _between(rate.to_dataset(name="rate"), "off_nadir_deg", learnt["off_nadir_deg"].values, angle)["rate"]

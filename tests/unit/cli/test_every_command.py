@@ -123,7 +123,7 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     assert_refused(again, "--output")
     options = [*few, "--depths", 5, "--seed", 2, "--corrections", made, "-o", tmp_path / "again.nc", "-q"]
     lines = run("depth-bias", "riegl_vq840g", *options).stdout.splitlines()
-    # Angle, wind, ripples, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong; bias after correction.
+    # Angle, wind, ripples, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong, bias after it.
     names, cells = lines[-2].split(), lines[-1].replace(" %", "").split()
     assert cells[:6] == ["20.0", "0", "5", "IB", "5", "single"]
     assert float(cells[names.index("found")]) == float(cells[names.index(">10")]) == 100
