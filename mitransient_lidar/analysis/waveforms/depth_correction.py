@@ -28,7 +28,9 @@ _TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
 _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
 #: and waters, over a level sea, of the shipped tables.
-_OF_TWO = 0.45
+_OF_TWO = 0.47
+#: Rate of level seas between ripples where a table has those of one wind [m^2 per m/s]: the mean of three tables.
+_OF_RIPPLES = 8.6e-4
 _SAME_RING = 0.05  # largest difference of the radii of pixels on a ring, over the largest radius
 _ANGLE_DIGITS = 6  # of angles between pixels [deg]
 _NEAR = 2.0  # largest error of a depth that counts [m]
@@ -125,8 +127,9 @@ def correct_depths(
     g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
     geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
     mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
-    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.45 of their squared
-    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0. Rates of winds and
+    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
+    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0, one wind of ripples
+    8.6 cm^2 per m/s, the mean of three instruments. Rates of winds and
     ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
     where no other ones do. Without any bias of an estimator in a pixel, depths and
     errors stay as they are.
@@ -317,7 +320,7 @@ def _walks(learnt: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
     rows = learnt["wind_speed"] == 0
     for name, own in (("ripples", learnt.isel(wind_speed=rows)), ("wind_speed", learnt.isel(wind_speed=~rows))):
         if own.sizes["wind_speed"] < 2:
-            rates[name] = xr.zeros_like(rates["depth"])
+            rates[name] = xr.full_like(rates["depth"], _OF_RIPPLES if name == "ripples" else 0.0)
             continue
         usual, steps = own.where(own["found"] >= _USUAL), np.diff(own["ripples"].values)
         first, second = (usual.isel(wind_speed=part).drop_vars("wind_speed") for part in (slice(-1), slice(1, None)))

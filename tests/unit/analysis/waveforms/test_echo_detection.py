@@ -148,7 +148,7 @@ def test_errors_are_those_of_the_noise(method):
 
 
 def test_errors_of_energies_and_columns_have_the_correlation_of_samples():
-    """The errors seen in 1500 records whose noise a filter of 6 ns shares; independent samples would have half of it."""
+    """Errors seen in 1500 records whose noise a filter of 6 ns shares; independent samples would have half of them."""
     rng = np.random.default_rng(5)
     kernel = np.ones(12) / np.sqrt(12)
     signal = echoes([60.0]) + 0.4 * np.exp(-0.02 * TIME) * (TIME > 80)
