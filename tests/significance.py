@@ -47,6 +47,13 @@ def largest_chi2(freedom):
     return float(chi2.isf(FALSE_ALARM, freedom))
 
 
+def variance_limits(freedom, values=1):
+    """Return the limits of the ratio of a variance with this freedom to the true one, for each of some values."""
+    _count()
+    tail = 0.5 * FALSE_ALARM / values
+    return chi2.isf([1 - tail, tail], freedom) / freedom
+
+
 def largest_count(trials, chance):
     """Return the limit of the number of `trials` that have a property, each with at most this chance."""
     _count()

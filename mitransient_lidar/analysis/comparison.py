@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.results.sum_errors import SumErrors
+
+BoolArray = npt.NDArray[np.bool_]
 
 #: Probability of a difference between two results of the same scene.
 SIGNIFICANCE = 0.01
@@ -38,7 +42,8 @@ class Comparison:
     limit
         Critical ``abs(z)`` of the largest difference of all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
     energy_ratio, energy_ratio_stderr
-        Energy of the included bins, second over first, and its standard error for independent bins.
+        Energy of the included bins, second over first, and its standard error. Where the results state how errors of
+        bins are correlated (`results.sum_errors`), it is that of the power in these bins; pixels are independent.
     """
 
     z: FloatArray
@@ -115,8 +120,21 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
     z = _as_normal(difference / np.sqrt(total), freedom)
     sums = [float(value[counted].sum()) for value in values]
+    own = [_error_of_energy(result, counted) for result in results]
     spread = float(np.sqrt(np.nansum(total))) / sums[0]
+    if None not in own:
+        spread = sums[1] / sums[0] * float(np.linalg.norm(np.array(own, dtype=np.float64)))
     return Comparison(z, sidak_limit(int(counted.sum())), sums[1] / sums[0], spread)
+
+
+def _error_of_energy(result: xr.Dataset, counted: BoolArray) -> float | None:
+    """Return the relative error of the energy of bins, shape (pixels, time), None where correlations are not known."""
+    errors = SumErrors.of(result) if "waveform_stderr" in result else None
+    if errors is None:
+        return None
+    power, deviation = (np.nan_to_num(_by_pixel(result, name)) for name in ("waveform", "waveform_stderr"))
+    each = [errors.of_sum(own, inside.astype(np.float64)) for own, inside in zip(deviation, counted, strict=True)]
+    return float(np.linalg.norm(each) / np.sum(power[counted]))
 
 
 def sidak_limit(count: int, significance: float = SIGNIFICANCE) -> float:

@@ -32,6 +32,9 @@ def depth_bias(
         ),
     ] = None,
     winds: Annotated[str, typer.Option(metavar="M/S", help=_WINDS)] = "0,3,6",
+    ripples: Annotated[
+        str, typer.Option(metavar="M/S", help="Winds whose ripples level seas have, greater than 0, ascending.")
+    ] = "3,6",
     waters: Annotated[str, typer.Option(metavar="TYPES", help="Jerlov types from clear to turbid.")] = "IB,1C,5C",
     depths: Annotated[
         str, typer.Option(metavar="M", help="Depths of the bottom, greater than 0, ascending.")
@@ -72,6 +75,7 @@ def depth_bias(
     check_figure(figure, option="--figure")
     named = _waters(waters)
     lists: dict[str, Any] = {"winds": numbers("--winds", winds), "depths": numbers("--depths", depths)}
+    lists["ripples"] = numbers("--ripples", ripples)
     if angles is not None:
         lists["angles_deg"] = numbers("--angles", angles)
     from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for

@@ -15,9 +15,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
-from mitransient_lidar.rendering.accuracy import ErrorInflation, ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.accuracy import ErrorCorrelation, ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.reweighting import Case, check_share, effective_share
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
+from mitransient_lidar.results.sum_errors import with_correlation
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -131,7 +132,7 @@ class WaveformAccumulator(PassAccumulator):
         super().__init__(scene, window, train)
         response = scene.receiver.optics.response_time_ns
         self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
-        self._energy, self._power, self._inflation = PassStatistics(), PassStatistics(), ErrorInflation()
+        self._energy, self._power, self._correlation = PassStatistics(), PassStatistics(), ErrorCorrelation()
         self._origins, self._parameters, self._cases = list(origins), list(parameters), list(reweighted)
         self._perturbed, self._differences = (PassStatistics(), PassStatistics()), differences
         self._scores = sum(one.perturbation is not None for one in self._parameters)
@@ -172,7 +173,7 @@ class WaveformAccumulator(PassAccumulator):
         power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
         self._energy.add(energy)
         self._power.add(power)
-        self._inflation.add(power)
+        self._correlation.add(power)
         if self._batches:
             number = (self._power.count - 1) % len(self._batches)
             self._batches[number] = self._batches[number] + power
@@ -188,7 +189,6 @@ class WaveformAccumulator(PassAccumulator):
     def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
         """Return the labelled result; gates are two more variables."""
         axis, pixels = self.scene.axis, self.scene.receiver.pixels
-        bins, inflation = self._inflation.over(self._power.mean, self._power.stderr)
         means = self._energy.mean, self._power.mean
         if self._origins:
             # The whole is the sum of its parts to the bit.
@@ -202,8 +202,10 @@ class WaveformAccumulator(PassAccumulator):
             pixel_names=pixels.names,
             pixel_centres_mrad=1e3 * pixels.centres(),
             grid=pixels.grid,
-            attributes={**attributes, "error_inflation_bins": bins, "error_inflation": inflation},
+            attributes=attributes,
         )
+        if (measured := self._correlation.over(built["time"].values)) is not None:
+            built = with_correlation(built, *measured)
         if self._origins:
             arrays = (values for part in self._parts for values in (part.mean, part.stderr))
             built = results.add_components(built, self._origins, *arrays)

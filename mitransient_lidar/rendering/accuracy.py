@@ -11,6 +11,12 @@ from mitransient_lidar.core.validation import FloatArray
 #: Pixels darker than this fraction of the median are excluded from the errors of radiance.
 _DARK_PIXEL = 1e-2
 
+#: Most blocks of bins, and about as many pixels, that the correlation of errors is measured over.
+_BLOCKS, _CORRELATED_PIXELS = 512, 1024
+
+#: Least part of two blocks' errors that meets in pixels with light in both, for a correlation between them.
+_SHARED = 1e-9
+
 
 class PassStatistics:
     """Mean and standard error of one array for each pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
@@ -91,40 +97,53 @@ class RatioStatistics:
         return np.asarray(stderr[lit] / ratio[lit])
 
 
-class ErrorInflation:
-    """Standard errors of sums over 2, 4, 8, ... neighbouring bins relative to independent bins.
+class ErrorCorrelation:
+    """Correlation of the errors of bins: those of a pass are correlated, since they share paths.
 
-    Errors of the bins of a pass are correlated, since they share paths.
+    Pixels are taken together, and bins in at most `_BLOCKS` blocks.
     """
 
     def __init__(self) -> None:
-        self._blocks: dict[int, PassStatistics] = {}
+        self._count = 0
+        self._mean: FloatArray = np.zeros(())
+        self._products: FloatArray = np.zeros(())
+        self._squares: FloatArray = np.zeros(())
 
     def add(self, values: FloatArray) -> None:
         """Add the result of one pass, shape (pixels, time)."""
-        size, sums = 2, values
-        while sums.shape[1] >= 2:
-            sums = sums[:, : sums.shape[1] // 2 * 2].reshape(len(sums), -1, 2).sum(axis=2)
-            self._blocks.setdefault(size, PassStatistics()).add(sums)
-            size *= 2
+        values = values[:: max(1, len(values) // _CORRELATED_PIXELS)]
+        if self._count == 0:
+            self._mean = np.zeros_like(values)
+            self._edges = np.arange(0, values.shape[1], -(-values.shape[1] // _BLOCKS))
+            self._products, self._squares = np.zeros((self._edges.size,) * 2), np.zeros_like(values)
+        self._count += 1
+        before = values - self._mean
+        self._mean += before / self._count
+        after = values - self._mean
+        sums = (np.add.reduceat(one, self._edges, axis=1) for one in (before, after))
+        self._products += np.matmul(*(one if i else one.T for i, one in enumerate(sums)))
+        self._squares += before * after
 
-    def over(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
-        """Return numbers of bins and the median ratios of the errors of their sums to those of independent bins.
+    def over(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return the middles of the blocks [ns], and their correlations; None before the second pass.
 
-        Mean and standard error are those of the bins, shape (pixels, time). Sums below a millionth of the brightest one
-        are excluded.
+        That of two blocks is the mean correlation of a bin of one with a bin of the other, that of a block with itself
+        the mean over pairs of different bins, 1 for one bin. Bins without light have none.
         """
-        bins, inflation = [1], [1.0]
-        for size, block in self._blocks.items():
-            if block.count < 2:
-                continue
-            used = mean.shape[1] // size * size
-            quadrature = np.sqrt((stderr[:, :used] ** 2).reshape(len(stderr), -1, size).sum(axis=2))
-            counted = (quadrature > 0) & (block.mean > 1e-6 * np.nanmax(block.mean, initial=0.0))
-            if counted.any():
-                bins.append(size)
-                inflation.append(float(np.median(block.stderr[counted] / quadrature[counted])))
-        return bins, inflation
+        if self._count < 2:
+            return None
+        deviation = np.sqrt(np.maximum(self._squares, 0))
+        sums, parts = (np.add.reduceat(one, self._edges, axis=1) for one in (deviation, self._squares))
+        possible, found = sums.T @ sums, self._products.copy()
+        of_block = np.diag_indices_from(found)
+        possible[of_block] -= parts.sum(axis=0)
+        found[of_block] -= parts.sum(axis=0)
+        known = possible > _SHARED * np.outer(*2 * [np.sqrt(np.maximum(np.sum(sums**2, axis=0), 0))])
+        correlation = np.divide(found, possible, out=np.zeros_like(found), where=known)
+        if self._edges.size == time_ns.size:
+            correlation[of_block] = 1.0
+        sizes = np.diff(np.append(self._edges, time_ns.size))
+        return np.add.reduceat(time_ns, self._edges) / sizes, np.clip(correlation, -1, 1)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import finite, positive
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import exr, netcdf
+from mitransient_lidar.results import exr, netcdf, sum_errors
 from mitransient_lidar.results.formats import (
     IMAGE_AXES,
     attribute,
@@ -397,7 +397,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
             _write_exr(dataset, path, temporary)
         else:
             endings = "by_origin", "derivative", "reweighted"
-            large = [*_VARIABLES, "waveform_batch"]
+            large = [*_VARIABLES, "waveform_batch", sum_errors.VARIABLE]
             large += [_with_ending(name, ending) for ending in endings for name in _VARIABLES]
             large = [name for name in large if name in dataset]
             netcdf.write_netcdf(dataset, temporary, large)
@@ -452,6 +452,8 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
 def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
     if "shot" in dataset.dims:
         raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
+    # The attributes have the curve of the errors of sums in its place.
+    dataset = dataset.drop_dims(sum_errors.DIMS, errors="ignore")
     if extra := [str(name) for name in dataset.data_vars if name not in _VARIABLES]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     stacks: dict[str, dict[str, npt.NDArray[Any]]] = {}

@@ -24,14 +24,14 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
-from mitransient_lidar.results import exr, netcdf
+from mitransient_lidar.results import exr, netcdf, sum_errors
 from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format
 from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
 _LOG = logging.getLogger(__name__)
 
 _CHANNELS = {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}
-_OF_BINS = ("time", "origin", "case", "batch")  # dimensions of results with time bins alone
+_OF_BINS = ("time", "origin", "case", "batch", *sum_errors.DIMS)  # dimensions of results with time bins alone
 _SLOPES = "gate_energy_derivative"
 _HEADER = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence and different between sequences

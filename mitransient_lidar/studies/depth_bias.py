@@ -15,7 +15,12 @@ import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths
+from mitransient_lidar.analysis.waveforms.depth_correction import (
+    AXES,
+    correct_depths,
+    summarize_depths,
+    usual_attenuation,
+)
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
@@ -35,9 +40,6 @@ _WAVELENGTH = 532.0
 
 #: Relative standard error of renders of a level sea over that of waves, which differ more between places.
 _LEVEL = 0.6
-
-#: Speed of the wind whose ripples a level sea has [m/s].
-_RIPPLES = 5.0
 
 #: Difference of the second angle [degree], and angle from which it is less.
 _FURTHER, _GRAZING = 5.0, 60.0
@@ -86,6 +88,7 @@ def depth_bias(
     scene: str = "table1",
     angles_deg: Sequence[float] | None = None,
     winds: Sequence[float] = (0.0, 3.0, 6.0),
+    ripples: Sequence[float] = (3.0, 6.0),
     waters: Sequence[str] = WATERS,
     depths: Sequence[float] = (3.0, 6.0, 10.0),
     estimators: Sequence[str] = ESTIMATORS,
@@ -111,7 +114,9 @@ def depth_bias(
         Angles from nadir [degree], ascending; by default that of the instrument, and 5 degrees more,
         or less near grazing.
     winds
-        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
+        Wind speeds [m/s], ascending, at least 0; 0 for level seas with ripples.
+    ripples
+        Winds whose ripples the level seas have [m/s], above 0, ascending.
     waters
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
@@ -141,14 +146,15 @@ def depth_bias(
     Returns
     -------
     xarray.Dataset
-        Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``: ``bias``, ``spread``,
+        Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``, where ``wind_speed``
+        is 0 for each of the coordinate ``ripples`` [m/s], and equals it in seas with waves: ``bias``, ``spread``,
         ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` of `summarize_depths`; with `corrections` also
         ``corrected_bias``, ``corrected_spread`` and ``corrected_z``; and the shares of shots ``flagged`` with a depth,
         ``bright`` with a signal-to-noise ratio above 10 at the bottom, ``bright_found`` with a depth among these, and
         ``hidden``, bright ones without a depth that have one where errors of the render do not count as noise. Without
         estimator: ``snr``; without estimator and pixel: ``slope_along`` and ``slope_across``, root mean squares of the
-        mean slopes in the beam; and over ``off_nadir_deg``, ``wind_speed`` and ``water``, the ``attenuation`` [1/m]
-        that is measured. The truth is the depth of the bottom below the mean surface in the beam.
+        mean slopes in the beam, and the ``attenuation`` [1/m] that is measured, NaN in columns that are too short. The
+        truth is the depth of the bottom below the mean surface in the beam.
 
     Raises
     ------
@@ -165,11 +171,17 @@ def depth_bias(
         "water": np.asarray(waters, dtype=str),
         "depth": finite_array("depths", depths),
     }
+    of_level = finite_array("ripples", ripples)
     for name in ("off_nadir_deg", "wind_speed"):
         if axes[name].size == 0 or np.any(np.diff(axes[name]) <= 0) or axes[name][0] < 0:
             raise UserError(f"{name} = {axes[name].tolist()} must be numbers of at least 0 that ascend")
-    if axes["depth"].size == 0 or np.any(np.diff(axes["depth"], prepend=0.0) <= 0):
-        raise UserError(f"depth = {axes['depth'].tolist()} must be numbers above 0 that ascend")
+    for name, values in (("depth", axes["depth"]), ("ripples", of_level)):
+        if values.size == 0 or np.any(np.diff(values, prepend=0.0) <= 0):
+            raise UserError(f"{name} = {values.tolist()} must be numbers above 0 that ascend")
+    waves = axes["wind_speed"][axes["wind_speed"] > 0]
+    if waves.size < axes["wind_speed"].size:
+        axes["wind_speed"] = np.concatenate([np.zeros_like(of_level), waves])
+        waves = np.concatenate([of_level, waves])
     shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
     seed = integer("seed", seed, 0, 2**31)
     target_error = relative_error("target_error", target_error)
@@ -191,7 +203,7 @@ def depth_bias(
                 "wavelength_nm": _WAVELENGTH,
                 **(params or {}),
                 "off_nadir_deg": float(angle),
-                "wind_speed": float(wind) or _RIPPLES,
+                "wind_speed": float(waves[place[1]]),
                 "jerlov": str(water),
                 "bottom_depth": float(depth),
                 "surface_seed": seed + number,
@@ -232,19 +244,22 @@ def depth_bias(
         "seas_left_out": left_out,
         **geometry,
     }
-    return _labelled(axes, cells, pixels, list(estimators), attributes, total - left_out)
+    found = _labelled(axes, cells, pixels, list(estimators), attributes, total - left_out)
+    described = {"units": "m s-1", "long_name": "wind whose ripples the sea has"}
+    return found.assign_coords(ripples=("wind_speed", waves, described))
 
 
 def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
     """Return the lines of a table of a result of `depth_bias`, in centimetres, of one estimator."""
     corrected = "corrected_bias" in found
-    head = f"{'angle':>6}{'wind':>6} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
+    head = f"{'angle':>6}{'wind':>6}{'ripples':>9} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
     head += f"{'>10':>7}{'hidden':>8}{'flagged':>9}{'bias':>8}{'spread':>8}"
     lines = [head + f"{'error':>8}{'z':>6}{'wrong':>7}" + (f"{'bias':>10}{'spread':>8}{'z':>6}" if corrected else "")]
     one = found.sel(estimator=estimator)
     for place in np.ndindex(*(found.sizes[axis] for axis in AXES)):
         at = one.isel(dict(zip(AXES, place, strict=True)))
-        label = f"{float(at['off_nadir_deg']):>6.1f}{float(at['wind_speed']):>6g} {at['water'].item():<6}"
+        label = f"{float(at['off_nadir_deg']):>6.1f}{float(at['wind_speed']):>6g}"
+        label += f"{float(at['ripples']):>9g} {at['water'].item():<6}"
         if np.isnan(at["found"].values).all():  # left out
             continue
         for pixel in found["pixel"].values:
@@ -293,8 +308,7 @@ def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Datas
     if corrections is not None:
         after = summarize_depths(correct_depths(found, corrections), truth)
         numbers |= {f"corrected_{name}": after[name] for name in ("bias", "spread", "z")}
-    attenuation = found["attenuation"].values
-    numbers["attenuation"] = float(np.nanmedian(attenuation)) if np.isfinite(attenuation).any() else np.nan
+    numbers["attenuation"] = usual_attenuation(found["attenuation"].values, found["attenuation_stderr"].values)
     for name in _SLOPES:
         numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
     depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
@@ -355,11 +369,8 @@ def _labelled(
             data[name] = (dims, table(name), {"units": unit, "long_name": text})
     for name, text in _SLOPES.items():
         data[name] = (AXES, table(name), {"units": "1", "long_name": text})
-    measured = table("attenuation")
-    known = np.isfinite(measured).any(axis=-1)
-    median = np.nanmedian(np.where(known[..., np.newaxis], measured, 0.0), axis=-1)
-    described = {"units": "1/m", "long_name": "median attenuation of the column along the path"}
-    data["attenuation"] = (AXES[:3], np.where(known, median, np.nan), described)
+    described = {"units": "1/m", "long_name": "attenuation of the column along the path, weighted by its errors"}
+    data["attenuation"] = (AXES, table("attenuation"), described)
     units = {"off_nadir_deg": "degree", "wind_speed": "m s-1", "depth": "m"}
     coords: dict[str, Any] = {
         name: (name, values, {"units": units[name]} if name in units else {}) for name, values in axes.items()

@@ -23,6 +23,9 @@ from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.studies.depth_bias import depth_bias
 
+#: Wind whose ripples a level sea has [m/s].
+RIPPLES = 5.0
+
 _LOG = logging.getLogger(__name__)
 
 #: Winds [m/s] and waters of the tables of uncertainty tools, and depths at which airborne lidars find the bottom.
@@ -60,7 +63,7 @@ def depth_uncertainty(
     angles_deg
         Angles from nadir [degree], ascending; by default that of the instrument.
     winds
-        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with ripples.
+        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
     trajectory
         Errors of the survey's trajectory.
     estimator
@@ -113,6 +116,7 @@ def depth_uncertainty(
             receiver=receiver,
             angles_deg=angles,
             winds=winds,
+            ripples=[RIPPLES],
             waters=waters,
             depths=depths,
             estimators=[estimator],

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,10 +12,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
+from mitransient_lidar.results.sum_errors import SumErrors
 
 _LOG = logging.getLogger(__name__)
-
-_INFLATION = ("error_inflation_bins", "error_inflation")
 
 
 def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
@@ -32,12 +28,13 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
     Notes
     -----
     The energy of a gate is the sum of the mean power times bin width times the exact mean of the gate over the bin. The
-    errors of bins are correlated. The standard error is the quadrature sum times the inflation of the error of a sum
-    over as many bins, estimated from the passes of the render (attributes ``error_inflation_bins`` and
+    errors of bins are correlated: the standard error follows from those of the bins and their ``error_correlation``,
+    measured over the passes of the render. Without it, as in a result from an EXR file, it is the quadrature sum times
+    the median inflation of the error of a sum over as many bins (attributes ``error_inflation_bins`` and
     ``error_inflation``; linear in the logarithm of the number of bins, and beyond the last one proportional to the
-    square root). A gate with weights w is equivalent to (sum w)^2 / sum w^2 bins. The upper bound is the sum of the
-    errors, which is used if the inflation is unknown. Derivatives of a result are cut in the same way, with the
-    inflation of the waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too.
+    square root), and at most the sum of the errors, which is used if nothing is known. A gate with weights w is
+    equivalent to (sum w)^2 / sum w^2 bins. Derivatives of a result are cut in the same way, with the correlation of the
+    waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too.
     """
     if missing := [name for name in ("waveform", "waveform_stderr") if name not in dataset]:
         raise UserError(
@@ -46,16 +43,16 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
         )
     dims, time = results.record_dims(dataset, "waveform"), results.time_axis(dataset)
     check_train(train, dataset.attrs, time)
-    inflation = _inflation(dataset.attrs)
-    if inflation is None:
+    errors = SumErrors.of(dataset)
+    if errors is None:
         _LOG.info("the result has no error_inflation: the errors of the gates are upper bounds")
-    energy, stderr = _cut(dataset, "waveform", dims, train, inflation)
+    energy, stderr = _cut(dataset, "waveform", dims, train, errors)
     # Gates of the result itself are replaced.
     coords = {name: one for name, one in dataset.coords.items() if "gate" not in one.dims}
     stack = build_gates(energy, stderr, train, coords=coords, attributes=dataset.attrs)
     if "waveform_derivative" not in dataset:
         return stack
-    return add_gate_derivatives(stack, *_cut(dataset, "waveform_derivative", ("parameter", *dims), train, inflation))
+    return add_gate_derivatives(stack, *_cut(dataset, "waveform_derivative", ("parameter", *dims), train, errors))
 
 
 def _cut(
@@ -63,7 +60,7 @@ def _cut(
     name: str,
     dims: tuple[str, ...],
     train: GateTrain,
-    inflation: tuple[FloatArray, FloatArray] | None,
+    errors: SumErrors | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return energies in gates [J] of a power, or its derivatives, and their standard errors, with gates last."""
     time = results.time_axis(dataset)
@@ -75,25 +72,7 @@ def _cut(
         # Only the bins of the gate: a NaN in another bin must not spread to it.
         inside = slice(first, first + weights.size)
         energy[..., gate] = power[..., inside] @ weights
-        bound = deviation[..., inside] @ weights
-        if inflation is None:
-            stderr[..., gate] = bound
-        else:
-            equivalent = float(weights.sum() ** 2 / np.sum(weights**2))
-            quadrature = np.sqrt(deviation[..., inside] ** 2 @ weights**2)
-            stderr[..., gate] = np.minimum(quadrature * _inflation_at(inflation, equivalent), bound)
+        own = deviation[..., inside]
+        stderr[..., gate] = own @ weights if errors is None else errors.of_sum(own, weights, first)
     joules = train.pulses * time.bin_width_ns * 1e-9
     return joules * energy, joules * stderr
-
-
-def _inflation(attributes: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
-    """Return numbers of bins and the inflation of the error of their sum over the quadrature sum, if known."""
-    bins, inflation = (np.atleast_1d(np.asarray(attributes.get(name, []), np.float64)) for name in _INFLATION)
-    return None if bins.size == 0 or bins.shape != inflation.shape else (bins, inflation)
-
-
-def _inflation_at(inflation: tuple[FloatArray, FloatArray], bins: float) -> float:
-    """Return the inflation of the error for a real number of bins."""
-    known, values = inflation
-    beyond = math.sqrt(max(bins / known[-1], 1))
-    return float(np.interp(math.log(bins), np.log(known), values)) * beyond

@@ -22,6 +22,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
@@ -433,6 +434,8 @@ def _summed(dataset: xr.Dataset) -> xr.Dataset:
     if "pixel" not in dataset["waveform"].dims:
         raise UserError(f"waveform has the dimensions {dataset['waveform'].dims}; they must be pixel and time, or shot")
     summed = dataset[["waveform"]].sum("pixel")
+    if sum_errors.VARIABLE in dataset:
+        summed[sum_errors.VARIABLE] = dataset[sum_errors.VARIABLE]
     if "waveform_stderr" in dataset:
         summed["waveform_stderr"] = (dataset["waveform_stderr"] ** 2).sum("pixel") ** 0.5
     summed = summed.expand_dims(pixel=["all"]).transpose(..., "pixel", "time")

@@ -27,11 +27,14 @@ _TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
 #: Share of shots with a depth from which a bias counts for the changes between nodes; fewest places of a spread.
 _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
-#: and waters, over a level sea, of the first six shipped tables.
-_OF_TWO = 0.46
+#: and waters, over a level sea, of the shipped tables.
+_OF_TWO = 0.47
+#: Rate of level seas between ripples where a table has those of one wind [m^2 per m/s]: the mean of three tables.
+_OF_RIPPLES = 8.6e-4
 _SAME_RING = 0.05  # largest difference of the radii of pixels on a ring, over the largest radius
 _ANGLE_DIGITS = 6  # of angles between pixels [deg]
 _NEAR = 2.0  # largest error of a depth that counts [m]
+_LEVEL = 1e-6  # largest difference of the heights of a level sea [m]
 
 
 def read_corrections(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -46,10 +49,14 @@ def read_corrections(path: str | os.PathLike[str]) -> xr.Dataset:
         raise UserError(f"{path} must be a NetCDF file (.nc) of depth-bias")
     table = netcdf.read_netcdf(path)
     wanted = {*AXES, "estimator", "pixel"}
-    if not set(_TABLE) <= set(table.data_vars) or set(table["bias"].dims) != wanted or "instrument" not in table.attrs:
+    known = set(_TABLE) <= set(table.data_vars) and "ripples" in table.coords and "instrument" in table.attrs
+    if not known or set(table["bias"].dims) != wanted or set(table["attenuation"].dims) != set(AXES):
         raise UserError(f"{path} holds no corrections of depths: it must be a table of depth-bias")
-    for axis in ("off_nadir_deg", "wind_speed", "depth"):
-        if np.any(np.diff(table[axis].values) <= 0):
+    level = table["wind_speed"].values == 0
+    axes = {axis: table[axis].values for axis in ("off_nadir_deg", "depth", "wind_speed")}
+    axes |= {"wind_speed": axes["wind_speed"][~level], "ripples": table["ripples"].values[level]}
+    for axis, values in axes.items():
+        if np.any(np.diff(values) <= 0):
             raise UserError(f"{path} has {axis} that does not ascend")
     return table.transpose(*AXES, "estimator", "pixel")
 
@@ -84,7 +91,8 @@ def correct_depths(
     table : xarray.Dataset
         From `read_corrections` or `studies.depth_bias.depth_bias`.
     wind_speed : float, optional
-        Wind speed [m/s], at least 0; by default that of the result's scene, 0 over a level sea.
+        Wind speed [m/s], at least 0, of a level sea that of its ripples; by default that of the result's scene. With 0,
+        the sea is level.
     turn_deg : float
         Angle by which the pixels are turned about the receiver's axis, from far to left [deg]; see `turned_pixels`.
 
@@ -92,9 +100,11 @@ def correct_depths(
     -------
     xarray.Dataset
         The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases are
-        interpolated linearly in the angle from nadir, the wind, the attenuation of the column (the median over the
-        waveforms), and the depth, as are spreads; outside the table they are those of its ends. A bias counts with the
-        share bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        interpolated linearly in the angle from nadir, the wind or, of level seas, the wind of the ripples, the
+        attenuation of the column (`usual_attenuation`) among columns as long, and the depth, as are spreads; outside
+        the table they are those of its ends. Where the column has no attenuation, the mean over the waters counts, each
+        with the share of its bottoms at this depth that are found. A bias counts with the share
+        bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
         ``depth_m_method_error`` is the root of the sum of the squares of
 
@@ -102,6 +112,7 @@ def correct_depths(
           error by noise exceeds the spread, ``depth_m_stderr`` is reduced to the spread;
         - the error of the mean bias over n places of a sea with waves, or n renders of a level sea, spread/sqrt(n);
         - the error of biases between nodes, and beyond the ends of the table, as of random walks: see Notes;
+        - the spread of the biases of the waters, where the column has no attenuation;
         - the rounding of the surface's time to a bin of the render, the largest of the pixels; see
           `depth_errors.rounding_ns`.
 
@@ -116,9 +127,11 @@ def correct_depths(
     g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
     geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
     mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
-    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.46 of their squared
-    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0. Cells in which fewer
-    of the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
+    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
+    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0, one wind of ripples
+    8.6 cm^2 per m/s, the mean of three instruments. Rates of winds and
+    ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
+    where no other ones do. Without any bias of an estimator in a pixel, depths and
     errors stay as they are.
     """
     instrument = found.attrs.get("instrument", "")
@@ -139,32 +152,40 @@ def correct_depths(
     # Linear are spreads, not their squares: where surface echoes fade with the angle, errors of 22 degrees would be
     # mostly those of 25.
     learnt["deviation"] = learnt["variance"] ** 0.5
-    wind = _wind(found) if wind_speed is None else non_negative("wind_speed", wind_speed)
+    wind, level = _sea(found, wind_speed)
     angle = required_number(found.attrs, "off_nadir_deg")
-    cell, rates = learnt, _walks(learnt)
-    for axis, value in (("off_nadir_deg", angle), ("wind_speed", wind)):
-        nodes = table[axis].values
-        cell = (
-            cell.interp({axis: float(np.clip(value, nodes[0], nodes[-1]))}) if nodes.size > 1 else cell.isel({axis: 0})
-        )
-    attenuation, depths = cell["attenuation"].values, table["depth"].values
-    opacity = _median(found["attenuation"].values)
-    water = _place_of(attenuation, opacity)
-    by_angle = _walked(table["off_nadir_deg"].values, angle)
-    by_water = _walked(attenuation, opacity)
+    cell, rates = _of_sea(learnt, wind, level), _walks(learnt, angle)
+    nodes = table["off_nadir_deg"].values
+    cell = _between(cell, "off_nadir_deg", nodes, angle)
     depth = found["depth_m"] if several else found["depth_m"].expand_dims(estimator=list(names))
     arranged = depth.transpose("estimator", "pixel", ..., "echo")
+    opacity, at_depth = _opacity(found, arranged)
+    depths = table["depth"].values
+    attenuation = _along_depth(cell["attenuation"].transpose("water", "depth").values, depths, np.array(at_depth))
+    of_waters = _shares(attenuation, opacity)
+    by_angle, by_wind = _walked(nodes, angle), _walked_of_sea(table, wind, level)
+    by_water = _walked(attenuation, opacity)
     amount, deviation, variance, share = (np.zeros(arranged.shape) for _ in range(4))
     for e, p in np.ndindex(arranged.shape[:2]):
         at = arranged.values[e, p]
         one = cell.isel(estimator=e, pixel=p)
         rate = {axis: of.isel(estimator=e, pixel=p).values for axis, of in rates.items()}
+        rows = {
+            name: _along_depth(one[name].transpose("water", "depth").values, depths, at)
+            for name in ("bias", "deviation", "noise_share", "found")
+        }
+        shares = np.broadcast_to(of_waters.reshape(-1, *[1] * at.ndim), rows["bias"].shape)
+        if np.isnan(opacity):  # waters in which a bottom at this depth is seen
+            shares = rows["found"] / np.maximum(rows["found"].sum(axis=0), 1e-9)
         for name, target in (("bias", amount), ("deviation", deviation), ("noise_share", share)):
-            values = one[name].transpose("water", "depth").values
-            target[e, p] = _interpolated(values, water, _place_of(depths, at))
-        by_depth = _at_row(rate["depth"], water) * _walked(depths, at)
-        between = _at_row(rate["off_nadir_deg"], water) * by_angle + float(rate["water"]) * by_water
-        variance[e, p] = deviation[e, p] ** 2 + (by_depth + between if one["bias"].notnull().any() else np.nan)
+            target[e, p] = np.sum(shares * rows[name], axis=0)
+        variance[e, p] = deviation[e, p] ** 2
+        if np.isnan(opacity):
+            variance[e, p] += np.sum(shares * (rows["bias"] - amount[e, p]) ** 2, axis=0)
+        by_depth = np.tensordot(rate["depth"], shares, 1) * _walked(depths, at)
+        between = np.tensordot(rate["off_nadir_deg"], shares, 1) * by_angle + float(rate["water"]) * by_water
+        between = between + np.tensordot(rate["ripples" if level else "wind_speed"], shares, 1) * by_wind
+        variance[e, p] += by_depth + between if one["bias"].notnull().any() else np.nan
     amount[..., :2] = 0.0
 
     def of_echoes(values: FloatArray) -> xr.DataArray:
@@ -211,6 +232,7 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
     return table[list(_TABLE)].assign(
         bias=table["bias"] * certain,
         variance=beyond + uncertain,
+        uncertain=uncertain,
         noise_share=np.sqrt((left / noise).where(noise > 0, 1.0).clip(max=1)),
     )
 
@@ -250,11 +272,40 @@ def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, 
     return mixed.assign({name: learnt[name] for name in whole})
 
 
-def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:
+def _of_sea(learnt: xr.Dataset, wind: float, level: bool) -> xr.Dataset:
+    """Return a table at a wind or, of a level sea, at the wind of its ripples; a level sea is the one without wind."""
+    rows = learnt["wind_speed"].values == 0
+    waves, ripples = learnt.isel(wind_speed=~rows), learnt["ripples"].values[rows]
+    calm = learnt.isel(wind_speed=rows)
+    if rows.any():
+        calm = _between(calm, "wind_speed", ripples, np.clip(wind, ripples[0], ripples[-1]))
+        if level or rows.all():
+            return calm
+        waves = xr.concat([calm.expand_dims(wind_speed=[0.0]), waves.drop_vars("ripples")], "wind_speed")
+    return _between(waves, "wind_speed", waves["wind_speed"].values, wind)
+
+
+def _between(table: xr.Dataset, axis: str, nodes: FloatArray, value: float) -> xr.Dataset:
+    """Return a table between the nodes of an axis, linearly; a cell that one of both lacks is that of the other."""
+    place = float(np.interp(value, nodes, np.arange(nodes.size)))
+    low = int(place)
+    first, second = (table.isel({axis: min(one, nodes.size - 1)}, drop=True) for one in (low, low + 1))
+    return first.fillna(second) * (1 - (place - low)) + second.fillna(first) * (place - low)
+
+
+def _walked_of_sea(table: xr.Dataset, wind: float, level: bool) -> float:
+    """Return g h/(g + h), as `_walked`, of a wind between those of the waves, or of the ripples of level seas."""
+    rows = table["wind_speed"].values == 0
+    nodes = table["ripples"].values[rows == level] if np.any(rows == level) else table["wind_speed"].values
+    nodes = np.append(nodes, 0.0) if rows.any() and not level else nodes
+    return float(_walked(nodes, wind))
+
+
+def _walks(learnt: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
     """Return the rates of the random walks of biases along the axes of a table [m^2 per unit], as `correct_depths`.
 
-    Those of ``off_nadir_deg`` and ``depth`` are over water; a water without them has the mean of the others, 0 without
-    any.
+    All but that of ``water`` are over water; a water without them has the mean of the others, 0 without any. Those of
+    ``wind_speed`` and ``ripples`` are between the angles of the table, less the variance of the means of places.
     """
     calm = learnt.isel(wind_speed=0)
     bias = calm["bias"].where(calm["found"] >= _USUAL)
@@ -266,6 +317,18 @@ def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:
         if axis != "water":
             rate = rate.fillna(rate.mean("water")).transpose("water", ...)
         rates[axis] = rate.fillna(0)
+    rows = learnt["wind_speed"] == 0
+    for name, own in (("ripples", learnt.isel(wind_speed=rows)), ("wind_speed", learnt.isel(wind_speed=~rows))):
+        if own.sizes["wind_speed"] < 2:
+            rates[name] = xr.full_like(rates["depth"], _OF_RIPPLES if name == "ripples" else 0.0)
+            continue
+        usual, steps = own.where(own["found"] >= _USUAL), np.diff(own["ripples"].values)
+        first, second = (usual.isel(wind_speed=part).drop_vars("wind_speed") for part in (slice(-1), slice(1, None)))
+        change = (second["bias"] - first["bias"]) ** 2 - first["uncertain"] - second["uncertain"]
+        change = _OF_TWO * change / xr.DataArray(steps, dims="wind_speed")
+        rate = change.mean([dim for dim in change.dims if dim in ("wind_speed", "depth")]).clip(min=0)
+        rate = _between(rate.to_dataset(name="rate"), "off_nadir_deg", learnt["off_nadir_deg"].values, angle)["rate"]
+        rates[name] = rate.fillna(rate.mean("water")).fillna(0).transpose("water", ...)
     return rates
 
 
@@ -327,31 +390,48 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
     return values
 
 
-def _median(values: FloatArray) -> float:
-    """Return the median of the numbers among values, NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else math.nan
+def usual_attenuation(attenuation: FloatArray, stderr: FloatArray) -> float:
+    """Return the mean attenuation of waveforms, of the same shape as its errors, weighted with their inverse squares.
+
+    It is NaN where fewer than half of the waveforms have a column to measure it in. The weights leave out pixels that
+    see too little of a short column.
+    """
+    known = np.isfinite(attenuation) & (stderr > 0)
+    if not known.size or known.mean() < _USUAL:
+        return math.nan
+    return float(np.average(attenuation[known], weights=stderr[known] ** -2.0))
 
 
-def _wind(found: xr.Dataset) -> float:
-    """Return the wind speed of a result's scene [m/s], 0 for a level sea."""
+def _opacity(found: xr.Dataset, depth: xr.DataArray) -> tuple[float, float]:
+    """Return the attenuation of the columns, NaN where it is not known, and the median depth of their bottoms [m]."""
+    values, stderr = (found[name].transpose("pixel", ...).values for name in ("attenuation", "attenuation_stderr"))
+    bottom = depth.isel(estimator=0, echo=-1).values
+    known = np.isfinite(bottom) & np.isfinite(values)
+    return usual_attenuation(values, stderr), float(np.median(bottom[known])) if known.any() else 0.0
+
+
+def _sea(found: xr.Dataset, given: float | None) -> tuple[float, bool]:
+    """Return the wind speed of a result's scene, or that of its ripples [m/s], and whether the sea is level."""
     lowest, highest = found.attrs.get("surface_heights_m", (math.nan, math.nan))
-    if highest - lowest < 1e-6:
-        return 0.0
+    level = bool(highest - lowest < _LEVEL) or given == 0
+    if given is not None:
+        return non_negative("wind_speed", given), level
     wind: Any = found.attrs.get("scene.wind_speed")
     try:
-        return float(wind)
+        return float(wind), level
     except (TypeError, ValueError):
         raise UserError("the wind speed of the result is not known: give it") from None
 
 
-def _place_of(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
-    """Return places of values between nodes, 0 for the first one; of NaN, that of the lowest node."""
+def _shares(nodes: FloatArray, value: float) -> FloatArray:
+    """Return the weights of nodes in a linear interpolation, beyond the ends those of the ends; NaN is unknown."""
     order = np.flatnonzero(np.isfinite(nodes))
-    if not order.size:
-        return np.zeros(np.shape(values))
     order = order[np.argsort(nodes[order])]
-    return np.asarray(np.interp(np.nan_to_num(values, nan=float(nodes[order[0]])), nodes[order], order.astype(float)))
+    if not order.size or np.isnan(value):
+        return np.full(nodes.size, 1 / nodes.size)
+    weights = np.zeros(nodes.size)
+    weights[order] = [np.interp(value, nodes[order], one) for one in np.eye(order.size)]
+    return weights
 
 
 def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
@@ -367,25 +447,15 @@ def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.where(inside, low * high / np.where(inside, low + high, 1.0), low))
 
 
-def _at_row(values: FloatArray, row: FloatArray) -> float:
-    """Return the value of a row between rows."""
-    return float(np.interp(row, np.arange(values.size), values))
+def _along_depth(values: FloatArray, depths: FloatArray, at: FloatArray) -> FloatArray:
+    """Return values, shape (water, depth), at depths of any shape, which stands after the waters.
 
-
-def _interpolated(values: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:
-    """Return values, shape (rows, columns), between their nodes; missing ones are those of the nearest node."""
+    They are linear between the known depths of a water, or those of the nearest water with any, and constant beyond.
+    """
     known = np.isfinite(values)
     if not known.any():
-        return np.zeros(np.shape(column))
-    rows, columns = np.nonzero(known)
-    filled = values.copy()
-    for i, j in np.argwhere(~known):
-        nearest = np.argmin(10 * np.abs(rows - i) + np.abs(columns - j))
-        filled[i, j] = values[rows[nearest], columns[nearest]]
-    low = np.minimum(row.astype(int), values.shape[0] - 1)
-    left = np.minimum(column.astype(int), values.shape[1] - 1)
-    down, right = row - low, column - left
-    below, beyond = np.minimum(low + 1, values.shape[0] - 1), np.minimum(left + 1, values.shape[1] - 1)
-    first = (1 - right) * filled[low, left] + right * filled[low, beyond]
-    second = (1 - right) * filled[below, left] + right * filled[below, beyond]
-    return np.asarray((1 - down) * first + down * second)
+        return np.full((len(values), *at.shape), np.nan)
+    waters = np.flatnonzero(known.any(axis=1))
+    nearest = [waters[np.argmin(np.abs(waters - water))] for water in range(len(values))]
+    places = np.nan_to_num(at, nan=float(depths[0]))
+    return np.stack([np.interp(places, depths[known[water]], values[water][known[water]]) for water in nearest])

@@ -17,6 +17,7 @@ IntArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
 
 _NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a record
+_TOGETHER = 256  # records whose correlated samples are in memory at a time
 _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
@@ -58,11 +59,15 @@ class Records:
         Centres of the bins [ns], evenly spaced, shape (time,).
     noise
         Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
+    shared
+        Covariance of samples over the product of their noise, shape (time, time), where sums of samples are not those
+        of independent bins; on its diagonal below 1 where the noise is that of means over neighbours. None otherwise.
     """
 
     power: FloatArray
     time_ns: FloatArray
     noise: FloatArray
+    shared: FloatArray | None = None
 
     @classmethod
     def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
@@ -109,14 +114,42 @@ class Records:
         """Return the centres of bins [ns]; of bins outside the record, that of the nearest one inside."""
         return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
 
+    def places(self, bins: IntArray, lags: IntArray) -> IntArray:
+        """Return the bins at lags from a bin of each record, those outside the record moved to its ends."""
+        return np.asarray(np.clip(bins[:, np.newaxis] + lags, 0, self.time_ns.size - 1))
+
     def around(self, bins: IntArray, lags: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return the samples at lags from a bin of each record, their noise, and whether they are in the record."""
         places = bins[:, np.newaxis] + lags
         inside = (places >= 0) & (places < self.time_ns.size)
-        clipped = np.clip(places, 0, self.time_ns.size - 1)
+        clipped = self.places(bins, lags)
         power = np.take_along_axis(self.power, clipped, axis=1)
         noise = np.take_along_axis(np.broadcast_to(self.noise, self.power.shape), clipped, axis=1)
         return power, noise, inside
+
+
+def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: FloatArray | None) -> FloatArray:
+    """Return the standard errors of sums of samples, shape (n,).
+
+    Parameters
+    ----------
+    scaled
+        Noise of the samples times their weights, shape (n, bins); 0 outside the record.
+    places
+        Bins of the samples, in the record, shape (n, bins); None for all bins.
+    shared
+        As of `Records`.
+    """
+    if shared is None:
+        return np.asarray(np.linalg.norm(scaled, axis=1))
+    if places is None:
+        return np.asarray(np.sqrt(np.maximum(np.sum((scaled @ shared) * scaled, axis=1), 0)))
+    variance = np.zeros(len(scaled))
+    for start in range(0, len(scaled), _TOGETHER):
+        own, at = scaled[start : start + _TOGETHER], places[start : start + _TOGETHER]
+        matrices = shared[at[:, :, np.newaxis], at[:, np.newaxis, :]]
+        variance[start : start + _TOGETHER] = np.einsum("ni,nij,nj->n", own, matrices, own, optimize=True)
+    return np.sqrt(np.maximum(variance, 0))
 
 
 def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:

@@ -15,6 +15,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     EchoFlag,
     IntArray,
     Records,
+    error_of_sums,
     has_echo,
 )
 from mitransient_lidar.analysis.waveforms.echo_shape import Template
@@ -37,6 +38,8 @@ class Window:
         Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
     ramps, level_noise
         Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
+    places, shared
+        Bins of the samples, shape (n, bins), and the correlation of their noise as of `Records`.
     """
 
     u: FloatArray
@@ -47,6 +50,8 @@ class Window:
     bin_ns: float
     ramps: FloatArray
     level_noise: FloatArray
+    places: IntArray
+    shared: FloatArray | None
 
     @classmethod
     def around(
@@ -74,12 +79,14 @@ class Window:
         if after is not None:
             levels, level_noise = _levels(records, bins, after, width, np.asarray(decay))
             power = power - levels @ ramps
-        return cls(u, records.time_of(bins), power, noise, inside, records.bin_ns, ramps, level_noise)
+        places, middle = records.places(bins, lags), records.time_of(bins)
+        return cls(u, middle, power, noise, inside, records.bin_ns, ramps, level_noise, places, records.shared)
 
     def error_of_sum(self, weights: FloatArray) -> FloatArray:
         """Return the standard error, shape (n,), of the sum of the samples times `weights`, shape (n, bins)."""
         levels = np.sum((weights @ self.ramps.T * self.level_noise) ** 2, axis=1)
-        return np.asarray(np.sqrt(np.sum((weights * self.noise) ** 2, axis=1) + levels))
+        scaled = np.where(self.inside, weights * self.noise, 0.0)
+        return np.asarray(np.sqrt(error_of_sums(scaled, self.places, self.shared) ** 2 + levels))
 
 
 def _levels(
@@ -97,7 +104,8 @@ def _levels(
         counted = usable & (side * u >= 1.5 * width)
         count = counted.sum(axis=1)
         level = np.sum(np.where(counted, power, 0), axis=1) / np.maximum(count, 1)
-        error = np.sqrt(np.sum(np.where(counted, noise, 0) ** 2, axis=1)) / np.maximum(count, 1)
+        scaled = np.where(counted, noise, 0.0)
+        error = error_of_sums(scaled, records.places(bins, lags), records.shared) / np.maximum(count, 1)
         if side < 0:
             fall = np.exp(-decay * np.sum(np.where(counted, -u, 0), axis=1) / np.maximum(count, 1))
             # Without samples between the echoes: the dip between them.

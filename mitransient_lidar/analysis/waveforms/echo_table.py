@@ -18,6 +18,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     Echoes,
     EchoFlag,
     Records,
+    error_of_sums,
     find_echoes,
     saturated_spans,
 )
@@ -91,7 +92,7 @@ def extract(
         of ``pulse_fwhm_ns``.
     noise : float or array-like, optional
         Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
-        ``waveform_stderr`` times the attribute ``error_inflation``, or ``signal_deviation``, or the spread before the
+        ``waveform_stderr`` with the ``error_correlation``, or ``signal_deviation``, or the spread before the
         surface echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over
         a pulse to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
         ``signal_mean_stderr``, so that errors of a render are no echoes.
@@ -192,8 +193,7 @@ def extract(
     0.1 to 1.8 (surface penetration), and scattered light reaches the bottom later by 0.02 to 0.1. It arrives no earlier
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo.
 
-    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction. Bins of rendered
-    waveforms are correlated: without ``error_inflation`` the errors are too small.
+    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
@@ -295,7 +295,7 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
     safe = np.where(known & (total > 0), total, 1.0)
     seconds = records.bin_ns * 1e-9
     time = np.sum(power * records.time_ns, axis=1) / safe
-    time_error = np.sqrt(np.sum((noise * (records.time_ns - time[:, np.newaxis])) ** 2, axis=1)) / safe
+    time_error = error_of_sums(noise * (records.time_ns - time[:, np.newaxis]), None, records.shared) / safe
     level = column.level * np.exp(-column.decay * delay)
     relative = column.level_stderr / column.level
     mixed = 2 * column.correlation * relative * delay * column.decay_stderr
@@ -310,7 +310,7 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
         half,
         time_error,
         level_error,
-        np.sqrt(np.sum(noise**2, axis=1)) * seconds,
+        error_of_sums(noise, None, records.shared) * seconds,
         half * column.decay_stderr / decay,
         np.where(known, 0, int(EchoFlag.NO_ECHO)),
     ).known_only(known)

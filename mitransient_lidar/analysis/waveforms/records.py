@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
+from mitransient_lidar.results.sum_errors import SumErrors
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -91,6 +92,8 @@ class Waveforms:
         Height that single events of the detector reach, shape (pixels,).
     lowest_m
         Lowest point of the sea [m], negative; that of a rough sea where it is not known.
+    shared
+        Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
     """
 
     dims: tuple[str, ...]
@@ -113,6 +116,7 @@ class Waveforms:
     lines: LinesOfSight
     event_height: FloatArray
     lowest_m: float
+    shared: FloatArray | None = None
 
     @property
     def count(self) -> int:
@@ -172,7 +176,10 @@ class Waveforms:
                     f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
                 )
             baseline = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
-        deviation = _noise(dataset, name, samples, baseline, quiet, noise, max(int(template.fwhm_ns / step), 1))
+        run = max(int(template.fwhm_ns / step), 1)
+        deviation, shared = _noise(dataset, name, samples, baseline, quiet, noise, run), None
+        if name == "waveform" and noise is None and "waveform_stderr" in dataset:
+            deviation, shared = _noise_of_render(dataset, deviation, run)
         if in_blocks:
             samples, deviation = _without_gaps(dataset, samples, deviation)
         return cls(
@@ -196,6 +203,7 @@ class Waveforms:
             _lines_of_sight(dataset, dims[:-1]),
             _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels),
             float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _LOWEST))[0]),
+            shared,
         )
 
     @property
@@ -240,7 +248,8 @@ class Waveforms:
         """Return some of the waveforms less their baseline."""
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size
         noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
-        return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
+        found = Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
+        return replace(found, shared=self.shared)
 
 
 def _pulse(attributes: Attributes) -> Pulse:
@@ -329,9 +338,7 @@ def _noise(
             raise UserError(f"noise of shape {given.shape} must be a number, or one per pixel, or per pixel and bin")
         return given.reshape(-1, 1) + np.zeros((pixels, 1)) if given.size <= pixels else given.reshape(pixels, count)
     if name == "waveform" and "waveform_stderr" in dataset:
-        bins, inflation = (dataset.attrs.get(key, 1.0) for key in ("error_inflation_bins", "error_inflation"))
-        factor = np.interp(math.log(run), np.log(np.atleast_1d(bins)), np.atleast_1d(inflation))
-        return float(factor) * dataset["waveform_stderr"].values.reshape(-1, count)
+        return np.asarray(dataset["waveform_stderr"].values.reshape(-1, count), dtype=np.float64)
     by_receiver = _receiver_noise(dataset, samples, baseline, quiet, run)
     if "signal_mean_stderr" not in dataset:
         return by_receiver
@@ -341,6 +348,15 @@ def _noise(
     if len(by_receiver) not in (1, len(by_render)):
         by_receiver = np.tile(by_receiver, (len(by_render) // pixels, 1))
     return np.asarray(np.hypot(by_receiver, by_render))
+
+
+def _noise_of_render(dataset: xr.Dataset, deviation: FloatArray, run: int) -> tuple[FloatArray, FloatArray | None]:
+    """Return the noise for means of `run` samples of a render with the errors `deviation`, and its correlation."""
+    errors = SumErrors.of(dataset)
+    if errors is None:
+        return deviation, None
+    factor, correlation = errors.of_means(deviation, run), errors.matrix()
+    return factor * deviation, None if correlation is None else correlation / np.outer(factor, factor)
 
 
 def _receiver_noise(

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
@@ -42,7 +43,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
         error = (error**2).sum("shot", skipna=False) ** 0.5 / values.sizes["shot"]
         values = values.mean("shot")
     pixels = [dim for dim in dims if dim not in ("shot", "time")]
-    others = {"shot", "origin", "parameter", "case", "batch"}
+    others = {"shot", "origin", "parameter", "case", "batch", *sum_errors.DIMS}
     own = {key: one for key, one in dataset.coords.items() if not others & {*one.dims}}
     for angle in ("angle_x", "angle_y"):
         if angle not in own or set(own[angle].dims) != set(pixels):

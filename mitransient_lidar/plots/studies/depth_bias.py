@@ -32,7 +32,7 @@ def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> 
             ax.errorbar(found["off_nadir_deg"], bias, spread, label=name.replace("_", " "), **style)
         ax.axhline(0, color="0.5", linewidth=0.8)
         wind, water, depth = one["cell"].item()
-        sea = f"{wind:g} m/s" if wind else "level sea with ripples"
+        sea = f"{wind:g} m/s" if wind else f"level sea, ripples of {float(one['ripples']):g} m/s"
         ax.set_title(f"{sea}, Jerlov {water}, {depth:g} m", fontsize="medium")
         drawing.add_grid(ax)
     for ax in axes[-1]:

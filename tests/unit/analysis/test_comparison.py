@@ -10,6 +10,7 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis import comparison
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.sum_errors import with_correlation
 
 TRUE = np.exp(-np.arange(100) / 40) * np.array([[1.0], [0.5]])  # J, two pixels
 
@@ -54,6 +55,17 @@ def test_a_difference_in_one_bin_or_in_all_is_found():
     assert abs(everywhere.energy_ratio - 1.05) < largest_z(40) * everywhere.energy_ratio_stderr
     assert everywhere.energy_ratio_stderr < 0.002
     assert not everywhere.agrees
+
+
+def test_the_error_of_the_energy_has_the_correlation_of_bins():
+    """Errors that all bins of a pixel share add up; independent ones would be a tenth."""
+    given = [result(seed, passes=40) for seed in (1, 2)]
+    alone = comparison.compare(*given).energy_ratio_stderr
+    shared = [with_correlation(one, one["time"].values, np.ones((100, 100))) for one in given]
+    sums = [np.linalg.norm(one["waveform_stderr"].sum("time")) / one["waveform"].sum().item() for one in given]
+    together = comparison.compare(*shared)
+    assert together.energy_ratio_stderr == pytest.approx(np.hypot(*sums) * together.energy_ratio, rel=1e-6)
+    assert together.energy_ratio_stderr > 5 * alone
 
 
 def test_bins_outside_the_window_or_badly_known_do_not_count():

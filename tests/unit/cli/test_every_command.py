@@ -117,15 +117,15 @@ def test_commands_of_a_result_refuse_invalid_options(arguments, message, result)
 def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     """A table, a render, its record with the receiver of the instrument, and its depths, each from the files before."""
     made, csv = tmp_path / "table.nc", tmp_path / "echoes.csv"
-    few = ["--winds", "0", "--waters", "IB", "--angles", "20", "--shots", 8, "--records", 4]
+    few = ["--winds", "0", "--ripples", 5, "--waters", "IB", "--angles", "20", "--shots", 8, "--records", 4]
     check(run("depth-bias", "riegl_vq840g", *few, "--depths", "3,6", "-o", made, "-q"), tmp_path)
     again = run("depth-bias", "riegl_vq840g", *few, "--depths", 5, "--seed", 2, "--corrections", made, "-o", csv, "-q")
     assert_refused(again, "--output")
     options = [*few, "--depths", 5, "--seed", 2, "--corrections", made, "-o", tmp_path / "again.nc", "-q"]
     lines = run("depth-bias", "riegl_vq840g", *options).stdout.splitlines()
-    # Angle, wind, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong, and bias after correction.
+    # Angle, wind, ripples, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong, bias after it.
     names, cells = lines[-2].split(), lines[-1].replace(" %", "").split()
-    assert cells[:5] == ["20.0", "0", "IB", "5", "single"]
+    assert cells[:6] == ["20.0", "0", "5", "IB", "5", "single"]
     assert float(cells[names.index("found")]) == float(cells[names.index(">10")]) == 100
     first = names.index("bias")
     before, after = float(cells[first]), float(cells[names.index("bias", first + 1)])
@@ -156,7 +156,8 @@ def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
     names = {f"{stem}_{name}" for name in ("tvu.csv", "tvu_corrected.csv", "thu.csv", "tvu.png", "orders.png")}
     assert {path.name for path in folder.iterdir()} == {"riegl_vq840g_tpu.nc", *names}
     table = tmp_path / "table.nc"
-    check(run("depth-bias", "riegl_vq840g", *few, "-D", "altitude=120", "--angles", 20, "-o", table), tmp_path)
+    options = [*few, "--ripples", 5, "-D", "altitude=120", "--angles", 20, "-o", table]
+    check(run("depth-bias", "riegl_vq840g", *options), tmp_path)
     bias = netcdf.read_netcdf(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
     found = netcdf.read_netcdf(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
     vertical = np.hypot(bias["bias"], bias["spread"]).where(bias["found"] >= 0.5)

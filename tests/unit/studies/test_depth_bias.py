@@ -47,6 +47,7 @@ def rendered(monkeypatch):
 def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
     states = []
     options = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"]}
+    options["ripples"] = [5.0]
     table = study.depth_bias("riegl_vq840g", depths=[0.1, 0.2, 3, 6, 8, 10], progress=states.append, **options)
     # A bottom that the surface hides is no lost one.
     assert rendered == 2 * [0.1, 0.2, 3, 6]
@@ -55,20 +56,29 @@ def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
     np.testing.assert_array_equal(one["wrong"], 0)
     np.testing.assert_array_equal(one["bias"], [np.nan, 0.1, 0.1, 0.1, np.nan, np.nan])
     assert [state.done for state in states] == list(range(1, 13))
-    assert table["attenuation"].item(0) == pytest.approx(0.2)
+    np.testing.assert_allclose(table["attenuation"].values[0, 0, 0], [np.nan, 0.2, 0.2, 0.2, np.nan, np.nan])
     assert table.attrs["altitude"] == 150
 
 
 def test_level_seas_are_rendered_as_often_as_waves_have_places(rendered, monkeypatch):
     """A single render has an error that its records share."""
-    options = []
+    options, winds = [], []
     render = study.render_shots
-    monkeypatch.setattr(study, "render_shots", lambda *given, **rest: options.append(rest) or render(*given, **rest))
+
+    def noted(scene, given, **rest):
+        options.append(rest)
+        winds.append((given["wind_speed"], given.get("spectrum")))
+        return render(scene, given, **rest)
+
+    monkeypatch.setattr(study, "render_shots", noted)
     seas = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"], "depths": [3.0]}
     table = study.depth_bias("riegl_vq840g", shots=4, target_error=0.05, **seas)
-    assert [one["target_error"] for one in options] == pytest.approx([0.03, 0.05])
-    assert options[0]["positions"] == 4 * [(0.0, 0.0)]
-    assert options[1]["count"] == 4
+    assert [one["target_error"] for one in options] == pytest.approx([0.03, 0.03, 0.05])
+    assert winds == [(3.0, "flat"), (6.0, "flat"), (3.0, None)]
+    assert table["wind_speed"].values.tolist() == [0, 0, 3]
+    assert table["ripples"].values.tolist() == [3, 6, 3]
+    assert options[0]["positions"] == options[1]["positions"] == 4 * [(0.0, 0.0)]
+    assert options[2]["count"] == 4
     assert table.attrs["level_renders"] == 4
     with pytest.raises(UserError, match="target_error = 0 must be greater than 0"):
         study.depth_bias("riegl_vq840g", target_error=0.0, **seas)

@@ -30,10 +30,10 @@ def table(instrument="riegl_vq840g"):
     angle, wind, depth = grid["off_nadir_deg"], grid["wind_speed"], grid["depth"]
     bias = estimator * (0.01 * angle + 0.02 * wind + 0.3 * attenuation + 0.005 * depth) + pixel
     spread = xr.zeros_like(bias) + 0.01 * depth
-    level = attenuation + xr.zeros_like(angle) + xr.zeros_like(wind)
+    level = attenuation + xr.zeros_like(angle) + xr.zeros_like(wind) + xr.zeros_like(depth)
     data = {"bias": bias, "spread": spread, "found": xr.ones_like(bias), "attenuation": level}
     data["noise_error"] = xr.zeros_like(bias)
-    made = xr.Dataset(data).transpose(..., "estimator", "pixel")
+    made = xr.Dataset(data).transpose(..., "estimator", "pixel").assign_coords(ripples=("wind_speed", [5.0, 6.0]))
     return made.transpose(*AXES, "estimator", "pixel").assign_attrs(instrument=instrument)
 
 
@@ -53,6 +53,7 @@ def echoes(depth, attenuation=0.3, pixels=("red", "green"), several=True, **attr
         "depth_m_method_error": (dims, zeros + 0.05),
         "flags": (dims, zeros.astype(int)),
         "attenuation": (("shot", "pixel"), np.full(shape[:2], attenuation)),
+        "attenuation_stderr": (("shot", "pixel"), np.full(shape[:2], 0.01)),
     }
     names = ["gaussian", "peak"] if several else ["gaussian"]
     coords = {"echo": ECHO, "pixel": list(pixels), **({"estimator": names} if several else {})}
@@ -69,9 +70,9 @@ def test_the_bias_of_the_place_between_nodes_is_subtracted():
             bias = factor * (0.15 + 0.06 + 0.09 + 0.005 * np.array([4.0, 8.0])) + p
             np.testing.assert_allclose(bottom["depth_m"].values[:2, p, e], np.array([4.0, 8.0]) - bias)
             np.testing.assert_allclose(bottom["depth_correction_m"].values[:2, p, e], bias)
-            # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.46 of a quarter of the
+            # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.47 of a quarter of the
             # squared difference. The nodes' spreads are 2, 6 and 10 cm.
-            between = 0.46 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
+            between = 0.47 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
             left = np.sqrt(np.array([0.04, 0.08]) ** 2 + between)
             np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], left)
     assert np.isnan(bottom["depth_m"].values[2]).all()
@@ -98,6 +99,56 @@ def test_errors_grow_beyond_the_ends_of_a_table():
     np.testing.assert_allclose(bottom["depth_correction_m"], bottom["depth_correction_m"][0])
 
 
+def test_unknown_water_is_all_waters_in_which_the_bottom_is_seen():
+    """Without attenuation the mean over the waters counts, and their spread: the clearest water is no better known."""
+    made = table()
+    made["bias"][:], made["spread"][:] = 0.0, 0.0
+    made["bias"].loc[{"water": "IB"}], made["bias"].loc[{"water": "5C"}] = 0.02, 0.12
+    left, stated = [], []
+    for bias in (0.02, 0.12):
+        bottom = correct_depths(echoes([6.0 + bias], np.nan, several=False), made).sel(echo="bottom", pixel="red")
+        left.append(bottom["depth_m"].item() - 6)
+        stated.append(bottom["depth_m_method_error"].item())
+    np.testing.assert_allclose(left, [-0.05, 0.05], atol=1e-12)
+    np.testing.assert_allclose(stated, 0.05, atol=1e-12)
+    # One column in three is too long for chance: no water is known by it.
+    found = echoes([6.0] * 3, np.nan, several=False)
+    found["attenuation"][0] = 0.5
+    assert correct_depths(found, made)["depth_correction_m"].values[0, 0, 3] == pytest.approx(0.07)
+    made["found"].loc[{"water": "5C", "depth": 10.0}] = 0.0
+    deep = correct_depths(echoes([10.0], np.nan, several=False), made)
+    assert deep["depth_correction_m"].values[0, 0, 3] == pytest.approx(0.02)
+
+
+def test_ripples_are_an_axis_of_level_seas():
+    """Biases of 1 and 7 cm with ripples of 3 and 6 m/s: the walk has 0.47 of 6^2/3 cm^2 for each m/s."""
+    made = xr.concat([table().isel(wind_speed=[0]), table()], "wind_speed")
+    made = made.assign_coords(ripples=("wind_speed", [3.0, 6.0, 6.0]))
+    made["bias"][:], made["spread"][:] = 0.0, 0.0
+    made["bias"][{"wind_speed": 0}], made["bias"][{"wind_speed": 1}] = 0.01, 0.07
+    rate = 0.47 * 0.06**2 / 3
+    for ripples, bias, away in ((3.0, 0.01, 0.0), (4.0, 0.03, 2 / 3), (1.0, 0.01, 2.0), (9.0, 0.07, 3.0)):
+        found = echoes([6.0], several=False, surface_heights_m=[0.0, 0.0], **{"scene.wind_speed": ripples})
+        bottom = correct_depths(found, made).sel(echo="bottom", pixel="red")
+        assert bottom["depth_correction_m"].item() == pytest.approx(bias)
+        assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(rate * away), abs=1e-9)
+    bottom = correct_depths(found, made.isel(wind_speed=[1, 2])).sel(echo="bottom", pixel="red")
+    assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(3 * depth_correction._OF_RIPPLES))
+
+
+def test_attenuation_is_compared_with_that_of_columns_as_long():
+    """Columns of 2 m measure half the attenuation of others: 0.25 is the turbid water there, not one between."""
+    made = table()
+    made["attenuation"] = made["attenuation"] * xr.DataArray([0.5, 1.0, 1.0], dims="depth")
+    for depth, water in ((2.0, 1.0), (6.0, (0.25 - 0.1) / 0.4)):
+        bias = 0.15 + 0.06 + 0.3 * (0.1 + 0.4 * water) + 0.005 * depth
+        found = echoes([depth], 0.25, several=False)
+        # A pixel that hardly sees the column counts little.
+        found["attenuation"][:, 1], found["attenuation_stderr"][:, 1] = -5.0, 1e6
+        corrected = correct_depths(found, made)
+        assert corrected["depth_correction_m"].values[0, 0, 3] == pytest.approx(bias)
+
+
 def test_noise_in_the_table_counts_once():
     """Of a spread of 5 cm, 3 cm are the noise that the shots state; 8 cm of noise are reduced to the 5 cm."""
     made = table()
@@ -116,7 +167,9 @@ def test_a_bias_within_its_error_counts_little():
     # A level sea has one place, of which several renders differ as places of waves do.
     for wind, renders, share in ((6.0, 1, 0.2), (0.0, 1, 1.0), (0.0, 4, 0.2)):
         given = made.assign_attrs(level_renders=renders)
-        corrected = correct_depths(echoes([6.0]), given, wind).sel(echo="bottom")
+        heights = [0.0, 0.0] if wind == 0 else [-0.5, 0.5]
+        found = echoes([6.0], surface_heights_m=heights)
+        corrected = correct_depths(found, given, wind or 5.0).sel(echo="bottom")
         np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * share)
         # The variance of four places, and that of their mean where they are independent.
         variance = 0.08**2 / (1 - 1 / 4) + (0.08**2 / 4 if share < 1 else 0)
@@ -143,10 +196,11 @@ def stated(seed, realisations=20):
         values["found"] = 0 * nodes + 1, 0 * nodes + 1
         data = {name: (AXES, np.stack(pair, axis=1)) for name, pair in values.items()}
         axes = {"off_nadir_deg": np.arange(0.0, 20, 2), "wind_speed": [0.0, 5.0], "depth": np.arange(1.0, 25, 2)}
-        axes["water"] = [str(number) for number in range(10)]
+        axes["water"], axes["ripples"] = [str(number) for number in range(10)], ("wind_speed", [5.0, 5.0])
         known = xr.Dataset(data, axes, {"shots": places, "records": 60, "instrument": "riegl_vq840g"})
         known = known.expand_dims(estimator=["gaussian"], pixel=["red"], axis=(4, 5))
-        known["attenuation"] = AXES[:3], np.broadcast_to(0.1 + 0.1 * np.arange(10), (10, 2, 10)).copy()
+        opacity = 0.1 + 0.1 * np.arange(10)[:, np.newaxis]
+        known["attenuation"] = AXES, np.broadcast_to(opacity, (10, 2, 10, 12)).copy()
         angle, water = 2 * rng.integers(0, 9, 2) + 1
         steps_deep = 2 * rng.integers(0, 11, 400) + 1
         error = bias[angle, water, steps_deep] + total * rng.normal(size=400)

@@ -1,11 +1,14 @@
 """Detection and measurement of echoes in waveforms: bias, standard errors and flags."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import exponnorm, norm
 from significance import largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms import echo_estimators
+from mitransient_lidar.analysis.waveforms.column_fits import column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, find_echoes
 from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
@@ -142,6 +145,24 @@ def test_errors_are_those_of_the_noise(method):
     # with what they are compared with, which costs up to 5 %.
     assert abs(z.std(ddof=1) - 1) < largest_z(count, 2) / np.sqrt(2 * count) + 0.05
     assert abs(z.mean()) < largest_z(count, 2) / np.sqrt(count) + 0.1
+
+
+def test_errors_of_energies_and_columns_have_the_correlation_of_samples():
+    """Errors seen in 1500 records whose noise a filter of 6 ns shares; independent samples would have half of them."""
+    rng = np.random.default_rng(5)
+    kernel = np.ones(12) / np.sqrt(12)
+    signal = echoes([60.0]) + 0.4 * np.exp(-0.02 * TIME) * (TIME > 80)
+    noise = np.apply_along_axis(np.convolve, 1, rng.normal(size=(1500, TIME.size + 11)), kernel, "valid")
+    records = Records.of(signal + 0.01 * noise, TIME, 0.01)
+    lags = np.abs(np.subtract.outer(np.arange(TIME.size), np.arange(TIME.size)))
+    records = replace(records, shared=np.clip(1 - lags / 12, 0, 1))
+    top = echo_estimators.Window.around(records, np.full(1500, 120), 6.0)
+    ends = np.full(1500, 90.0), np.full(1500, 190.0), np.full(1500, 80.0)
+    fit = column_fit(records, *ends)
+    weights = np.ones(top.power.shape)
+    pairs = [(np.sum(top.power, axis=1), top.error_of_sum(weights)), (fit.decay, fit.decay_stderr)]
+    for found, stated in [*pairs, (fit.level, fit.level_stderr)]:
+        np.testing.assert_allclose(found.std() / np.median(stated), 1, atol=largest_z(1500) / np.sqrt(2 * 1500))
 
 
 def test_surface_target_and_bottom_are_found_on_a_column():

@@ -61,11 +61,11 @@ def test_bias_is_drawn_against_the_angle():
     dims = ("off_nadir_deg", "wind_speed", "water", "depth", "estimator", "pixel")
     bias = np.linspace(-0.2, 0.1, 3 * 2 * 2).reshape(3, 1, 1, 2, 2, 1)
     coords = {"off_nadir_deg": [0.0, 20.0, 40.0], "wind_speed": [0.0], "water": ["1C"], "depth": DEPTHS}
-    coords |= {"estimator": ["leading_edge", "peak"], "pixel": ["single"]}
+    coords |= {"ripples": ("wind_speed", [6.0]), "estimator": ["leading_edge", "peak"], "pixel": ["single"]}
     data = {"bias": (dims, bias), "spread": (dims, np.full(bias.shape, 0.01))}
     figure = plot_depth_bias(xr.Dataset(data, coords, {"instrument": "made", "receiver": "ideal"}))
     first, second = figure.axes
-    assert first.get_title() == "level sea with ripples, Jerlov 1C, 2 m"
+    assert first.get_title() == "level sea, ripples of 6 m/s, Jerlov 1C, 2 m"
     curve = second.containers[1].lines[0]
     np.testing.assert_array_equal(curve.get_xdata(), coords["off_nadir_deg"])
     np.testing.assert_allclose(curve.get_ydata(), 100 * bias[:, 0, 0, 1, 1, 0])
