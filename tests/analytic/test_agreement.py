@@ -273,7 +273,8 @@ def assert_same_light(merged, reference, error):
     significance.assert_same(*classes, error=error, bias=0.005, known=0.3, faint=1e-4, lacking=True)
 
 
-#: In the quick tier: half of the passes find light that the complement or the roulette lose, by 8 and 57 standard errors.
+#: In the quick tier: half of the passes find light that the complement or the roulette lose, by 57 and 8 standard
+#: errors.
 MIXED = "mirror and sphere in strata"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water, strata
 #: (the quick case) and orders (turbid water). Closed forms cover solids, masts, poses under water, and beam and view of
