@@ -200,9 +200,9 @@ def test_command_writes_table_plot_and_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_small_surface_is_warned_of(caplog, tmp_path):
+def test_a_small_surface_is_warned_of(caplog):
     params = {**SCENE, "off_nadir_deg": 20, "time_start_ns": 1400, "attenuation": 1, "scattering": 0.9}
     params |= {"surface_size": 4, "surface_cell_size": 0.25}
     with caplog.at_level(logging.WARNING):
-        fov_sweep(few_paths("table1", tmp_path), [15], params, passes=4, max_depth=3)
+        fov_sweep("table1", [15], params, passes=4, max_depth=3)
     assert "the surface is smaller than the spread of the light" in caplog.text
