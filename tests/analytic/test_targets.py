@@ -77,7 +77,8 @@ def grid(low, high, count):
 
 def render_one(lidar_scene, passes, integrator, target, start=1430.0, **more):
     film = {"time_start_ns": start, "bin_width_ns": 0.25, "bin_count": 480}
-    options = {"type": integrator, "paths_per_pass": 2**14}
+    photons = {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
+    options = {"type": integrator, "paths_per_pass": 2**14, **photons}
     scene = lidar_scene(integrator=options, film=film, bottom=None, extra={"target": target}, **{**ONE, **more})
     return passes(scene, 24)[:, 0]
 
