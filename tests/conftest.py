@@ -1,5 +1,11 @@
 """Fixtures that every kind of test shares."""
 
+import os
+
+# Before NumPy: threads that wait for each other take more time than the small matrices of tests, all the more in two
+# processes.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
 # Before Mitsuba: the package sets the path of LLVM for Dr.Jit.
 import mitransient_lidar  # noqa: F401, I001
 

@@ -121,16 +121,35 @@ def exit_if_failed(path: Path) -> None:
 
 
 @contextlib.contextmanager
+def _logging(handler: logging.Handler, level: int, *, propagate: bool) -> Iterator[None]:
+    """Give log messages of the package to a handler, and to those of the root logger if `propagate`."""
+    logger = logging.getLogger("mitransient_lidar")
+    before = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    logger.propagate = propagate
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before[0])
+        logger.propagate = before[1]
+
+
+def silent(quiet: bool) -> contextlib.AbstractContextManager[None]:
+    """Show no log messages if `quiet`."""
+    return _logging(logging.NullHandler(), logging.NOTSET, propagate=False) if quiet else contextlib.nullcontext()
+
+
+@contextlib.contextmanager
 def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     """Show log messages and progress on stderr; yield the function that takes the progress.
 
     On a terminal it is a bar; elsewhere, as in a pipe or a log, a line every 15 s.
     """
-    logger = logging.getLogger("mitransient_lidar")
     if quiet:
-        logger.addHandler(logging.NullHandler())
-        logger.propagate = False
-        yield None
+        with silent(quiet):
+            yield None
         return
     from rich.logging import RichHandler
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -140,9 +159,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     console = _console()
     handler = RichHandler(console=console, show_path=False, show_time=False)
     handler.setFormatter(_PrintableLog("%(message)s"))
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
+    with _logging(handler, logging.INFO, propagate=True):
         description = TextColumn("{task.description}", table_column=Column(no_wrap=False, ratio=1))
         columns = (SpinnerColumn(), description, BarColumn(bar_width=16), TimeElapsedColumn())
         if not console.is_terminal:
@@ -160,8 +177,6 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
                 bar.update(task, description=text, completed=state.done, total=expected)
 
             yield show
-    finally:
-        logger.removeHandler(handler)
 
 
 @contextlib.contextmanager

@@ -47,7 +47,7 @@ def shoot(lidar_scene, passes, start_ns, *, altitude, angle, water, bottom, slop
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
-@pytest.mark.parametrize(("altitude", "depth"), [(400.0, 3.0), (100.0, 8.0), (1000.0, 8.0)])
+@pytest.mark.parametrize(("altitude", "depth"), [(400.0, 3.0), (1000.0, 8.0)])
 def test_bottom_arrives_to_a_tenth_of_a_millimetre(lidar_scene, passes, integrator, altitude, depth):
     """Rays start beside the surfaces that they leave: distances without these gaps are up to 0.4 mm too short."""
     pose = {"altitude": altitude, "off_nadir_deg": 0.0}

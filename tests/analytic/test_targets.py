@@ -1,5 +1,7 @@
 """Targets and bottoms: echoes against closed forms and quadrature, both integrators, and the published figures."""
 
+import functools
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -75,7 +77,8 @@ def grid(low, high, count):
 
 def render_one(lidar_scene, passes, integrator, target, start=1430.0, **more):
     film = {"time_start_ns": start, "bin_width_ns": 0.25, "bin_count": 480}
-    options = {"type": integrator, "paths_per_pass": 2**14}
+    photons = {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
+    options = {"type": integrator, "paths_per_pass": 2**14, **photons}
     scene = lidar_scene(integrator=options, film=film, bottom=None, extra={"target": target}, **{**ONE, **more})
     return passes(scene, 24)[:, 0]
 
@@ -135,13 +138,9 @@ SPHERES = {
 }
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize(
-    "sphere",
-    [pytest.param(name, marks=pytest.mark.slow if "narrow" in name else pytest.mark.long) for name in SPHERES],
-)
-def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
-    """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
+@functools.cache
+def echo_of(sphere):
+    """Return energies [J] and times [ns] of the echo of a sphere, by places on its surface."""
     lidar, sigma, centre, radius = SPHERES[sphere]
     (cosine, dcos), (azimuth, dphi) = grid(-1.0, 1.0, 1200), grid(0.0, 2 * np.pi, 1200)
     cosine, azimuth = np.meshgrid(cosine, azimuth)
@@ -149,7 +148,17 @@ def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
     normal = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
     irradiance, received, towards, time = gain(*np.moveaxis(centre + radius * normal, -1, 0), lidar, sigma)
     facing = np.maximum(np.sum(normal * towards, axis=-1), 0)
-    energy = 0.3 / np.pi * irradiance * received * facing**2 * radius**2 * dcos * dphi
+    return 0.3 / np.pi * irradiance * received * facing**2 * radius**2 * dcos * dphi, time
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(
+    "sphere",
+    [pytest.param(name, marks=pytest.mark.slow if "narrow" in name else pytest.mark.long) for name in SPHERES],
+)
+def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
+    """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
+    (lidar, sigma, centre, radius), (energy, time) = SPHERES[sphere], echo_of(sphere)
     pose = {"altitude": lidar.height, "off_nadir_deg": float(np.degrees(lidar.off_nadir))}
     start = np.floor(time[energy > 0].min() - 10)
     echo = render_one(
@@ -188,8 +197,8 @@ def test_cylinder_as_narrow_as_the_patches_of_its_light(lidar_scene, passes):
         bottom=None,
         extra={"target": cylinder},
     )
-    energy = passes(scene, 64).sum(axis=(1, 2))
-    significance.assert_equal(energy, expected, error=0.007, bias=0.005)
+    energy = passes(scene, 40).sum(axis=(1, 2))
+    significance.assert_equal(energy, expected, error=0.009, bias=0.005)
 
 
 @pytest.mark.slow

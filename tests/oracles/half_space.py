@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial.legendre import leggauss, legvander
+from scipy.special import roots_legendre
 
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 from mitransient_lidar.physics.lidar.refraction import fresnel
@@ -83,7 +84,7 @@ def phase_moments(phase: Callable[[FloatArray], FloatArray], count: int) -> Floa
         Means of the Legendre polynomials of the cosine, shape (count,), by Gauss's rule in the logarithm of the angle
         up to 0.05 rad and in the angle beyond.
     """
-    x, w = leggauss(2000)
+    x, w = roots_legendre(2000)
     low, middle = np.log(1e-9), 0.05
     small = np.exp(low + (np.log(middle) - low) * (x + 1) / 2)
     large = middle + (np.pi - middle) * (x + 1) / 2

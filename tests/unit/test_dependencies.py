@@ -1,6 +1,6 @@
 """Packages that are imported against those that `pyproject.toml` declares."""
 
-import ast
+import re
 import sys
 
 from dependency_versions import ROOT, requirements
@@ -16,6 +16,10 @@ NOT_IMPORTED = {"karellen-llvm-core", "setuptools", "pytest-xdist"}
 OPTIONAL = {"selenium", "lazpy"}
 
 
+#: A line that imports, which takes a tenth of the time of a syntax tree to find.
+IMPORT = re.compile(r"^ *(?:import (?=[\w.]+(?: as \w+)?$)|from (?=[\w.]+ import ))(\w+)", re.MULTILINE)
+
+
 def declared(*extras):
     """Return the names of the dependencies and of those of extras, as package indices normalise them."""
     return {canonicalize_name(requirement.name) for requirement in requirements(*extras)}
@@ -25,10 +29,7 @@ def imported(*folders):
     """Return the names of the packages whose modules the Python files of folders import, at any depth of the code."""
     files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
     own = {"mitransient_lidar", *(path.stem for path in (ROOT / "tests").iterdir())}
-    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_bytes()))]
-    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    modules |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.level == 0}
-    names = {module.partition(".")[0] for module in modules} - own - sys.stdlib_module_names
+    names = {name for file in files for name in IMPORT.findall(file.read_text("utf-8"))} - own - sys.stdlib_module_names
     return {canonicalize_name(PACKAGES.get(name, name)) for name in names}
 
 

@@ -43,6 +43,7 @@ def test_help_lists_the_options_of_a_render():
         assert option in text
 
 
+@pytest.mark.slow
 def test_a_language_server_completes_options():
     for call, wanted in (("render('table1', targ", "target_error="), ("record(shot, opt", "optical_density=")):
         source = f"import mitransient_lidar\nshot = None\nmitransient_lidar.{call}"

@@ -55,10 +55,30 @@ def path(tmp_path):
 RECORD = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
 
 
-@pytest.fixture
-def store(path):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder with a new store and with a full one: all of its runs are done, with values that are fill values, too."""
+    folder = tmp_path_factory.mktemp("stores")
     renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
-    return Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
+    store = Store.create(folder / "new", renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
+    shutil.copytree(folder / "new", folder / "full")
+    full = Store(folder / "full")
+    for shard in store.shards:
+        status, errors, arrays = filled(full, shard, 0)
+        arrays["waveform"][...] = np.nan if shard else 7
+        full.write(shard, np.full_like(status, DONE), errors, arrays)
+    assert (full.status() == DONE).all()
+    return folder
+
+
+@pytest.fixture
+def store(made, path):
+    return Store(shutil.copytree(made / "new", path))
+
+
+@pytest.fixture
+def full(made, path):
+    return Store(shutil.copytree(made / "full", path))
 
 
 def filled(store, shard, value):
@@ -177,17 +197,6 @@ def test_status_is_written_last(store, path, monkeypatch):
     with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
         store.write(0, np.full_like(status, DONE), errors, arrays)
     assert not Store(path).status().any()
-
-
-@pytest.fixture
-def full(store):
-    """A store all of whose runs are done, with values that are fill values, too."""
-    for shard in store.shards:
-        status, errors, arrays = filled(store, shard, 0)
-        arrays["waveform"][...] = np.nan if shard else 7
-        store.write(shard, np.full_like(status, DONE), errors, arrays)
-    assert (store.status() == DONE).all()
-    return store
 
 
 def flip(path):

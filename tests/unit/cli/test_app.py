@@ -133,6 +133,16 @@ def test_progress_is_lines_where_there_is_no_terminal(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("quiet", [True, False])
+def test_logging_after_a_command_is_as_before_it(quiet):
+    """A quiet command once kept all later messages of the package from handlers of the program that called it."""
+    logger = logging.getLogger("mitransient_lidar")
+    before = logger.propagate, logger.level, [*logger.handlers]
+    with messages.reporting(quiet):
+        assert (logger.propagate, logger.level, len(logger.handlers)) != (*before[:2], len(before[2]))
+    assert (logger.propagate, logger.level, logger.handlers) == before
+
+
 @pytest.mark.slow
 def test_interrupted_render_is_kept(scene, calls, tmp_path):
     calls.extra["interrupted"] = 1

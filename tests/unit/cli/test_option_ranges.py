@@ -1,5 +1,6 @@
 """Ranges of numeric options: every help names one, and what lies outside is refused."""
 
+import functools
 import re
 import typing
 
@@ -10,6 +11,7 @@ from command_line import assert_refused, run
 
 from mitransient_lidar import results
 from mitransient_lidar.cli.app import app
+from mitransient_lidar.results import netcdf
 
 NUMBER = r"-?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?(?:\^\d+)?(?:/\d+)?(?: - 1)?"
 RANGE = re.compile(rf"({NUMBER}) to ({NUMBER})")
@@ -119,10 +121,13 @@ def test_help_names_the_range_of_every_number(command):
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    """File of a result of four pixels."""
+    """File of a result of four pixels; it and tables of corrections are read once, as that takes half of the time."""
     path = tmp_path_factory.mktemp("result") / "result.nc"
     results.save(synthetic_shots.result(), path)
-    return path
+    once = functools.cache(netcdf.read_netcdf)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(netcdf, "read_netcdf", lambda given: once(given).copy())
+        yield path
 
 
 @pytest.mark.parametrize("command", sorted(NEEDED))

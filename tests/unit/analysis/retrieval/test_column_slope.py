@@ -135,13 +135,13 @@ def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
 
 
 @pytest.mark.slow
-def test_the_time_leaves_out_the_widest_fields_of_view(caplog):
-    options = {"passes": 4, "seed": 1}
-    found = fov_sweep("table1", [15, 10, 20], {**SCENE, "bin_count": 110}, max_time=0.01, **options)
+def test_the_time_leaves_out_the_widest_fields_of_view(caplog, tmp_path):
+    options, scene = {"passes": 4, "seed": 1}, few_paths("table1", tmp_path)
+    found = fov_sweep(scene, [15, 10, 20], {**SCENE, "bin_count": 110}, max_time=0.01, **options)
     assert found["field_of_view"].values.tolist() == [10]
     assert found.attrs["left_out_mrad"] == "15, 20"
     assert "fields of view of 15, 20 mrad are left out" in caplog.text
-    whole = fov_sweep("table1", [10], {**SCENE, "bin_count": 110}, **options)
+    whole = fov_sweep(scene, [10], {**SCENE, "bin_count": 110}, **options)
     assert whole.attrs["left_out_mrad"] == ""
 
 

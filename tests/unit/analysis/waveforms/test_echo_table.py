@@ -29,16 +29,10 @@ DECAY = 0.035
 # At nadir from 200 m with n = n_g = 1.34: no spread over the footprint, and 0.1119 m of water a nanosecond.
 SURFACE = 2e9 * 212.84 / 299792458
 PER_NS = 0.299792458 / (2 * 1.34)
-ATTRIBUTES = {
-    "altitude": 212.84,
-    "off_nadir_deg": 0.0,
-    "refractive_index": 1.34,
-    "group_index": 1.34,
-    "pulse_fwhm_ns": 5.0,
-    "response_time_ns": 0.0,
-    "surface_time_ns": SURFACE,
-    "layout": "2x2",
-}
+ATTRIBUTES = {"altitude": 212.84, "off_nadir_deg": 0.0, "refractive_index": 1.34, "group_index": 1.34}
+ATTRIBUTES |= {"pulse_fwhm_ns": 5.0, "response_time_ns": 0.0, "surface_time_ns": SURFACE, "layout": "2x2"}
+#: Times of the surface in the pixels of `result` [ns], against the mean.
+SHIFTS = np.array([2.3, 2.1, -1.8, -2.2])
 
 
 def echo(arrival, energy):
@@ -59,7 +53,7 @@ def waveform(surface=SURFACE, bottom=70.0, target=0.0):
 
 
 def result(values=None, grid=None, **attributes):
-    values = np.stack([waveform(SURFACE + shift) for shift in (2.3, 2.1, -1.8, -2.2)]) if values is None else values
+    values = np.stack([waveform(SURFACE + shift) for shift in SHIFTS]) if values is None else values
     count = len(values)
     return results.build(
         values * DT * 1e-9,
@@ -106,11 +100,10 @@ def test_isolated_echoes_without_noise(estimator):
 
 
 def test_surface_column_target_and_bottom_of_every_pixel():
-    shifts = np.array([2.3, 2.1, -1.8, -2.2])
-    values = np.stack([waveform(SURFACE + shift, target=2e-13) for shift in shifts])
+    values = np.stack([waveform(SURFACE + shift, target=2e-13) for shift in SHIFTS])
     table = echo_table.extract(result(values))
     for name, delay in (("surface", 0), ("target", 40), ("bottom", 70)):
-        np.testing.assert_allclose(table["time_ns"].sel(echo=name), SURFACE + shifts + delay, atol=0.05)
+        np.testing.assert_allclose(table["time_ns"].sel(echo=name), SURFACE + SHIFTS + delay, atol=0.05)
     np.testing.assert_allclose(table["depth_m"].sel(echo="bottom"), 70 * PER_NS, atol=0.006)
     np.testing.assert_allclose(table["energy"].sel(echo="target"), 2e-13, rtol=0.01)
     # Half of exp(-0.035 t); at 200 m the distance takes 1 % of the decay over these depths, which is taken out.
@@ -128,10 +121,8 @@ def test_attenuation_is_along_the_path_without_the_loss_by_distance():
 
 def test_depths_from_the_mean_surface():
     table = echo_table.extract(result(), depth_from="mean")
-    np.testing.assert_allclose(table["depth_m"].sel(echo="surface") / PER_NS, [2.3, 2.1, -1.8, -2.2], atol=0.05)
-    np.testing.assert_allclose(
-        table["depth_m"].sel(echo="bottom") / PER_NS, 70 + np.array([2.3, 2.1, -1.8, -2.2]), atol=0.05
-    )
+    for name, delay in (("surface", 0), ("bottom", 70)):
+        np.testing.assert_allclose(table["depth_m"].sel(echo=name) / PER_NS, SHIFTS + delay, atol=0.05)
 
 
 def test_several_estimators_have_a_dimension_of_their_own():
@@ -216,6 +207,8 @@ def test_rows_say_why_a_depth_is_unknown():
     saturated = int(EchoFlag.SATURATED | EchoFlag.POOR_FIT)
     assert csv_tables.unknown_depth("bottom", saturated, True) == "saturated"
     assert csv_tables.unknown_depth("bottom", 0, False) == "no surface echo"
+    assert csv_tables.flag_names(0) == ""
+    assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
 
 
 def test_imager_and_blocks_give_the_same_as_pixels():
@@ -281,11 +274,7 @@ def test_a_single_record_behind_a_logarithm_is_expanded():
     one = echo_table.extract(shots.isel(shot=0, drop=True).drop_vars("signal_mean"))
     # By the noise, of which the mean is free, 0.6 %; unexpanded, by factors.
     np.testing.assert_allclose(one["energy"], both["energy"].isel(shot=0), rtol=0.1)
-
-
-def test_a_logarithm_needs_both_its_numbers():
-    shots = recorded(np.stack([waveform()]), 2, 0.01)
-    shots.attrs["receiver.logarithm.knee_v"] = 1e-3
+    del shots.attrs["receiver.logarithm.volts_per_decade"]
     with pytest.raises(UserError, match=r"no attribute receiver.logarithm.volts_per_decade"):
         echo_table.extract(shots)
 
@@ -416,8 +405,6 @@ def test_csv_and_command(tmp_path):
         (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
         (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv."),
         (["--no-table"], "--no-table leaves nothing to do"),
-        (["--layers", "9"], "layers = 9 must lie between 0 and 8"),
-        (["--threshold", "0"], "threshold = 0 must be greater than 0"),
     ],
 )
 def test_invalid_options(tmp_path, options, sentence):
@@ -435,13 +422,7 @@ def test_command_reads_what_a_receiver_recorded(tmp_path):
         found = [float(line["depth_m"]) for line in csv.DictReader(file) if line["echo"] == "bottom"]
     assert found == pytest.approx([70 * PER_NS] * 3, abs=0.05)
     shots.rename(signal="sound").to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    (tmp_path / "short.nc").write_bytes((tmp_path / "other.nc").read_bytes()[:100])
-    for name, sentence in (
-        ("other.nc", "holds neither a signal nor a waveform over time."),
-        ("short.nc", "is damaged or truncated"),
-        ("missing.nc", "No such file or directory"),
-    ):
-        assert_refused(run("waveforms", tmp_path / name), sentence)
+    assert_refused(run("waveforms", tmp_path / "other.nc"), "holds neither a signal nor a waveform over time.")
 
 
 def in_series(*shots):
@@ -484,11 +465,6 @@ def test_records_of_a_series_have_true_errors():
         )
     errors = bottoms["time_ns_stderr"].values
     assert np.nanmedian(errors[200:]) > 2 * np.nanmedian(errors[:200])
-
-
-def test_flag_names():
-    assert csv_tables.flag_names(0) == ""
-    assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
 
 
 def drop(name):
