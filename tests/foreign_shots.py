@@ -45,6 +45,8 @@ def write_foreign(shot, instrument, random, path):
     recorded = mitransient_lidar.record(shot, instrument, gain="auto", seed=int(random.integers(2**31)))
     signal = recorded["signal"].isel(shot=0)
     scale, delay = float(10 ** random.uniform(-2, 4)), float(random.uniform(-300, 1300))
+    if instrument == "usgs_eaarl_b":  # whose two channels differ in gain
+        signal = signal.isel(pixel=random.integers(2, size=1))
     counts = scale * (signal - signal.isel(time=slice(8)).median("time"))
     with path.open("w", newline="") as file:
         table = csv.writer(file)

@@ -288,7 +288,7 @@ def _check_counts(recorded: xr.Dataset) -> None:
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
     truth = recorded["true_bottom_depth_below_surface"].values
-    found = extract(recorded, list(estimators))
+    found = extract(recorded, list(estimators), targets=1)
     numbers: dict[str, Any] = dict(summarize_depths(found, truth))
     if corrections is not None:
         after = summarize_depths(correct_depths(found, corrections), truth)
@@ -320,7 +320,7 @@ def _shares(recorded: xr.Dataset, found: xr.Dataset, truth: FloatArray, bright: 
     known = np.isfinite(depth)
     hidden = np.zeros(known.shape, dtype=bool)
     if "signal_mean_stderr" in recorded and (wanted & ~known).any():
-        exact, _ = with_depth(extract(recorded.drop_vars("signal_mean_stderr"), found["estimator"].values.tolist()))
+        exact, _ = with_depth(extract(recorded.drop_vars("signal_mean_stderr"), found["estimator"].values.tolist(), targets=1))
         hidden = wanted & ~known & (np.abs(exact - truth[:, np.newaxis, np.newaxis]) < _RIGHT)
     share = np.broadcast_to(wanted, known.shape).mean(axis=0)
     of_bright = np.divide((wanted & known).mean(axis=0), share, out=np.full(share.shape, np.nan), where=share > 0)

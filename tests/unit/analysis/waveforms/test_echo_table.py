@@ -177,7 +177,7 @@ def test_a_surface_echo_within_its_error_is_not_listed():
     table = echo_table.extract(recorded(np.stack([bare, waveform()]), 200, 0.02))
     none, some = (table.sel(echo="surface").isel(pixel=pixel) for pixel in (0, 1))
     # An amplitude beyond its error by chance is listed: in 1 % of the shots.
-    unlisted = (none["flags"] & EchoFlag.NO_ECHO).values > 0
+    unlisted = (none["flags"] & EchoFlag.COLUMN_ONSET).values > 0
     assert unlisted.mean() > 0.9
     none = none.isel(shot=unlisted)
     for name in ("amplitude", "energy", "width_ns"):
