@@ -134,7 +134,9 @@ def fit(
         own = BehindBandwidth(scene) if BANDWIDTH in names else scene
         if missing := [name for name in names if name not in (start or {})]:
             raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
-        problem = WaveformFit(found, own, dict(start or {}), bounds, **options)
+        known = start or {}
+        starts = {name: known[name] for name in names} | dict(known)
+        problem = WaveformFit(found, own, starts, bounds, **options)
         problem.approach(most_renders=most_renders, until=began + limit)
         return _run(problem, began, limit, most_renders, scale_errors)
     given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)

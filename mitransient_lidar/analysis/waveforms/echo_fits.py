@@ -166,7 +166,9 @@ def gaussian_echo(
         first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
         data = replace(data, usable=data.usable & (data.u - shape.peak_ns >= first[:, np.newaxis]))
     if around is not None:
-        ends = [np.where(one >= 0, 0.5 * (one - bins) * records.bin_ns, end) for one, end in zip(around, _FAR, strict=True)]
+        ends = [
+            np.where(one >= 0, 0.5 * (one - bins) * records.bin_ns, end) for one, end in zip(around, _FAR, strict=True)
+        ]
         low, high = (end[:, np.newaxis] for end in ends)
         from_peak = data.u - shape.peak_ns
         data = replace(data, usable=data.usable & (from_peak >= low) & (from_peak <= high))

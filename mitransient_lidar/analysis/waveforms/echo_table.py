@@ -486,9 +486,7 @@ def _estimate(
         fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
         for number, (place, flag) in enumerate(places[1:], 1):
             around = found.neighbours(number)
-            fit = echo_fits.gaussian_echo(
-                records, place, width, decay, flag, shape, after=found.surface, around=around
-            )
+            fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)
             detected = np.where(place >= 0, records.time_of(place) - shape.peak_ns, np.nan)
             fits.append(fit.or_at(detected, _UNFITTED * width))
         return fits

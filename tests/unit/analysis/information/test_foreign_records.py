@@ -6,8 +6,9 @@ import xarray as xr
 from closed_form_waveform import METRES_PER_NS, SURFACE_NS
 
 import mitransient_lidar
-from mitransient_lidar.analysis.information.bandwidth import BehindBandwidth, _behind
+from mitransient_lidar.analysis.information.bandwidth import BehindBandwidth
 from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.core.errors import UserError
 
 TRUTH = {"attenuation": 0.25, "bottom_reflectance": 0.1, "bottom_depth": 6.0}
 TIME = np.arange(0.0, 150.0, 0.5)
@@ -16,6 +17,7 @@ SCALE, SHIFT = 37.0, 1300.0
 
 def rows_of(c, rho, depth):
     """Return surface echo, column and bottom echo of pulses of 3 ns [W]."""
+
     def echo(t):
         return np.exp(-0.5 * ((TIME - t) / 1.3) ** 2)
 
@@ -68,3 +70,59 @@ def test_a_shifted_and_scaled_shot_is_found_from_wrong_starts(factors, tmp_path)
     assert np.abs(z).max() < 4, z
     assert fitted["value"].sel(parameter="time_offset_ns") == pytest.approx(SHIFT, abs=0.2)
     assert fitted.attrs["probability"] > 1e-4
+
+
+def test_the_squares_of_stored_residuals_are_the_chi_squared(tmp_path):
+    """With noise of the receiver, of the user, and unknown: the last one had those of other units."""
+    path = shot(tmp_path / "shot.csv")
+    for options in ({"receiver": "riegl_vq840g"}, {"noise": 0.05}, {}):
+        fitted = fit(path, (1, 1, 1), **options)
+        assert float(np.nansum(fitted["residual"] ** 2)) == pytest.approx(fitted.attrs["chi_squared"], rel=1e-9)
+        assert int(fitted["used"].sum()) == np.isfinite(fitted["residual"]).sum()
+
+
+def test_errors_grow_with_a_misfit_and_a_bad_fit_is_refused(tmp_path):
+    """Noise stated 1.5 and 4 times too small, of the same samples: the errors are those of the noise that they have."""
+    random, light = np.random.default_rng(3), 1e6 * model(TRUTH)["waveform"].values[0]
+    path = write(tmp_path / "shot.csv", light + random.normal(0, 0.01, TIME.size), TIME)
+    right, small, smallest = (fit(path, (1, 1, 1), noise=SCALE * 0.01 / by) for by in (1, 1.5, 4))
+    np.testing.assert_allclose(small["stderr"], right["stderr"], rtol=0.15)
+    np.testing.assert_allclose(smallest["stderr"], right["stderr"], rtol=0.15)
+    assert [one.attrs["refused"] for one in (right, small, smallest)] == [0, 0, 1]
+    assert [one.attrs["converged"] for one in (right, small, smallest)] == [1, 1, 0]
+    assert any("stated errors are multiplied" in text for text in small.attrs["messages"])
+    assert any("the fit is refused: chi-squared is 1" in text for text in smallest.attrs["messages"])
+
+
+def test_a_scene_that_does_not_explain_waveforms_of_unknown_noise_is_refused(tmp_path):
+    """Two echoes of which the model has one: no noise is known, but more than a tenth of the squares is left."""
+    other = rows_of(*TRUTH.values()) + np.roll(rows_of(*TRUTH.values()), 40)
+    fitted = fit(write(tmp_path / "shot.csv", 1e6 * other, TIME), (1, 1, 1))
+    assert fitted.attrs["refused"] == 1
+    assert any("of the squares of the samples, more than 10 %" in text for text in fitted.attrs["messages"])
+
+
+def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
+    """A single pole of 80 MHz, from a start of 100 MHz: parameters and bandwidth within their errors."""
+    behind = BehindBandwidth(model)({**TRUTH, "bandwidth_mhz": 80.0})["waveform"].values[0]
+    random = np.random.default_rng(5)
+    path = write(tmp_path / "shot.csv", 1e6 * behind + random.normal(0, 0.003, TIME.size), TIME)
+    fitted = fit(path, (0.8, 1.2, 0.9), free=[*TRUTH, "bandwidth_mhz"], noise=0.003 * SCALE)
+    assert fitted.attrs["converged"]
+    truth = [*TRUTH.values(), 80.0]
+    assert np.abs((fitted["value"].values[:4] - truth) / fitted["stderr"].values[:4]).max() < 4
+    assert fitted["parameter_units"].values[3] == "MHz"
+    # Without it, the response is taken for the scene's.
+    assert fit(path, (1, 1, 1), noise=0.003 * SCALE).attrs["refused"] == 1
+    with pytest.raises(UserError, match="alternatives"):
+        fit(path, (1, 1, 1), free=[*TRUTH, "bandwidth_mhz"], receiver="apd")
+
+
+def test_volts_behind_a_logarithm_are_expanded(tmp_path):
+    recorded = detect_waveforms(model(TRUTH), "pmt_log", seed=4, gain="auto")
+    samples = recorded["signal"].values.ravel() - np.median(recorded["signal"].values.ravel()[:20])
+    rows = [f"{t + SHIFT},{v:.6g}" for t, v in zip(recorded["time"].values, samples, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["time_ns,volts", *rows]))
+    fitted = fit(tmp_path / "log.csv", (0.8, 1.2, 0.9), receiver="pmt_log")
+    z = (fitted["value"].values[:3] - list(TRUTH.values())) / fitted["stderr"].values[:3]
+    assert np.abs(z).max() < 5, z
