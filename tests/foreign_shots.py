@@ -22,7 +22,7 @@ from mitransient_lidar.studies import fit as study
 TRUTH = {"attenuation": 0.4, "bottom_reflectance": 0.1, "bottom_depth": 6.0}
 PARAMS = {"spectrum": "flat", "scattering": 0.2}
 #: Instruments with the share of their energy that is emitted: noise of the record exceeds that of the render.
-INSTRUMENTS = {"published_airborne": 0.1, "leica_chiroptera4x": 1.0, "riegl_vq840g": 1.0, "usgs_eaarl_b": 0.1}
+INSTRUMENTS = {"published_airborne": 0.1, "leica_chiroptera4x": 1.0, "riegl_vq840g": 1.0, "leica_hawkeye4x_deep": 0.1}
 #: Passes of the shots behind the records, and passes of a model and their size.
 SHOT_PASSES, MODEL_PASSES, PASS_SHARE = 64, 16, 1 / 16
 
@@ -45,8 +45,6 @@ def write_foreign(shot, instrument, random, path):
     recorded = mitransient_lidar.record(shot, instrument, gain="auto", seed=int(random.integers(2**31)))
     signal = recorded["signal"].isel(shot=0)
     scale, delay = float(10 ** random.uniform(-2, 4)), float(random.uniform(-300, 1300))
-    if instrument == "usgs_eaarl_b":  # whose two channels differ in gain
-        signal = signal.isel(pixel=random.integers(2, size=1))
     counts = scale * (signal - signal.isel(time=slice(8)).median("time"))
     with path.open("w", newline="") as file:
         table = csv.writer(file)

@@ -16,7 +16,6 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.validation import finite
 
-
 _REFUSED = 1  # exit code of a fit that is refused
 
 
@@ -81,9 +80,9 @@ def fit(
     """Fit parameters of a scene to waveforms.
 
     Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc (with
-    covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times the expected
-    one is refused: it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it prints
-    and writes (exit code 130).
+    covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times the
+    expected one is refused: it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it
+    prints and writes (exit code 130).
     """
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))

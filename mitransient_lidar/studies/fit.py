@@ -39,6 +39,7 @@ _FEWEST_PASSES, _MOST_PASSES = 16, 256  # that are chosen
 #: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
 #: their own noise to matter little, and few because each is kept.
 _BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
+_WIDEST_BIN = 0.4  # of the scene's record, in widths of the pulse, that an interpolation needs
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
 
 
@@ -218,6 +219,8 @@ class _RenderedModel:
         )
         if dataset.attrs.get("interrupted"):
             raise KeyboardInterrupt
+        if self.done == 0:
+            _warn_of_wide_bins(dataset)
         self.done += 1
         if self.progress is not None:
             self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
@@ -233,6 +236,19 @@ class _RenderedModel:
         for name, value in values.items():
             texts = with_value(texts, name, value)
         return {**self.params, **{parameter_of(name): texts[parameter_of(name)] for name in values}}
+
+
+def _warn_of_wide_bins(dataset: xr.Dataset) -> None:
+    """Warn of bins between which a waveform is not known: splines through them would err by more than its noise."""
+    width, pulse = (float(dataset.attrs.get(name, math.nan)) for name in ("bin_width_ns", "pulse_fwhm_ns"))
+    if width > _WIDEST_BIN * pulse:
+        logger.warning(
+            "bins of %g ns are too wide for pulses of %g ns: times between them are interpolated, set bin_width_ns to "
+            "%.2g or less",
+            width,
+            pulse,
+            pulse / 3,
+        )
 
 
 def _names(free: Sequence[str]) -> list[str]:

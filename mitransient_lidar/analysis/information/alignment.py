@@ -98,4 +98,5 @@ def residual_correlation(residuals: FloatArray) -> FloatArray:
 
 def _compressed(values: FloatArray) -> FloatArray:
     """Return the compressed samples of a row."""
-    return np.asarray(np.arcsinh(values / max(_COMPRESSED * float(np.max(values, initial=0.0)), 1e-300)))
+    level = max(_COMPRESSED * float(np.max(values, initial=0.0)), 1e-300)
+    return np.asarray(np.arcsinh(values / level))

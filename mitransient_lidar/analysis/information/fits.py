@@ -8,10 +8,8 @@ and at the scale of linear least squares. Positive parameters are fitted as loga
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -24,17 +22,11 @@ from mitransient_lidar.analysis.information.alignment import (
     light_duration,
     residual_correlation,
 )
-from mitransient_lidar.analysis.information.errors import (
-    NO_BATCHES,
-    Errors,
-    estimate_errors,
-    refusal_of_unknown_noise,
-    smoothed_variance,
-)
+from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.fit_table import FittedSamples, fit_table
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 
 #: A function that returns a render, with derivatives, of values of the free parameters.
@@ -124,7 +116,7 @@ class WaveformFit:
         self.values = aligned
 
     def forget(self, model: Model | None = None) -> None:
-        """Forget the renders so far, for a changed or another model; an interruption of its first one brings them back."""
+        """Forget the renders so far, for a changed or another model; an interruption of its first one restores them."""
         self.model = model or self.model
         self._former = self._kept, self._rendered
         self._kept, self._rendered = {}, None
@@ -491,68 +483,12 @@ class WaveformFit:
     ) -> xr.Dataset:
         """Return the result of `run`."""
         mean, _, by_model, noise = self._at(values)
-        weights = self._weights(values, used)
-        names = list(values)
-        found = self.found
-        residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
-        stderr = np.full(mean.shape, np.nan) if noise is None else np.sqrt(noise)
-        unexplained = 0.0
-        if noise is None:
-            unexplained = errors.chi_squared / max(float(np.nansum(found.values[weights > 0] ** 2)), 1e-300)
-            deviation = math.sqrt(errors.reduced) if errors.reduced > 0 else 1.0
-            residual, errors = residual / deviation, replace(errors, chi_squared=errors.expected)
-        refusal = errors.refusal() if noise is not None else refusal_of_unknown_noise(unexplained)
-        samples = {
-            "measured": (found.values, "measured waveform"),
-            "measured_stderr": (stderr, "standard error of the measured waveform"),
-            "fitted": (mean, "fitted waveform"),
-            "fitted_stderr": (np.sqrt(by_model), "standard error of the fitted waveform by Monte Carlo"),
-        }
-        arrays = {name: found.labelled(array, text) for name, (array, text) in samples.items()}
-        arrays["residual"] = found.labelled(residual, "measured less fitted, in standard deviations")
-        arrays["used"] = found.labelled((weights > 0).astype(np.int8), "sample that was fitted")
-        for name in ("residual", "used"):
-            arrays[name].attrs["units"] = "1"
-        vectors = {
-            "value": np.array(list(values.values())),
-            "stderr": errors.stderr,
-            "stderr_by_model": errors.by_model,
-            "start": np.array([free.start for free in self.free]),
-            "low": np.array([free.low for free in self.free]),
-            "high": np.array([free.high for free in self.free]),
-            "at_bound": errors.held.astype(np.int8),
-        }
-        matrices = {"covariance": errors.covariance, "correlation": errors.correlation}
-        units = [self.units.get(name) or unit_of(re.sub(r"\[\d+\]$", "", name)) or "1" for name in names]
+        samples = FittedSamples(mean, by_model, noise, self._weights(values, used))
         messages = [] if converged else [f"the fit has not converged in {self.renders} renders"]
-        messages += [refusal] if refusal else []
-        messages += errors.messages(names, np.array(list(values.values())))
         if self._refusal:
             messages.append(f"steps were refused, at which the fit may have ended: {self._refusal}")
-        if noise is None:
-            messages.append(
-                "the errors of the waveforms are unknown: they are taken from the residuals, whose standard deviation is "
-                f"{deviation:.3g}"
-            )
-        if found.estimated and found.batches is None and self._prediction(values).batches is None:
+        if self.found.estimated and self.found.batches is None and self._prediction(values).batches is None:
             messages.append(NO_BATCHES)
-        return xr.Dataset(
-            {
-                **{name: ("parameter", vector) for name, vector in vectors.items()},
-                **{name: (("parameter", "other_parameter"), matrix) for name, matrix in matrices.items()},
-                **arrays,
-            },
-            {"parameter": names, "other_parameter": names, "parameter_units": ("parameter", units)},
-            {
-                "chi_squared": errors.chi_squared,
-                "expected": errors.expected,
-                "freedom": errors.freedom,
-                "probability": math.nan if noise is None else errors.probability,
-                "renders": self.renders,
-                "rounds": rounds,
-                "converged": int(converged and not refusal),
-                "refused": int(bool(refusal)),
-                "interrupted": int(self.interrupted),
-                "messages": messages,
-            },
-        )
+        ending = {"renders": self.renders, "rounds": rounds, "interrupted": int(self.interrupted)}
+        table = fit_table(self.found, self.free, values, samples, errors, self.units, messages)
+        return table.assign_attrs(ending, converged=int(converged and not table.attrs["refused"]))

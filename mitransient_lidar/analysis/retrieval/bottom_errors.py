@@ -123,8 +123,8 @@ def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, Fl
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
     Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of it are not in the Gaussian
-    that is fitted to the echo. The sum of the signal about the echo, less the column before it, is all of it. The energy
-    of the Gaussian is kept where noise makes the sum less certain than 10 %, or there is no column.
+    that is fitted to the echo. The sum of the signal about the echo, less the column before it, is all of it. The
+    Gaussian counts where noise makes the sum less certain than 10 %, or there is no column.
 
     Parameters are those of `loss_error`.
     """

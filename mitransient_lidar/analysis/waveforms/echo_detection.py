@@ -343,7 +343,8 @@ def _strongest(peaks: BoolArray, excess: FloatArray, apart: float, most: int | N
 
     Each of shape (n,), -1 where there are no more; one at least, and `most` at most.
     """
-    left, bins, found = peaks.copy(), np.arange(peaks.shape[1]), []
+    left, bins = peaks.copy(), np.arange(peaks.shape[1])
+    found: list[IntArray] = []
     while not found or (left.any() and (most is None or len(found) < most)):
         place = np.where(left.any(axis=1), np.argmax(np.where(left, excess, -np.inf), axis=1), -1)
         found.append(place)
@@ -357,7 +358,8 @@ def _is_edge(
 ) -> BoolArray:
     """Return which peaks are rises of the column: behind them the signal stays above the column before, and only falls.
 
-    An echo of a Gaussian pulse has fallen to a twentieth within 0.8 reaches, others to their `tail`; between two echoes the signal rises again.
+    An echo of a Gaussian pulse has fallen to a twentieth within 0.8 reaches, others to their `tail`; between two echoes
+    the signal rises again.
     """
     edges = np.zeros_like(peaks)
     start, end = (max(round(share * reach), 1) for share in _BEHIND_EDGE)

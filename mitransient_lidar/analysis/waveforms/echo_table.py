@@ -120,8 +120,9 @@ def extract(
     -------
     xarray.Dataset
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
-        ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
-        with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of `echo_detection.EchoFlag`. Without ``echo``:
+        ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
+        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
+        `echo_detection.EchoFlag`. Without ``echo``:
         ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which
         ``depth_m_method_error`` includes. Over the dimensions of the waveforms alone: ``attenuation`` [1/m] along the
         path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``: ``layer_depth_m``,
@@ -198,8 +199,7 @@ def extract(
     0.1 to 1.8 (surface penetration), and scattered light reaches the bottom later by 0.02 to 0.1. It arrives no earlier
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo.
 
-    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction. Bins of rendered
-    waveforms are correlated: without ``error_inflation`` the errors are too small.
+    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
@@ -239,12 +239,10 @@ def echo_names(targets: int = 1) -> list[str]:
 def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, npt.NDArray[Any]]:
     """Return quantities with so many targets, of which those that are not there are unknown."""
     missing = targets + len(ECHOES) - 1 - part["flags"].shape[-1]
-    if missing <= 0:
-        return part
     filled = dict(part)
-    for name in _OF_ECHOES:
-        values, value = part[name], int(EchoFlag.NO_ECHO) if name == "flags" else np.nan
-        filled[name] = np.insert(values, [values.shape[-1] - 1] * missing, value, axis=-1)
+    for name in _OF_ECHOES if missing > 0 else ():
+        value = int(EchoFlag.NO_ECHO) if name == "flags" else np.nan
+        filled[name] = np.insert(part[name], [part[name].shape[-1] - 1] * missing, value, axis=-1)
     return filled
 
 

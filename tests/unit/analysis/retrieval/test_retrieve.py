@@ -74,12 +74,12 @@ def test_a_receiver_of_one_pixel_gives_bottom_and_water():
 
 
 def test_the_tail_of_a_bottom_counts_and_its_focusing_does_not():
-    """A tail of 6 % behind the echo, in which the Gaussian has less than 1 %, and waves that make all 1.2 times brighter."""
+    """A tail of 6 % behind the echo, of which the Gaussian has less than 1 %, and waves that focus light."""
     shot = on_axis()
     plain = float(retrieve.bottom(shot, LEVEL)["reflectance"][0])
     delay = 2 * N * DEPTH / COS_WATER / C0
     energy = float(retrieve.bottom(shot, LEVEL)["bottom_energy"]) / 4
-    tail = 0.06 * energy * 1e9 * np.where(TIME > SURFACE + delay, np.exp(-(TIME - SURFACE - delay) / 8) / 8, 0)
+    tail = 0.06 * energy * 1e9 * np.where(SURFACE + delay < TIME, np.exp(-(TIME - SURFACE - delay) / 8) / 8, 0)
     longer = retrieve.bottom(result(shot["waveform"].values + tail), LEVEL)
     assert float(longer["reflectance"][0]) == pytest.approx(1.06 * plain, rel=0.01)
     waves = on_axis().assign_attrs(wave_focusing=[1.2, 1.2], wave_focusing_depths=[0.01, 1.0])
