@@ -150,8 +150,7 @@ def extract(
     targets and bottoms below 3 standard errors as ``poor_fit``, and surfaces as ``column_onset``: their time is that of
     the column's onset, as of all beyond 60 degrees from nadir. They have neither amplitude nor width.
 
-    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the time that is clipped.
-
+    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time.
     ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of the record's trigger and clocks, which
     cancels where the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for
     ``gaussian`` the typical error by scattered light that arrives later, by the light's distribution in the pixel,
@@ -228,7 +227,7 @@ class _Settings:
     layers: int
     depth_from: str
     iterations: int
-    targets: int | None = None
+    targets: int | None
 
 
 def echo_names(targets: int = 1) -> list[str]:
@@ -266,7 +265,6 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     # The column begins where the tail of the surface echo has ended.
     tail = max(1.75 * width, waveforms.template.tail_ns(_TAIL) + width - waveforms.template.fwhm_ns)
     start = np.where(surface >= 0, time[surface] + tail, np.nan)
-    # Of several targets, the column ends at the first.
     later = np.where(found.bins[1:] >= 0, found.bins[1:], time.size).min(axis=0)
     following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
@@ -431,8 +429,7 @@ def _label(
     coords: dict[str, Any] = {
         str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)
     }
-    names = echo_names(table["flags"].shape[-1] - len(ECHOES) + 1)
-    coords["echo"] = ("echo", names, {"long_name": "kind of echo"})
+    coords["echo"] = ("echo", echo_names(table["flags"].shape[-1] - 3), {"long_name": "kind of echo"})
     if several:
         coords["estimator"] = ("estimator", list(settings.estimators), {"long_name": "estimator of the echo's time"})
     provenance = {
