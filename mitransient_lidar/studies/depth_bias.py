@@ -320,9 +320,7 @@ def _shares(recorded: xr.Dataset, found: xr.Dataset, truth: FloatArray, bright: 
     known = np.isfinite(depth)
     hidden = np.zeros(known.shape, dtype=bool)
     if "signal_mean_stderr" in recorded and (wanted & ~known).any():
-        exact, _ = with_depth(
-            extract(recorded.drop_vars("signal_mean_stderr"), found["estimator"].values.tolist(), targets=1)
-        )
+        exact, _ = with_depth(extract(recorded.drop_vars("signal_mean_stderr"), found["estimator"].values.tolist()))
         hidden = wanted & ~known & (np.abs(exact - truth[:, np.newaxis, np.newaxis]) < _RIGHT)
     share = np.broadcast_to(wanted, known.shape).mean(axis=0)
     of_bright = np.divide((wanted & known).mean(axis=0), share, out=np.full(share.shape, np.nan), where=share > 0)
