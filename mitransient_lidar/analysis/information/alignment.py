@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -90,7 +91,7 @@ def residual_correlation(residuals: FloatArray) -> FloatArray:
     found = [1.0]
     for lag in range(1, min(_MOST_LAGS, residuals.shape[-1] // 4)):
         value = float(np.sum(residuals[:, lag:] * residuals[:, :-lag])) / max(total, 1e-300)
-        if value < 2 / np.sqrt(max(count, 1)):
+        if value < 2 / math.sqrt(max(count, 1)):
             break
         found.append(value)
     return np.array(found)

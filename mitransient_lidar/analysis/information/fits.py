@@ -134,7 +134,7 @@ class WaveformFit:
             As for `run`, which has one render left at least.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000) - 1, until
-        blurs = (0.0,)
+        blurs: tuple[float, ...] = (0.0,)
         if TIME_OFFSET in self.nuisances:
             model = self._prediction(self.values)
             blurs = tuple(share * light_duration(model.time_ns, model.mean) for share in _BLURS)

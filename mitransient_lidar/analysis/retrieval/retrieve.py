@@ -307,7 +307,10 @@ def bottom(
     unknown = np.full(np.shape(time), np.nan)
     depths = np.stack(np.broadcast_arrays(*depth, unknown), axis=-1)
     depth_errors = np.where(np.isfinite(depths), np.stack(np.broadcast_arrays(*depth_error, unknown), axis=-1), np.nan)
-    applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, False)}
+    applied: dict[str, tuple[Any, Any]] = {
+        "reflectance": (slope_corrected, column_corrected),
+        "depth": (depth_corrected, False),
+    }
     for name, (by_slope, by_column) in applied.items():
         steps = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
         found[f"{name}_corrected"] = ((*dims, "correction"), steps, {"long_name": f"correction of the {name} applied"})
