@@ -350,7 +350,6 @@ def _with_depths(
         own = found.own.ravel()
         flags = table["flags"][:, number, 0]
         flags |= np.where((own | np.isnan(measured)) & ~dark, 0, int(EchoFlag.NO_SURFACE_LIGHT))
-        # Without a distinct echo, the onset of the column gives the time.
         absent = np.isnan(measured) | ~own
         faint |= absent
         flags |= np.where(absent, int(EchoFlag.NO_ECHO), np.where(faint, int(EchoFlag.COLUMN_ONSET), 0))
@@ -376,7 +375,8 @@ def _with_depths(
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
-    of_surface = np.array([index == 0 if from_mean else index > 0 for index in range(time.shape[-1])])
+    of_onset = (table["flags"] & int(EchoFlag.COLUMN_ONSET)) > 0
+    of_surface = of_onset | ((np.arange(time.shape[-1]) > 0) != from_mean)
     method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
     table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)
     if "layer_time_ns" in table:
