@@ -87,11 +87,11 @@ def residual_correlation(residuals: FloatArray) -> FloatArray:
 
     It holds the correlation of unknown noise and what neighbours share of a misfit.
     """
-    total, count = float(np.sum(residuals**2)), np.count_nonzero(residuals)
+    total, count = float(np.sum(residuals**2)), max(int(np.count_nonzero(residuals)), 1)
     found = [1.0]
     for lag in range(1, min(_MOST_LAGS, residuals.shape[-1] // 4)):
         value = float(np.sum(residuals[:, lag:] * residuals[:, :-lag])) / max(total, 1e-300)
-        if value < 2 / math.sqrt(max(count, 1)):
+        if value < 2 / math.sqrt(count):
             break
         found.append(value)
     return np.array(found)
