@@ -108,7 +108,7 @@ def without_bottom(store: Path, data: xr.Dataset) -> tuple[np.ndarray, np.ndarra
         result = template.assign(waveform=(template["waveform"].dims, power[np.newaxis]))
         # Seeds that no run of the campaign has.
         record = detect_waveforms(result, "apd", seed=2**40 + int(run), gain=float(gain))
-        echoes = extract(record).isel(shot=0)
+        echoes = extract(record, targets=1).isel(shot=0)
         signals.append(record["signal"].values[0])
         times.append(found_times(echoes["flags"].values, echoes["time_ns"].values))
     return np.array(signals), np.array(times)

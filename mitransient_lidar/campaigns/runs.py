@@ -259,7 +259,7 @@ class RunRenderer:
             for name, values in _truth(series).items():
                 yield name, Array(tuple(map(str, values.dims)), values.values, dict(values.attrs))
         if "echoes" in keep:
-            echoes = extract(series if recorded is None else recorded)
+            echoes = extract(series if recorded is None else recorded, targets=1)
             for kind, values in echoes.data_vars.items():
                 array = np.asarray(values, dtype=np.int16 if kind == "flags" else np.float32)
                 yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, _plain(values.attrs))

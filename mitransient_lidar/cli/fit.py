@@ -16,6 +16,8 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.validation import finite
 
+_REFUSED = 1  # exit code of a fit that is refused
+
 
 def fit(
     file: Annotated[
@@ -25,7 +27,10 @@ def fit(
             help="Result or recorded signal (.nc, .exr), or a CSV file with the column time_ns and one for each pixel.",
         ),
     ],
-    free: Annotated[str, typer.Option(metavar="NAME,NAME,...", help="Free parameters of the scene.")],
+    free: Annotated[
+        str,
+        typer.Option(metavar="NAME,NAME,...", help="Free parameters of the scene, and bandwidth_mhz of a receiver."),
+    ],
     scene: Annotated[
         str | None, typer.Option(help="Name or XML file of the scene; by default that of the result.")
     ] = None,
@@ -50,7 +55,11 @@ def fit(
         typer.Option(help="Standard deviation of every sample, in the unit of the waveforms, greater than 0."),
     ] = None,
     receiver: Annotated[
-        str | None, typer.Option(help="Receiver of a signal, by default the one that it names.")
+        str | None,
+        typer.Option(
+            help="Receiver of a signal, by default the one that it names. Of a CSV file, the one whose response and "
+            "noise the model gets: a preset, an instrument or a .toml file."
+        ),
     ] = None,
     scale_errors: Annotated[
         bool, typer.Option("--scale-errors", help="Multiply the covariance by the reduced chi-squared.")
@@ -71,7 +80,8 @@ def fit(
     """Fit parameters of a scene to waveforms.
 
     Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc (with
-    covariance, fitted waveform and residuals), fit.csv and fit.png. Ctrl-C ends the fit at its last step, which it
+    covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times the
+    expected one is refused: it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it
     prints and writes (exit code 130).
     """
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
@@ -111,6 +121,8 @@ def fit(
             plot_fit(fitted, targets[2])
     typer.echo("\n".join(study.describe_fit(fitted)))
     exit_if_interrupted(fitted)
+    if fitted.attrs["refused"]:
+        raise typer.Exit(_REFUSED)
 
 
 def _pairs(option: str, given: list[str] | None) -> dict[str, str]:

@@ -214,7 +214,9 @@ class FlightRenderer:
         series, later = self._render(inputs, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         recorded = record(series, self.plan, inputs)
-        echoes = extract(self._with_turned_pixels(recorded, inputs) if turned else recorded, self.plan.estimator)
+        echoes = extract(
+            self._with_turned_pixels(recorded, inputs) if turned else recorded, self.plan.estimator, targets=1
+        )
         pixels = recorded.sizes["pixel"]
         start = float(recorded.attrs["time_start_ns"]) + later
         about = {"units": "ns", "long_name": "time of the start of the first sample after the pulse"}

@@ -303,7 +303,7 @@ def _check_counts(recorded: xr.Dataset) -> None:
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
     truth = recorded["true_bottom_depth_below_surface"].values
-    found = extract(recorded, list(estimators))
+    found = extract(recorded, list(estimators), targets=1)
     numbers: dict[str, Any] = dict(summarize_depths(found, truth))
     if corrections is not None:
         after = summarize_depths(correct_depths(found, corrections), truth)

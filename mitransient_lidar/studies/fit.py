@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.fits import WaveformFit
+from mitransient_lidar.analysis.information.bandwidth import (
+    BANDWIDTH,
+    BANDWIDTH_BOUNDS,
+    BANDWIDTH_START,
+    BehindBandwidth,
+)
+from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
@@ -33,6 +39,7 @@ _FEWEST_PASSES, _MOST_PASSES = 16, 256  # that are chosen
 #: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
 #: their own noise to matter little, and few because each is kept.
 _BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
+_WIDEST_BIN = 0.4  # of the scene's record, in widths of the pulse, that an interpolation needs
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
 
 
@@ -67,7 +74,7 @@ def fit(
         for values of the free parameters (`analysis.information.fits.WaveformFit`).
     free
         Names of the free parameters, such as ``attenuation``, ``attenuation[1]`` of the second layer, or
-        ``bottom_reflectance``.
+        ``bottom_reflectance``; and ``bandwidth_mhz``, the half-power frequency of a receiver with a single pole [MHz].
     params, instrument
         Other values of the scene's parameters, and instrument that replaces its lidar; see `rendering.render.render`.
     start
@@ -80,7 +87,8 @@ def fit(
     noise
         Standard deviation of every sample, above 0, in the unit of the waveforms, instead of their own errors.
     receiver
-        Receiver of a recorded signal, by default the one that it names.
+        Receiver of a recorded signal, by default the one that it names; or of a CSV file, whose response and noise the
+        model gets (`analysis.information.measured.measured`).
     scale_errors
         Whether to multiply the covariance by the reduced chi-squared.
     passes
@@ -117,25 +125,41 @@ def fit(
 
         source = results.open(source, signals=True)
     found = measured(source, noise=noise, receiver=receiver)
+    if BANDWIDTH in names:
+        if found.receiver is not None:
+            raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
+        start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
+        bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
     options: dict[str, Any] = {"free_scale": free_scale, "free_time": free_time}
     if callable(scene):
+        own = BehindBandwidth(scene) if BANDWIDTH in names else scene
         if missing := [name for name in names if name not in (start or {})]:
             raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
-        problem = WaveformFit(found, scene, dict(start or {}), bounds, **options)
+        known = start or {}
+        starts = {name: known[name] for name in names} | dict(known)
+        problem = WaveformFit(found, own, starts, bounds, **options)
         problem.approach(most_renders=most_renders, until=began + limit)
         return _run(problem, began, limit, most_renders, scale_errors)
     given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)
     attributes = source.attrs if isinstance(source, xr.Dataset) else {}
     coarse = min(given or _FEWEST_PASSES, _COARSE_PASSES)
     model = _RenderedModel(
-        _scene(scene, attributes), params, instrument, names, coarse, _seed(seed, attributes), progress
+        _scene(scene, attributes),
+        params,
+        instrument,
+        [name for name in names if name != BANDWIDTH],
+        coarse,
+        _seed(seed, attributes),
+        progress,
     )
     starts = {**model.starts(start or {}), **(start or {})}
-    problem = WaveformFit(found, model, starts, bounds, **options)
+    light: Model = BehindBandwidth(model) if BANDWIDTH in names else model
+    problem = WaveformFit(found, light, starts, bounds, **options)
     problem.approach(most_renders=most_renders, until=began + limit)
     if time.perf_counter() - began < limit and not problem.interrupted:
         model.passes = given or _passes(problem.noise_ratio())
-        problem.forget()
+        light = BehindBandwidth(model) if BANDWIDTH in names else model
+        problem.forget(light)
     fitted = _run(problem, began, limit, most_renders, scale_errors)
     return fitted.assign_attrs({"scene": model.name, "passes": model.passes, "seed": model.seed})
 
@@ -195,6 +219,8 @@ class _RenderedModel:
         )
         if dataset.attrs.get("interrupted"):
             raise KeyboardInterrupt
+        if self.done == 0:
+            _warn_of_wide_bins(dataset)
         self.done += 1
         if self.progress is not None:
             self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
@@ -210,6 +236,19 @@ class _RenderedModel:
         for name, value in values.items():
             texts = with_value(texts, name, value)
         return {**self.params, **{parameter_of(name): texts[parameter_of(name)] for name in values}}
+
+
+def _warn_of_wide_bins(dataset: xr.Dataset) -> None:
+    """Warn of bins between which a waveform is not known: splines through them would err by more than its noise."""
+    width, pulse = (float(dataset.attrs.get(name, math.nan)) for name in ("bin_width_ns", "pulse_fwhm_ns"))
+    if width > _WIDEST_BIN * pulse:
+        logger.warning(
+            "bins of %g ns are too wide for pulses of %g ns: times between them are interpolated, set bin_width_ns to "
+            "%.2g or less",
+            width,
+            pulse,
+            pulse / 3,
+        )
 
 
 def _names(free: Sequence[str]) -> list[str]:

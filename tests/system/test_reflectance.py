@@ -64,9 +64,8 @@ def shot(lidar_scene):
 def test_reflectance_within_its_error(tx, rx, shot):
     """Within one stated error, a sixth to a fifth of the reflectance.
 
-    It is mostly that of the method, and much the same in all cases: they gave 0.132 to 0.153, within 0.002 of which
-    other passes come. Of a whole aperture the second would be 0.096, without gaps the third 0.058, and with a Gaussian
-    beam in the middle of the view that off axis 0.072.
+    It is mostly that of the method. Of a whole aperture the second would be 0.096, without gaps the third 0.058,
+    and with a Gaussian beam in the middle of the view that off axis 0.072.
     """
     found = retrieve.bottom(shot(tx, rx), LEVEL).sel(correction="level")
     value, error = float(found["reflectance"]), float(found["reflectance_stderr"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,9 @@ NO_BATCHES = (
     "stated errors are too small: errors of a render agree over its whole record, and neither the waveforms nor the "
     "model have batches of passes, which show this"
 )
+#: Chi-squared over its mean above which a fit is refused; for unknown noise, the residuals' share of the squares.
+WORST_CHI_SQUARED, WORST_UNEXPLAINED = 5.0, 0.1
+_UNLIKELY = 1e-3  # probability of a larger chi-squared below which there is a misfit
 _SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combination of parameters is unknown
 
 
@@ -70,9 +73,32 @@ class Errors:
 
         return float(chi2.sf(self.reduced * self.freedom, self.freedom))
 
+    @property
+    def is_misfit(self) -> bool:
+        """Whether chi-squared is larger than chance allows."""
+        return self.reduced > 1 and self.probability < _UNLIKELY
+
+    def grown_with_misfit(self) -> Errors:
+        """Return errors whose covariance is multiplied by the reduced chi-squared if there is a misfit."""
+        return replace(self, covariance=self.covariance * self.reduced) if self.is_misfit else self
+
+    def refusal(self) -> str:
+        """Return why the scene does not explain waveforms of known noise, empty if it does."""
+        if not self.reduced > WORST_CHI_SQUARED:
+            return ""
+        return (
+            f"the fit is refused: chi-squared is {self.reduced:.3g} times the expected one, more than "
+            f"{WORST_CHI_SQUARED:g}. Start from other values, or check scene, receiver and noise"
+        )
+
     def messages(self, names: Sequence[str], values: FloatArray) -> list[str]:
         """Return sentences on parameters that the waveforms do not determine."""
         found = []
+        if self.is_misfit and self.reduced <= WORST_CHI_SQUARED:
+            found.append(
+                f"chi-squared is {self.reduced:.3g} times the expected one: scene or noise are not those of the "
+                "waveforms, and the stated errors are multiplied by its root"
+            )
         for name, value, influence, held in zip(names, values, self.influence, self.held, strict=True):
             if held:
                 found.append(
@@ -190,6 +216,16 @@ def estimate_errors(
     by_model[known] = np.sqrt(np.maximum(np.diag(parts[1]), 0)) / influence[known]
     freedom = 2 * expected**2 / variance if variance > 0 else math.nan
     return Errors(covariance, by_model, influence, held, chi_squared, expected, freedom)
+
+
+def refusal_of_unknown_noise(unexplained: float) -> str:
+    """Return why a scene that leaves a share of the squares of the samples does not explain them, empty if it does."""
+    if unexplained <= WORST_UNEXPLAINED:
+        return ""
+    return (
+        f"the fit is refused: its residuals have {100 * unexplained:.3g} % of the squares of the samples, more than "
+        f"{100 * WORST_UNEXPLAINED:g} %. Start from other values, or check scene and receiver"
+    )
 
 
 def smoothed_variance(variance: FloatArray) -> FloatArray:

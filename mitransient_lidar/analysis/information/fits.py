@@ -8,7 +8,6 @@ and at the scale of linear least squares. Positive parameters are fitted as loga
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -17,11 +16,17 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.analysis.information.alignment import (
+    Misfit,
+    best_offset,
+    light_duration,
+    residual_correlation,
+)
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.fit_table import FittedSamples, fit_table
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET, free_parameters
-from mitransient_lidar.analysis.information.measured import Measured, Misfit, Prediction, best_offset, predict
+from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 
 #: A function that returns a render, with derivatives, of values of the free parameters.
@@ -35,6 +40,9 @@ _TOLERANCE, _COARSE_TOLERANCE = 1e-3, 0.03  # relative change of the sum of squa
 _CONDITION = 1e6  # of correlations of parameters, above which their inverse is not used
 _RELATIVE_ERROR = 0.1  # of every sample while a fit approaches the solution
 _UNKNOWN_ERROR = 0.01  # standard deviation in place of unknown ones then, over the largest sample
+#: Standard deviations of the filters under which waveforms of unknown time approach a model, over its light's duration.
+_BLURS = (0.15, 0.04, 0.0)
+_DARK = 0.01  # of the largest sample of a model, below which it is dark beyond an end of its record
 _DIGITS = 12  # of values that are rendered: logarithms and back change the last ones
 
 
@@ -89,7 +97,7 @@ class WaveformFit:
             raise UserError(f"start of {fixed[0]}: it is fixed")
         if not self.names:
             raise UserError("free = '' must name at least one parameter of the scene")
-        if found.receiver is not None and self.nuisances:
+        if found.receiver is not None and found.calibrated and self.nuisances:
             raise UserError(f"{self.nuisances[0]} of a recorded signal is that of its receiver: it cannot be free")
         # Invalid starts and bounds are refused before the first render.
         later = {name: 1.0 for name in self.nuisances if name not in starts}
@@ -102,12 +110,14 @@ class WaveformFit:
         # The last accepted step that was rendered, and why others were not tried.
         self._rendered: _Rendered | None = None
         self._refusal, self._exhausted, self.interrupted = "", False, False
+        self._blur_ns = 0.0
         aligned = self._align({name: float(value) for name, value in starts.items()})
         self.free = free_parameters(aligned, bounds)
         self.values = aligned
 
-    def forget(self) -> None:
-        """Forget the renders so far, after a change of the model; an interruption of the first one brings them back."""
+    def forget(self, model: Model | None = None) -> None:
+        """Forget the renders so far, for a changed or another model; an interruption of its first one restores them."""
+        self.model = model or self.model
         self._former = self._kept, self._rendered
         self._kept, self._rendered = {}, None
 
@@ -124,6 +134,18 @@ class WaveformFit:
             As for `run`, which has one render left at least.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000) - 1, until
+        blurs: tuple[float, ...] = (0.0,)
+        if TIME_OFFSET in self.nuisances:
+            model = self._prediction(self.values)
+            blurs = tuple(share * light_duration(model.time_ns, model.mean) for share in _BLURS)
+        for self._blur_ns in blurs:
+            found = self._approached()
+            # Without time for another render, the last one is what is left.
+            self.values = self._rendered.values if self._is_over and self._rendered is not None else found
+        self._blur_ns = 0.0
+
+    def _approached(self) -> dict[str, float]:
+        """Return the solution of least squares of logarithms from `values`, after a filter if waveforms are blurred."""
         used = self._used(self.values)
         mean, _, by_model, noise = self._at(self.values)
         largest = float(np.abs(self.found.values[used]).max())
@@ -132,11 +154,13 @@ class WaveformFit:
         softening = np.sqrt(np.where(known, variance, 1.0))
         # Samples that are in the noise on one side alone say little: their logarithms are far from linear.
         darker = np.minimum(np.abs(np.nan_to_num(self.found.values)), np.abs(mean))
+        if self._blur_ns:
+            darker = np.abs(mean)
         relative = (variance + smoothed_variance(by_model)) / (darker**2 + softening**2)
         weights = np.where(known, 1 / np.sqrt(relative + _RELATIVE_ERROR**2), 0.0)
-        found = self._solution(self.values, Misfit(weights, softening), used, _COARSE_TOLERANCE)
-        # Without time for another render, the last one is what is left.
-        self.values = self._rendered.values if self._is_over and self._rendered is not None else found
+        step = float(np.median(np.diff(self.found.time_ns)))
+        misfit = Misfit(weights, softening, self._blur_ns / step)
+        return self._solution(self.values, misfit, used, _COARSE_TOLERANCE)
 
     def noise_ratio(self) -> float:
         """Return the variance of the model's Monte Carlo over that of the waveforms, at `values`.
@@ -170,8 +194,9 @@ class WaveformFit:
             ``measured``, ``measured_stderr``, ``fitted``, ``fitted_stderr`` (Monte Carlo of the model), ``residual`` in
             standard deviations of both, and ``used`` (1 for samples that were fitted). Attributes: ``chi_squared``,
             its mean ``expected`` and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger
-            one, ``renders``, ``rounds``, ``converged``, ``interrupted`` (1 after Ctrl-C), and ``messages``, sentences
-            on what the waveforms do not determine.
+            one, ``renders``, ``rounds``, ``converged``, ``refused`` (1 where the scene does not explain the waveforms),
+            ``interrupted`` (1 after Ctrl-C), and ``messages``, sentences on what the waveforms do not determine. The
+            squares of ``residual`` add up to ``chi_squared``.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         self._rendered, self._exhausted = None, False
@@ -251,7 +276,7 @@ class WaveformFit:
             return False
         change = np.array([values[name] - last.values[name] for name in values])
         bent = sum(
-            influence * step**2 / values[free.name]
+            influence * step**2 / max(values[free.name], 1e-300)
             for free, influence, step in zip(self.free, last.influence, change, strict=True)
             if free.is_logarithm
         )
@@ -275,19 +300,18 @@ class WaveformFit:
         model = self._prediction(values)
         scale, times = values.get(SCALE, 1.0), self._model_times(values)
         mean, slopes = (self._resampled(values, array) for array in (model.mean, model.derivative))
-        by_model, noise = (
-            None if variance is None else model.interpolated(times, variance)
-            for variance in (model.model_variance, model.noise_variance)
-        )
-        assert by_model is not None
+        by_model = model.interpolated(times, model.model_variance, outside=0.0)
+        noise = None if model.noise_variance is None else model.interpolated(times, model.noise_variance)
         rows = dict(zip(self.names, scale * slopes, strict=True)) | {SCALE: mean}
         if TIME_OFFSET in values:
             rows[TIME_OFFSET] = -scale * self._resampled(values, model.mean, order=1)
         derivative = np.array([rows[name] for name in values])
         if self.found.stderr is not None:
             noise = np.nan_to_num(self.found.stderr) ** 2
-        elif noise is not None and self.found.render_variance is not None:
-            noise = noise + self.found.render_variance
+        elif noise is not None:
+            noise = scale**2 * noise
+            for other in (self.found.render_variance, self.found.rounding):
+                noise = noise if other is None else noise + other
         return scale * mean, derivative, scale**2 * by_model, noise
 
     def _model_times(self, values: Mapping[str, float]) -> FloatArray:
@@ -314,7 +338,11 @@ class WaveformFit:
         times = self._model_times(values)
         margin = self._window(model) if TIME_OFFSET in values else 0.0
         rounding = 1e-6 * float(model.time_ns[1] - model.time_ns[0]) if model.time_ns.size > 1 else 0.0
-        inside = (times >= model.time_ns[0] + margin - rounding) & (times <= model.time_ns[-1] - margin + rounding)
+        # Where a record begins or ends in the dark, it is dark beyond, too.
+        dark = [bool(np.all(model.mean[:, end] < _DARK * model.mean.max())) for end in (0, -1)]
+        first = model.time_ns[0] + (-margin if dark[0] else margin)
+        last = model.time_ns[-1] + (2 * margin if dark[1] and self._blur_ns else -margin)
+        inside = (times >= first - rounding) & (times <= last + rounding)
         known = np.isfinite(self.found.values)
         if self.found.stderr is not None:
             known &= np.isfinite(self.found.stderr)
@@ -369,7 +397,7 @@ class WaveformFit:
     def _jacobian(self, x: FloatArray, misfit: Misfit, used: BoolArray) -> FloatArray:
         values = self._named(x)
         mean, derivative, _, noise = self._at(values)
-        slopes = np.asarray((misfit.slope(mean) * derivative)[:, used].T)
+        slopes = misfit.slopes(mean, derivative)[:, used].T
         if (rendered := self._kept.get(self._key(values))) is not None:
             scaled = slopes
             if misfit.softening is None and noise is None:
@@ -388,8 +416,13 @@ class WaveformFit:
         return {free.name: free.value(float(one)) for free, one in zip(self.free, x, strict=True)}
 
     def _narrow(self, ends: tuple[FloatArray, FloatArray], values: Mapping[str, float]) -> None:
-        """Narrow the bounds of the time offset to those that the samples in use allow."""
+        """Narrow the bounds of the time offset to those that the samples in use allow, and those of blurred echoes."""
         for index, free in enumerate(self.free):
+            if self._blur_ns and free.is_logarithm and free.name != SCALE:
+                # Blurred echoes hardly tell some parameters, which would run away.
+                at = free.internal(values[free.name])
+                ends[0][index] = max(ends[0][index], at - 1)
+                ends[1][index] = min(ends[1][index], at + 1)
             if free.name == TIME_OFFSET:
                 margin = self._window(self._prediction(values))
                 ends[0][index] = max(ends[0][index], values[TIME_OFFSET] - margin)
@@ -397,13 +430,15 @@ class WaveformFit:
 
     def _window(self, model: Prediction) -> float:
         """Return the largest change of the time offset in a round [ns]."""
-        return _WINDOW * float(model.time_ns[-1] - model.time_ns[0]) / max(model.time_ns.size - 1, 1)
+        bins = _WINDOW * float(model.time_ns[-1] - model.time_ns[0]) / max(model.time_ns.size - 1, 1)
+        return max(bins, 2 * self._blur_ns)
 
     def _align(self, starts: dict[str, float]) -> dict[str, float]:
         """Return the starts with those of the time offset and of the scale, which follow from the first render."""
         values = np.nan_to_num(self.found.values)
         if TIME_OFFSET in self.nuisances and TIME_OFFSET not in starts:
-            starts[TIME_OFFSET] = best_offset(self.found.time_ns, values, self._prediction(starts))
+            model = self._prediction(starts)
+            starts[TIME_OFFSET] = best_offset(self.found.time_ns, values, model.time_ns, model.mean)
         if SCALE in self.nuisances and SCALE not in starts:
             mean, _, _, noise = self._at({**starts, SCALE: 1.0})
             starts[SCALE] = self.found.best_scale(mean, noise)
@@ -423,10 +458,14 @@ class WaveformFit:
         recorded = self.found.render_variance
         if noise is not None and recorded is not None:
             noise = noise - recorded
-        return estimate_errors(
-            weights * (np.nan_to_num(self.found.values) - mean),
+        residuals = weights * (np.nan_to_num(self.found.values) - mean)
+        alike = self.found.correlation
+        if not self.found.calibrated and self.found.receiver is None:
+            alike = residual_correlation(residuals)
+        errors = estimate_errors(
+            residuals,
             weights * derivative,
-            (weights if noise is None else weights * np.sqrt(noise), self.found.correlation),
+            (weights if noise is None else weights * np.sqrt(noise), alike),
             (weights * np.sqrt(by_model), lags),
             np.array([free.is_bound(values[free.name]) for free in self.free]),
             scale_errors,
@@ -435,65 +474,21 @@ class WaveformFit:
             borrows=self.found.estimated,
             recorded=None if recorded is None else weights * np.sqrt(recorded),
         )
+        if noise is None or scale_errors or self.found.estimated:
+            return errors
+        return errors.grown_with_misfit()
 
     def _dataset(
         self, values: Mapping[str, float], used: BoolArray, errors: Errors, rounds: int, converged: bool
     ) -> xr.Dataset:
         """Return the result of `run`."""
         mean, _, by_model, noise = self._at(values)
-        weights = self._weights(values, used)
-        names = list(values)
-        found = self.found
-        residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
-        stderr = np.full(mean.shape, np.nan) if noise is None else np.sqrt(noise)
-        if noise is None:
-            residual = residual / math.sqrt(errors.reduced) if errors.reduced > 0 else residual
-        samples = {
-            "measured": (found.values, "measured waveform"),
-            "measured_stderr": (stderr, "standard error of the measured waveform"),
-            "fitted": (mean, "fitted waveform"),
-            "fitted_stderr": (np.sqrt(by_model), "standard error of the fitted waveform by Monte Carlo"),
-        }
-        arrays = {name: found.labelled(array, text) for name, (array, text) in samples.items()}
-        arrays["residual"] = found.labelled(residual, "measured less fitted, in standard deviations")
-        arrays["used"] = found.labelled((weights > 0).astype(np.int8), "sample that was fitted")
-        for name in ("residual", "used"):
-            arrays[name].attrs["units"] = "1"
-        vectors = {
-            "value": np.array(list(values.values())),
-            "stderr": errors.stderr,
-            "stderr_by_model": errors.by_model,
-            "start": np.array([free.start for free in self.free]),
-            "low": np.array([free.low for free in self.free]),
-            "high": np.array([free.high for free in self.free]),
-            "at_bound": errors.held.astype(np.int8),
-        }
-        matrices = {"covariance": errors.covariance, "correlation": errors.correlation}
-        units = [self.units.get(name) or unit_of(re.sub(r"\[\d+\]$", "", name)) or "1" for name in names]
+        samples = FittedSamples(mean, by_model, noise, self._weights(values, used))
         messages = [] if converged else [f"the fit has not converged in {self.renders} renders"]
-        messages += errors.messages(names, np.array(list(values.values())))
         if self._refusal:
             messages.append(f"steps were refused, at which the fit may have ended: {self._refusal}")
-        if noise is None:
-            messages.append("the errors of the waveforms are unknown: they are taken from the residuals")
-        if found.estimated and found.batches is None and self._prediction(values).batches is None:
+        if self.found.estimated and self.found.batches is None and self._prediction(values).batches is None:
             messages.append(NO_BATCHES)
-        return xr.Dataset(
-            {
-                **{name: ("parameter", vector) for name, vector in vectors.items()},
-                **{name: (("parameter", "other_parameter"), matrix) for name, matrix in matrices.items()},
-                **arrays,
-            },
-            {"parameter": names, "other_parameter": names, "parameter_units": ("parameter", units)},
-            {
-                "chi_squared": errors.chi_squared,
-                "expected": errors.expected,
-                "freedom": errors.freedom,
-                "probability": math.nan if noise is None else errors.probability,
-                "renders": self.renders,
-                "rounds": rounds,
-                "converged": int(converged),
-                "interrupted": int(self.interrupted),
-                "messages": messages,
-            },
-        )
+        ending = {"renders": self.renders, "rounds": rounds, "interrupted": int(self.interrupted)}
+        table = fit_table(self.found, self.free, values, samples, errors, self.units, messages)
+        return table.assign_attrs(ending, converged=int(converged and not table.attrs["refused"]))

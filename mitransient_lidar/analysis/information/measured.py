@@ -19,8 +19,10 @@ from mitransient_lidar.analysis.information.errors import smoothed_variance
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, positive, shown
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
@@ -36,6 +38,7 @@ class ReceiverSettings:
     chains: tuple[ReceiverChain, ...]
     optical_densities: FloatArray
     backgrounds: FloatArray
+    above_dark: bool = False  #: Whether the level without light has been subtracted.
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Measured:
     render_variance
         Variance of the render that a signal is a record of, which `stderr` and the receiver's noise leave out, shape
         (pixel, time); None without one.
+    rounding
+        Variance of the samples of a table with a receiver by its converter, shape (pixel, time); None without one.
     estimated
         Whether `stderr` is from the spread of a few passes.
     batches
@@ -78,6 +83,7 @@ class Measured:
     estimated: bool = False
     batches: FloatArray | None = None
     render_variance: FloatArray | None = None
+    rounding: FloatArray | None = None
 
     @property
     def pixel_dims(self) -> tuple[str, ...]:
@@ -119,29 +125,12 @@ class Prediction(NamedTuple):
     correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
     batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
 
-    def interpolated(self, times: FloatArray, values: FloatArray) -> FloatArray:
-        """Return rows of values, shape (pixel, time), at other times: linear between its own ones, and 0 outside."""
-        return np.array([np.interp(times, self.time_ns, row, left=0.0, right=0.0) for row in values])
+    def interpolated(self, times: FloatArray, values: FloatArray, outside: float | None = None) -> FloatArray:
+        """Return rows of values, shape (pixel, time), at other times, linear between its own ones.
 
-
-class Misfit(NamedTuple):
-    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
-
-    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening).
-    """
-
-    weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
-    softening: FloatArray | None = None  #: In the unit of the waveforms, above 0, shape (pixel, time).
-
-    def of(self, mean: FloatArray, values: FloatArray) -> FloatArray:
-        """Return the differences, shape (pixel, time)."""
-        if self.softening is None:
-            return self.weights * (mean - values)
-        return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
-
-    def slope(self, mean: FloatArray) -> FloatArray:
-        """Return the change of the differences with the mean, shape (pixel, time)."""
-        return self.weights if self.softening is None else self.weights / np.hypot(mean, self.softening)
+        Outside they are those of the ends, or another value.
+        """
+        return np.array([np.interp(times, self.time_ns, row, left=outside, right=outside) for row in values])
 
 
 def measured(
@@ -161,7 +150,9 @@ def measured(
     noise
         Standard deviation of every sample of waveforms, above 0 and in their unit, instead of their own.
     receiver
-        Receiver of a signal, as of `detect_waveforms`; by default the one that its attributes name.
+        Receiver of a signal, as of `detect_waveforms`; by default the one that its attributes name. Of a table, the
+        receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. Behind a logarithm,
+        samples are volts, which are expanded; limits and rounding are taken from the samples.
 
     Raises
     ------
@@ -177,10 +168,11 @@ def measured(
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")
         return _of_signal(source, receiver)
-    if receiver is not None:
-        raise UserError("receiver is that of a recorded signal, and the waveforms are none: leave it out")
     if not isinstance(source, xr.Dataset):
-        return _with_noise(_read_csv(Path(source)), given)
+        table = _with_noise(_read_csv(Path(source)), given)
+        return table if receiver is None else _behind(table, receiver_named(receiver))
+    if receiver is not None:
+        raise UserError("receiver is that of a signal or a table, and these waveforms are light [W]: leave it out")
     dims = results.record_dims(source, "waveform")
     values = _by_pixel(source["waveform"], dims)
     stderr = _by_pixel(source["waveform_stderr"], dims) if "waveform_stderr" in source else None
@@ -256,14 +248,16 @@ def _recorded(
         steps = reach[:, pixel] * slopes[:, pixel]
         own = light[pixel : pixel + 1]
         deviations = np.zeros((0, own.size)) if batches is None else batches[:, pixel]
-        lit = np.concatenate([own, own + error[pixel], own + steps, own - steps, own + deviations])
+        dark = np.zeros_like(own)
+        lit = np.concatenate([own, own + error[pixel], own + steps, own - steps, own + deviations, dark])
         expected = chain.expected(filtered * np.maximum(lit, 0), width, np.full(len(lit), background))
         count = len(steps)
         rise = expected.mean[2 : 2 + count] - expected.mean[2 + count : 2 + 2 * count]
         slope = np.divide(rise, 2 * reach[:, pixel], out=np.zeros_like(rise), where=reach[:, pixel] > 0)
         noise = _noise_of_mean(expected.variance[0], chain.digitiser, shots)
-        one = expected.mean[0], slope, (expected.mean[1] - expected.mean[0]) ** 2, noise
-        moved = expected.mean[2 + 2 * count :] - expected.mean[0]
+        level = expected.mean[-1] if receiver.above_dark else 0.0
+        one = expected.mean[0] - level, slope, (expected.mean[1] - expected.mean[0]) ** 2, noise
+        moved = expected.mean[2 + 2 * count : -1] - expected.mean[0]
         parts.append((*one, expected.saturation[0] < _SATURATED, moved))
     mean, slope, by_model, variance, valid, moved = zip(*parts, strict=True)
     stride = receiver.chains[0].stride(width)
@@ -294,18 +288,6 @@ def _noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int
     terms = np.arange(1, _TERMS + 1)
     alike = np.exp(-np.multiply.outer(exponent, terms**2)) @ (1 / terms**2)
     return np.asarray(np.maximum(variance / shots, step / (2 * np.pi**2) * alike))
-
-
-def best_offset(times: FloatArray, values: npt.ArrayLike, model: Prediction) -> float:
-    """Return the time [ns] that waveforms, shape (pixel, time), are later than a model, by their correlation."""
-    step = float(np.median(np.diff(model.time_ns)))
-    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
-    total: FloatArray | float = 0.0
-    for row, mean in zip(np.asarray(values), model.mean, strict=True):
-        sampled = np.interp(grid, times, row)
-        total = total + np.correlate(sampled, mean, "full")
-    lag = int(np.argmax(total)) - (model.time_ns.size - 1)
-    return float(grid[0] + lag * step - model.time_ns[0])
 
 
 def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:
@@ -379,6 +361,45 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
         shots=shots,
         render_variance=of_render,
     )
+
+
+def _behind(table: Measured, receiver: ReceiverChannels) -> Measured:
+    """Return waveforms of a table with their receiver, as samples that are linear in the light, above the dark level.
+
+    Rounding is that of the smallest difference of two samples.
+    """
+    pixels = [str(name) for name in table.template["pixel"].values]
+    given = [receiver.of(pixel).chain for pixel in pixels]
+    values, stderr = table.values, table.stderr
+    if (logarithm := given[0].logarithm) is not None:
+        stderr = None if stderr is None else stderr * logarithm.expansion(values)
+        values = logarithm.expand(values)
+    chains = tuple(_linear(chain) for chain in given)
+    step = float(np.median(np.diff(table.time_ns)))
+    rounding = np.zeros_like(values)
+    if given[0].digitiser is not None and logarithm is None:
+        for row, samples in zip(rounding, values, strict=True):
+            codes = np.unique(samples[np.isfinite(samples)])
+            row += float(np.min(np.diff(codes), initial=np.inf)) ** 2 / 12 if codes.size > 1 else 0.0
+    return replace(
+        table,
+        values=values,
+        stderr=stderr,
+        correlation=_response_correlation(chains[0], step, table.time_ns.size),
+        template=table.template.copy(data=values),
+        receiver=ReceiverSettings(chains, np.zeros(len(chains)), np.zeros(len(chains)), above_dark=True),
+        render_variance=None,
+        rounding=rounding,
+    )
+
+
+def _linear(chain: ReceiverChain) -> ReceiverChain:
+    """Return a chain without limits, logarithm and converter."""
+    amplifier = chain.amplifier and replace(chain.amplifier, limit_v=None, recovery_ns=None)
+    detector = chain.detector
+    if isinstance(detector, LinearDetector):
+        detector = replace(detector, largest_current_ma=math.inf)
+    return replace(chain, detector=detector, amplifier=amplifier, logarithm=None, digitiser=None, jitter=None)
 
 
 def _response_correlation(chain: ReceiverChain, step_ns: float, count: int) -> FloatArray:

@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
+from mitransient_lidar.analysis.waveforms.column_onset import Focusing
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
@@ -27,10 +28,15 @@ LARGEST_ERROR = 0.5
 LEAST_SHARE = 0.05
 
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
-_OF_ECHO = 0.05  # relative error of the energy of the bottom echo: light scattered forwards arrives later, in its tail
+_OF_ECHO = 0.03  # relative error of the energy of the bottom echo with its tail
+#: Optical depth of both ways by which light of the bottom loses more than the column's decay says, and its error: light
+#: that the water scatters twice by large angles joins the column within its first metres, and its decay is slower.
+COLUMN_GAIN, _OF_COLUMN_GAIN = 0.035, 0.04
+_AROUND = (2.0, 4.0)  # echo widths before and behind a bottom echo whose light counts
 _OF_LOSS = 0.05  # relative error of the optical depth of both ways: the bottom's light decays unlike the column's
 _UNTESTED = 0.15  # the same for a column that is too short to be tested for layers
 _DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
+_CERTAIN = 0.1  # relative error of a sum by noise above which a fit counts
 _WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
 _FOCUSING = 0.45  # relative deviation of the light at the bottom by waves over the deviation of the sea's slopes
 _GRID, _REACH = 128, 4.0  # points along each side of a beam, and half of its side in standard deviations
@@ -103,19 +109,54 @@ def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
     waveforms = Waveforms.from_dataset(summed, None, None, None, None)
     rows = slice(0, waveforms.count)
     time, width = waveforms.records(rows).time_ns, waveforms.echo_fwhm_ns
-    start, middle, level = (
-        echoes[name].sel(echo=echo).values.reshape(-1, 1)
-        for name, echo in (("time_ns", "surface"), ("time_ns", "bottom"), ("amplitude", "column"))
-    )
-    metres = 2 * waveforms.geometry.metres_per_ns
-    decay = echoes["attenuation"].values.reshape(-1, 1) * metres
+    start, middle = (echoes["time_ns"].sel(echo=name).values.reshape(-1, 1) for name in ("surface", "bottom"))
     inside = (time > np.maximum(middle - _WINDOW[0] * width, start + width)) & (time < middle - _WINDOW[1] * width)
-    column = level * waveforms.gain(rows) * np.exp(-decay * (time - start))
+    column = _column_of(waveforms, time, echoes)
     power = waveforms.records(rows).power
     measured, fitted = (np.sum(np.where(inside & np.isfinite(column), one, 0), axis=1) for one in (power, column))
     known = (measured > 0) & (fitted > 0)
     ratio = np.divide(measured, fitted, out=np.ones_like(measured), where=known)
     return np.where(known, np.log(ratio), np.nan).reshape(echoes["attenuation"].shape)
+
+
+def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, FloatArray]:
+    """Return the energies of bottom echoes with their tails, and their errors by noise [J].
+
+    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of it are not in the Gaussian
+    that is fitted to the echo. The sum of the signal about the echo, less the column before it, is all of it. The
+    Gaussian counts where noise makes the sum less certain than 10 %, or there is no column.
+
+    Parameters are those of `loss_error`.
+    """
+    waveforms = Waveforms.from_dataset(summed, None, None, None, None)
+    rows = slice(0, waveforms.count)
+    records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
+    middle, energy, error = (echoes[name].sel(echo="bottom").values for name in ("time_ns", "energy", "energy_stderr"))
+    from_echo = records.time_ns - middle.reshape(-1, 1)
+    inside = (from_echo > -_AROUND[0] * width) & (from_echo < _AROUND[1] * width)
+    column = np.where(from_echo < 0, _column_of(waveforms, records.time_ns, echoes), 0)
+    seconds = 1e-9 * records.bin_ns
+    total = seconds * np.sum(np.where(inside, records.power - column, 0), axis=1).reshape(energy.shape)
+    noise = np.where(inside, np.broadcast_to(records.noise, inside.shape), 0)
+    of_total = seconds * np.sqrt(np.sum(noise**2, axis=1)).reshape(energy.shape)
+    better = np.isfinite(total) & (of_total < _CERTAIN * total)
+    return np.where(better, total, energy), np.where(better, of_total, error)
+
+
+def _column_of(waveforms: Waveforms, time: FloatArray, echoes: xr.Dataset) -> FloatArray:
+    """Return the columns that were fitted to waveforms, extrapolated to all times, shape (waveforms, time)."""
+    start, level = (
+        echoes[name].sel(echo=echo).values.reshape(-1, 1)
+        for name, echo in (("time_ns", "surface"), ("amplitude", "column"))
+    )
+    decay = echoes["attenuation"].values.reshape(-1, 1) * 2 * waveforms.geometry.metres_per_ns
+    return np.asarray(level * waveforms.gain(slice(0, waveforms.count)) * np.exp(-decay * (time - start)))
+
+
+def focusing_at(dataset: xr.Dataset, depth: FloatArray) -> FloatArray:
+    """Return the mean factor by which waves focus light at depths [m] as a result states it, 1 without them."""
+    known = Focusing.from_attributes(dataset.attrs)
+    return np.ones_like(depth) if known is None else np.where(np.isfinite(depth), known.at(np.nan_to_num(depth)), 1.0)
 
 
 def slope_variance(attributes: Mapping[str, Any]) -> float:
@@ -173,7 +214,7 @@ def sea_variances(
 
 def echo_error(energy: FloatArray, stderr: FloatArray) -> FloatArray:
     """Return the relative error of the energies of bottom echoes by noise and by the method."""
-    return np.hypot(_OF_ECHO, np.nan_to_num(stderr / energy))
+    return np.hypot(math.hypot(_OF_ECHO, _OF_COLUMN_GAIN), np.nan_to_num(stderr / energy))
 
 
 def target_flags(

@@ -30,7 +30,7 @@ MULTIPLE_SCATTERING = 1.13
 METHOD_ERROR = 0.1
 
 #: bb/b of particles: the typical one, and a range that includes those of most natural waters.
-BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.03)
+BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.05)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def water_of_column(
     scattered by 8 %. The beam must be narrower than the field of view, and the column homogeneous.
 
     c is ill-posed: the signal hardly depends on forward scattering. The estimate is a + bw + (bb - bw/2)/r, with the
-    scattering bw of sea water at 532 nm, for particles of r = 0.0183 (Petzold's average particle), 0.03 and 0.003. The
+    scattering bw of sea water at 532 nm, for particles of r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The
     waters of `water_types` have 0.0033 (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
     """
     diameter = in_range("spot_diameter", spot_diameter, SMALLEST_SPOT, np.inf)

@@ -233,7 +233,10 @@ def bottom(
     flags, hidden = bottom_errors.target_flags(echoes, dataset.attrs, margin, one_place="shot" not in echoes.dims)
     seabed, column = (echoes.sel(echo=name) for name in ("bottom", "column"))
     seabed = seabed.where(xr.DataArray(flags & ReflectanceFlag.TARGET == 0, dims=seabed["time_ns"].dims))
-    time, energy = seabed["time_ns"].values, seabed["energy"].values
+    time = seabed["time_ns"].values
+    whole, by_noise = bottom_errors.whole_energy(summed, echoes)
+    missing = np.isnan(time)
+    energy, energy_error = np.where(missing, np.nan, whole), np.where(missing, np.nan, by_noise)
     along, across = (np.nan_to_num(slopes[f"slope_{name}"].values) for name in ("along", "across"))
     known_range = slopes["surface_range"].values
     ranges = np.where(np.isfinite(known_range), known_range, lidar.slant_range)
@@ -263,9 +266,11 @@ def bottom(
     depth_error = [level_error, np.where(depth_corrected, np.sqrt(others + by_estimate), level_error)]
     received = system.energy * system.aperture_area * share
     reflectance = []
+    # Waves focus the light of the bottom as they do that of the column.
+    light = energy * math.exp(bottom_errors.COLUMN_GAIN) / bottom_errors.focusing_at(dataset, depth[0])
     for distance, path, one in surfaces:
         gain = bottom_gain(distance, np.nan_to_num(path), lidar.refractive_index, one)
-        reflectance.append(np.pi * energy * np.exp(2 * mean_attenuation * path) / (received * gain))
+        reflectance.append(np.pi * light * np.exp(2 * mean_attenuation * path) / (received * gain))
     slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
     backscatter = _mean(power / share) / system.column_gain
@@ -273,10 +278,10 @@ def bottom(
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
     vertical = np.where(slope_corrected, ray.cos_vertical, level.cos_vertical)
-    ratio = column_retrieval.bottom_reflectance(energy, at_bottom, backscatter, vertical, lidar.group_index)
-    of_echo = bottom_errors.echo_error(energy, seabed["energy_stderr"].values)
+    ratio = column_retrieval.bottom_reflectance(light, at_bottom, backscatter, vertical, lidar.group_index)
+    of_echo = bottom_errors.echo_error(energy, energy_error)
     of_decay = 2 * delay * lidar.metres_per_ns * echoes["attenuation_stderr"].values
-    parts = (seabed["energy_stderr"].values / energy, column["amplitude_stderr"].values / power, of_decay)
+    parts = (energy_error / energy, column["amplitude_stderr"].values / power, of_decay)
     relative = np.sqrt(sum(np.nan_to_num(part) ** 2 for part in parts))
     column_corrected = np.isfinite(ratio) & (relative < _scatter(reflectance[1])) & _steadier(ratio, reflectance[1])
     reflectance.append(np.where(column_corrected, ratio, np.where(np.isfinite(ratio), reflectance[1], np.nan)))
@@ -303,7 +308,10 @@ def bottom(
     unknown = np.full(np.shape(time), np.nan)
     depths = np.stack(np.broadcast_arrays(*depth, unknown), axis=-1)
     depth_errors = np.where(np.isfinite(depths), np.stack(np.broadcast_arrays(*depth_error, unknown), axis=-1), np.nan)
-    applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, False)}
+    applied: dict[str, tuple[Any, Any]] = {
+        "reflectance": (slope_corrected, column_corrected),
+        "depth": (depth_corrected, False),
+    }
     for name, (by_slope, by_column) in applied.items():
         steps = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
         found[f"{name}_corrected"] = ((*dims, "correction"), steps, {"long_name": f"correction of the {name} applied"})
@@ -409,13 +417,16 @@ def retrieve(
 
     The arguments and errors are those of these functions. If no quantity can be estimated, `UserError` is raised.
     """
-    slopes = surface_slopes(
-        dataset,
-        wind_speed=wind_speed,
-        wind_direction_deg=wind_direction_deg,
-        slope_deviation=slope_deviation,
-        efficiency=efficiency,
-    )
+    if "pixel" in dataset.dims and dataset.sizes["pixel"] == 1:
+        slopes = _unknown_slopes(dataset)
+    else:
+        slopes = surface_slopes(
+            dataset,
+            wind_speed=wind_speed,
+            wind_direction_deg=wind_direction_deg,
+            slope_deviation=slope_deviation,
+            efficiency=efficiency,
+        )
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
     spot = spot_diameter(dataset.attrs)
     if spot >= column_retrieval.SMALLEST_SPOT:
@@ -425,6 +436,28 @@ def retrieve(
     if not any(np.isfinite(found[name]).any() for name in measured if name in found):
         raise UserError("nothing can be estimated: no waveform has a surface echo, a column or a bottom echo")
     return found
+
+
+def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the table of `surface_slopes` of a single pixel, which shows the height of the surface alone."""
+    lidar = lidar_geometry(dataset.attrs)
+    echoes = echo_table.extract(dataset, targets=1).isel(pixel=0)
+    time, by_noise, by_method = (echoes[f"surface_time_ns{end}"].values for end in ("", "_stderr", "_method_error"))
+    distance, error = (0.5e-9 * C0 * one for one in (time, np.hypot(by_noise, by_method)))
+    unknown, cosine = np.full(np.shape(time), np.nan), math.cos(lidar.off_nadir)
+    names = ("slope_along", "slope_across", "slope_deg", "slope_direction_deg", "plane_misfit")
+    table = {name: (unknown, "", "not observable with one pixel") for name in names}
+    table |= {f"{name}_stderr": (unknown, "1", "not observable with one pixel") for name in names[:2]}
+    table |= {
+        "surface_range": (distance, "m", "distance to the surface along the axis"),
+        "surface_range_stderr": (error, "m", "standard error of the distance"),
+        "surface_height": (lidar.height - distance * cosine, "m", "height of the surface above the mean sea level"),
+        "surface_height_stderr": (error * cosine, "m", "standard error of the height"),
+        "slope_refused": (np.zeros(np.shape(time)), "1", "1 where a slope is steeper than the sea"),
+    }
+    prior = [float(one) for one in surface_inputs.largest_deviations(dataset)]
+    found = _labelled(dataset, table, np.shape(time))
+    return found.assign_attrs(slope_method="no times of other pixels", slope_prior_deviation=prior)
 
 
 def _summed(dataset: xr.Dataset) -> xr.Dataset:

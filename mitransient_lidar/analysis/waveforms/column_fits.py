@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray, Records
+from mitransient_lidar.analysis.waveforms.echo_detection import (
+    BoolArray,
+    Echoes,
+    EchoFlag,
+    IntArray,
+    Records,
+    error_of_sums,
+)
 from mitransient_lidar.core.validation import FloatArray, integer, non_negative
 
 _FEWEST = 8  # bins of a column's fit
@@ -88,6 +95,36 @@ def column_fit(
     numbers = [level, level * errors[:, 0], rate, errors[:, 1], correlation, residual]
     level, level_error, rate, rate_error, correlation, residual = (np.where(known, one, np.nan) for one in numbers)
     return ColumnFit(level, level_error, rate, rate_error, correlation, residual, np.where(known, count, 0))
+
+
+def column_echoes(records: Records, column: ColumnFit, start: FloatArray, end: FloatArray, delay: FloatArray) -> Echoes:
+    """Return the columns between two times as echoes, with their level at a delay [ns] from the fits' reference."""
+    known = np.isfinite(column.level)
+    inside = (records.time_ns >= start[:, np.newaxis]) & (records.time_ns <= end[:, np.newaxis])
+    power, noise = np.where(inside, records.power, 0), np.where(inside, records.noise, 0)
+    total = np.sum(power, axis=1)
+    safe = np.where(known & (total > 0), total, 1.0)
+    seconds = records.bin_ns * 1e-9
+    time = np.sum(power * records.time_ns, axis=1) / safe
+    time_error = error_of_sums(noise * (records.time_ns - time[:, np.newaxis]), None, records.shared) / safe
+    level = column.level * np.exp(-column.decay * delay)
+    relative = column.level_stderr / column.level
+    mixed = 2 * column.correlation * relative * delay * column.decay_stderr
+    level_error = level * np.sqrt(np.maximum(relative**2 + (delay * column.decay_stderr) ** 2 - mixed, 0))
+    # A column that does not decay has no width.
+    decay = np.where(column.decay > 0, column.decay, np.nan)
+    half = np.log(2) / decay
+    return Echoes(
+        time,
+        level,
+        total * seconds,
+        half,
+        time_error,
+        level_error,
+        error_of_sums(noise, None, records.shared) * seconds,
+        half * column.decay_stderr / decay,
+        np.where(known, 0, int(EchoFlag.NO_ECHO)),
+    ).known_only(known)
 
 
 def _normal(

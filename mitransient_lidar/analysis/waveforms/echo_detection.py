@@ -26,6 +26,9 @@ _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
 _GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
+_BEHIND_EDGE, _STAYS = (0.8, 1.2), 0.15  # reaches behind an edge, and the share of its rise that is left there
+_LEAST_COLUMN = 0.1  # column before an edge, relative to the peak
+BEHIND_EDGE = _BEHIND_EDGE[0] * _REACH  #: Echo widths behind a peak from which on an edge is told by the signal.
 GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
 
 
@@ -39,12 +42,13 @@ class EchoFlag(IntFlag):
     POOR_FIT = 16  # too few usable samples, a fit that has not converged, or one with a doubtful amplitude
     SCATTERED_LIGHT = 64  # the beam does not light the pixel: the light has been scattered, and the depth is too large
     FEW_EVENTS = 128  # no higher than single events of the detector, such as dark counts: may be noise
+    COLUMN_ONSET = 256  # a surface without an echo of its own, whose time is that of the column's onset
     NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's
 
 
 def has_echo(flags: IntArray) -> BoolArray:
-    """Return where flags do not include `EchoFlag.NO_ECHO`."""
-    return np.asarray((flags & int(EchoFlag.NO_ECHO)) == 0)
+    """Return where there is an echo of its own: where flags include neither `NO_ECHO` nor `COLUMN_ONSET`."""
+    return np.asarray((flags & int(EchoFlag.NO_ECHO | EchoFlag.COLUMN_ONSET)) == 0)
 
 
 @dataclass(frozen=True)
@@ -183,15 +187,26 @@ def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> Float
 
 @dataclass(frozen=True)
 class DetectedEchoes:
-    """Surface, target and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`."""
+    """Surface, targets and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`.
 
-    bins: IntArray  #: Shape (3, n).
-    flags: IntArray  #: Shape (3, n).
+    The first target is the strongest one, and others follow by strength.
+    """
+
+    bins: IntArray  #: Shape (2 + targets, n), with a target at least.
+    flags: IntArray  #: Of the same shape.
 
     @property
     def surface(self) -> IntArray:
         """Bins of the surface peaks, shape (n,)."""
         return np.asarray(self.bins[0])
+
+    def neighbours(self, echo: int) -> tuple[IntArray, IntArray]:
+        """Return the bins of the last echo before and of the first one behind an echo, -1 without one, shape (n,)."""
+        others = np.delete(self.bins, echo, axis=0)
+        own, known = self.bins[echo], others >= 0
+        before = np.max(np.where(known & (others < own), others, -1), axis=0)
+        behind = np.min(np.where(known & (others > own), others, np.iinfo(np.intp).max), axis=0)
+        return before, np.where(behind < np.iinfo(np.intp).max, behind, -1)
 
 
 @dataclass(frozen=True)
@@ -216,6 +231,12 @@ class Echoes:
         """Return the echoes with NaN where they are not known."""
         numbers = {name: np.where(known, value, np.nan) for name, value in vars(self).items() if name != "flags"}
         return replace(self, **numbers)
+
+    def or_at(self, time_ns: FloatArray, error_ns: float) -> Echoes:
+        """Return the echoes with other times and an error of these [ns] where they have none."""
+        lacking = np.isnan(self.time_ns) & np.isfinite(time_ns)
+        error = np.where(lacking, error_ns, self.time_stderr)
+        return replace(self, time_ns=np.where(lacking, time_ns, self.time_ns), time_stderr=error)
 
     def delayed(self, delay_ns: float) -> Echoes:
         """Return the echoes with a delay [ns] added to their times."""
@@ -248,6 +269,8 @@ def find_echoes(
     latest_ns: npt.ArrayLike = np.inf,
     event_height: npt.ArrayLike = 0.0,
     waves: bool = False,
+    targets: int | None = None,
+    tail: float = 0.0,
 ) -> DetectedEchoes:
     """Find surface, target and bottom.
 
@@ -255,8 +278,10 @@ def find_echoes(
     signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and sqrt(w(t-d) w(t+d)),
     interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
     the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
-    Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
-    strongest before it a target; peaks below a fiftieth of the strongest are ignored. Waves focus the light of a shot,
+    Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, those
+    before it are targets; peaks below a fiftieth of the strongest are ignored, and of peaks less than an echo width
+    apart the strongest counts. Behind the upper edge of a turbid layer the signal does not fall back to the column
+    above it: such a rise is no echo. Waves focus the light of a shot,
     so that its column has peaks: below them, targets rise above the column by at least half of it, and near the surface
     also of the column behind them.
 
@@ -279,6 +304,10 @@ def find_echoes(
         Height that single events of the detector reach. Lower peaks count only where there is no higher one.
     waves : bool
         Whether the light has passed waves.
+    targets : int, optional
+        Largest number of targets of a record, at least 1; all by default.
+    tail : float
+        Signal of an ideal echo `BEHIND_EDGE` echo widths behind its peak, relative to the peak.
 
     Raises
     ------
@@ -317,6 +346,7 @@ def find_echoes(
         # The factor accounts for the noise of the samples of the column.
         own[(own <= 1.5 * threshold * noise) | (own <= contrast * power)] = -np.inf
         peaks, excess = peaks | np.isfinite(own), np.maximum(excess, own)
+    peaks &= ~_is_edge(power, noise, peaks & beyond, reach, threshold, tail)
     # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
 
@@ -330,15 +360,57 @@ def find_echoes(
         around = np.maximum(power - rise, _column_behind(power, noise, reach))
         level = np.where(bins <= near_until, around, column)
         before &= power - level > _FOCUSED * level
-    target = np.where(before.any(axis=1), np.argmax(np.where(before, excess, -np.inf), axis=1), -1)
-    places = np.stack([surface, target, bottom])
+    chosen = _strongest(before, excess, apart, targets)
+    places = np.stack([surface, *chosen, bottom])
     flags = np.where(places < 0, int(EchoFlag.NO_ECHO), 0)
     flags[1:] |= np.where((places[1:] >= 0) & ~strong.any(axis=1), int(EchoFlag.FEW_EVENTS), 0)
-    for first, second in combinations(range(3), 2):
-        near = (places[first] >= 0) & (places[second] >= 0) & (places[second] - places[first] < apart)
+    for first, second in combinations(range(len(places)), 2):
+        near = (places[first] >= 0) & (places[second] >= 0) & (np.abs(places[second] - places[first]) < apart)
         flags[[first, second]] |= np.where(near, int(EchoFlag.MERGED), 0)
-    flags[[0, 2]] |= np.where(_hides_bottom(records, power, width, surface) & (bottom < 0), int(EchoFlag.MERGED), 0)
+    flags[[0, -1]] |= np.where(_hides_bottom(records, power, width, surface) & (bottom < 0), int(EchoFlag.MERGED), 0)
     return DetectedEchoes(places, flags)
+
+
+def _strongest(peaks: BoolArray, excess: FloatArray, apart: float, most: int | None) -> list[IntArray]:
+    """Return the bins of peaks, the strongest first, without those less than `apart` from a stronger one.
+
+    Each of shape (n,), -1 where there are no more; one at least, and `most` at most.
+    """
+    left, bins = peaks.copy(), np.arange(peaks.shape[1])
+    found: list[IntArray] = []
+    while not found or (left.any() and (most is None or len(found) < most)):
+        place = np.where(left.any(axis=1), np.argmax(np.where(left, excess, -np.inf), axis=1), -1)
+        found.append(place)
+        left &= np.abs(bins - place[:, np.newaxis]) >= apart
+        left &= (place >= 0)[:, np.newaxis]
+    return found
+
+
+def _is_edge(
+    power: FloatArray, noise: FloatArray, peaks: BoolArray, reach: int, threshold: float, tail: float
+) -> BoolArray:
+    """Return which peaks are rises of the column: behind them the signal stays above the column before, and only falls.
+
+    An echo of a Gaussian pulse has fallen to a twentieth within 0.8 reaches, others to their `tail`; between two echoes
+    the signal rises again.
+    """
+    edges = np.zeros_like(peaks)
+    start, end = (max(round(share * reach), 1) for share in _BEHIND_EDGE)
+    rows, places = np.nonzero(peaks)
+    inside = (places >= 2 * reach) & (places + end < power.shape[1])
+    rows, places = rows[inside], places[inside]
+    before, earlier = (np.maximum(power[rows, places - lag], 0) for lag in (reach, 2 * reach))
+    falls_by = np.divide(before, earlier, out=np.ones_like(before), where=earlier > before)
+    lags = np.arange(end + 1)
+    column = before[:, np.newaxis] * falls_by[:, np.newaxis] ** (1 + lags / reach)
+    behind = power[rows[:, np.newaxis], places[:, np.newaxis] + lags]
+    error = np.broadcast_to(noise, power.shape)[rows, places]
+    above = behind - column
+    stays = above[:, start:].min(axis=1) > np.maximum(max(_STAYS, 2 * tail) * above[:, 0], 1.5 * threshold * error)
+    falls = np.diff(behind, axis=1).max(axis=1) <= threshold * error
+    dark = before < np.maximum(_LEAST_COLUMN * behind[:, 0], threshold * error)
+    edges[rows, places] = stays & falls & ~dark
+    return edges
 
 
 def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed: BoolArray) -> IntArray:

@@ -25,6 +25,7 @@ _FAINT = 0.1  # first guess of the height of a surface whose column is brighter,
 _RISE = 0.5  # level of the column that its rise crosses
 _BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
 _WEAK = 0.3  # first guess of the height of a surface without such a peak, in levels of the column
+_FAR = (-np.inf, np.inf)
 _CLOSE = 0.5  # least distance from the earliest time of a surface that a fit may find, in echo widths
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
@@ -150,18 +151,27 @@ def gaussian_echo(
     shape: EchoShape,
     *,
     after: IntArray | None = None,
+    around: tuple[IntArray, IntArray] | None = None,
 ) -> Echoes:
     """Fit an echo at which the column ends.
 
     The model is A E(u) plus a column exp(-k u) with one level before and another one behind the echo and a step between
     them that is blurred like the echo. It is fitted from two echo widths before the peak to one and a half after it,
-    without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,). The other
-    arguments are those of `gaussian_surface`.
+    without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,), and nearer to
+    the echoes before and behind it in the bins `around`, each of shape (n,) and -1 without one. The other arguments are
+    those of `gaussian_surface`.
     """
     data = _Data.of(records, bins, width, decay, (-2, 1.5), shape)
     if after is not None:
         first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
         data = replace(data, usable=data.usable & (data.u - shape.peak_ns >= first[:, np.newaxis]))
+    if around is not None:
+        ends = [
+            np.where(one >= 0, 0.5 * (one - bins) * records.bin_ns, end) for one, end in zip(around, _FAR, strict=True)
+        ]
+        low, high = (end[:, np.newaxis] for end in ends)
+        from_peak = data.u - shape.peak_ns
+        data = replace(data, usable=data.usable & (from_peak >= low) & (from_peak <= high))
     peak = data.peak()
     early = np.argmax(data.usable, axis=1)
     before = np.maximum(np.take_along_axis(data.power, early[:, np.newaxis], axis=1)[:, 0], 0)

@@ -74,6 +74,10 @@ class Template:
         top = np.flatnonzero(self.power >= self.power.max() * (1 - 1e-9))
         return float(0.5 * (self.time_ns[top[0]] + self.time_ns[top[-1]]))
 
+    def share_behind(self, delay_ns: float) -> float:
+        """Return the power a delay [ns] behind the peak, relative to the peak."""
+        return float(np.interp(self.peak_ns + delay_ns, self.time_ns, self.power, right=0.0) / self.power.max())
+
     def rise(self, level: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the time [ns] at which the edge crosses a level (0 to 1, of the peak), and its derivative."""
         edge = slice(0, int(np.argmax(self.power)) + 1)

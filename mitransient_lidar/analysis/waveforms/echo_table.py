@@ -11,14 +11,14 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms import deconvolution, echo_estimators, echo_fits
-from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_fit
+from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_echoes, column_fit
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_detection import (
+    BEHIND_EDGE,
     DetectedEchoes,
     Echoes,
     EchoFlag,
     Records,
-    error_of_sums,
     find_echoes,
     saturated_spans,
 )
@@ -38,6 +38,7 @@ _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distin
 _TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
 _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
+_UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
@@ -46,6 +47,7 @@ _QUANTITIES = {
     "energy": "integral of the echo over time",
     "width_ns": "full width of the echo at half maximum",
 }
+_OF_ECHOES = (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES), "flags")
 _PER_WAVEFORM = {
     "attenuation": ("1/m", "effective attenuation of the column along the path"),
     "attenuation_stderr": ("1/m", "standard error of the effective attenuation"),
@@ -72,6 +74,7 @@ def extract(
     depth_from: Literal["echo", "mean"] = "echo",
     iterations: int = 50,
     block: int = 2048,
+    targets: int | None = None,
 ) -> xr.Dataset:
     """Measure the echoes in waveforms.
 
@@ -110,13 +113,16 @@ def extract(
         Iterations of the deconvolution, 1 to 10 000.
     block : int
         Number of waveforms in memory at a time, at least 1.
+    targets : int, optional
+        Number of targets that the table has, 1 to 100; by default that of the waveform with most, at least 1.
 
     Returns
     -------
     xarray.Dataset
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
-        ``echo`` (surface, column, target, bottom): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
-        with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of `echo_detection.EchoFlag`. Without ``echo``:
+        ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
+        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
+        `echo_detection.EchoFlag`. Without ``echo``:
         ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which
         ``depth_m_method_error`` includes. Over the dimensions of the waveforms alone: ``attenuation`` [1/m] along the
         path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``: ``layer_depth_m``,
@@ -141,11 +147,10 @@ def extract(
     Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
     has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
     ``scattered_light``. Echoes no higher than single events of the detector are ``few_events``. ``gaussian`` flags
-    targets and bottoms below 3 standard errors as ``poor_fit``, surfaces as ``no_echo``, timed by the column's onset,
-    as are all beyond 60 degrees from nadir.
+    targets and bottoms below 3 standard errors as ``poor_fit``, and surfaces as ``column_onset``: their time is that of
+    the column's onset, as of all beyond 60 degrees from nadir. They have neither amplitude nor width.
 
-    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the time that is clipped.
-
+    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time.
     ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of the record's trigger and clocks, which
     cancels where the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for
     ``gaussian`` the typical error by scattered light that arrives later, by the light's distribution in the pixel,
@@ -203,9 +208,12 @@ def extract(
         raise UserError(f"depth_from = {depth_from!r} must be 'echo' or 'mean'")
     layers, block = integer("layers", layers, 0, 8), integer("block", block, 1, 10**9)
     waveforms = Waveforms.from_dataset(dataset, pulse, noise, echo_fwhm_ns, saturation_level)
-    settings = _Settings(names, threshold, contrast, layers, depth_from, iterations)
+    wanted = None if targets is None else integer("targets", targets, 1, 100)
+    settings = _Settings(names, threshold, contrast, layers, depth_from, iterations, wanted)
     starts = range(0, waveforms.count, block)
     parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
+    count = wanted or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
+    parts = [_with_targets(part, count) for part in parts]
     table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     table = _with_depths(dataset, waveforms, table, settings)
     return _label(dataset, waveforms, table, settings, several)
@@ -219,6 +227,22 @@ class _Settings:
     layers: int
     depth_from: str
     iterations: int
+    targets: int | None
+
+
+def echo_names(targets: int = 1) -> list[str]:
+    """Return the names of the echoes of a table with so many targets."""
+    return [*ECHOES[:3], *(f"target_{number}" for number in range(2, targets + 1)), ECHOES[3]]
+
+
+def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, npt.NDArray[Any]]:
+    """Return quantities with so many targets, of which those that are not there are unknown."""
+    missing = targets + len(ECHOES) - 1 - part["flags"].shape[-1]
+    filled = dict(part)
+    for name in _OF_ECHOES if missing > 0 else ():
+        value = int(EchoFlag.NO_ECHO) if name == "flags" else np.nan
+        filled[name] = np.insert(part[name], [part[name].shape[-1] - 1] * missing, value, axis=-1)
+    return filled
 
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
@@ -233,13 +257,16 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         latest_ns=waveforms.latest_surface(rows),
         event_height=waveforms.events(rows),
         waves=waveforms.focusing is not None,
+        targets=settings.targets,
+        tail=waveforms.template.share_behind(BEHIND_EDGE * width),
     )
     time = records.time_ns
-    surface, target, bottom = found.bins
+    surface = found.surface
     # The column begins where the tail of the surface echo has ended.
     tail = max(1.75 * width, waveforms.template.tail_ns(_TAIL) + width - waveforms.template.fwhm_ns)
     start = np.where(surface >= 0, time[surface] + tail, np.nan)
-    following = np.where(target >= 0, target, bottom)
+    later = np.where(found.bins[1:] >= 0, found.bins[1:], time.size).min(axis=0)
+    following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
     reference = time[surface]
@@ -260,14 +287,14 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         echoes = _estimate(estimator, waveforms, usable, found, column, sharp, settings)
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
-        quantities.append([echoes[0], _column(records, column, start, end, surface_ns - reference), *echoes[1:]])
+        quantities.append([echoes[0], column_echoes(records, column, start, end, surface_ns - reference), *echoes[1:]])
     table = {
         name: np.stack([np.stack([getattr(one, name) for one in echoes], axis=1) for echoes in quantities], axis=1)
         for name in vars(quantities[0][0])
     }
     table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
     # The peak may be anywhere in the time that is clipped.
-    for echo, span in zip((0, 2, 3), spans[:, :, np.newaxis], strict=True):
+    for echo, span in zip((0, *range(2, len(spans) + 1)), spans[:, :, np.newaxis], strict=True):
         error = table["time_ns_stderr"][..., echo]
         error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
@@ -284,36 +311,6 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
             "layer_attenuation_below": changes.decay_after * per_metre,
         }
     return table
-
-
-def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatArray, delay: FloatArray) -> Echoes:
-    """Return the columns between two times as echoes, with their level at a delay [ns] from the fits' reference."""
-    known = np.isfinite(column.level)
-    inside = (records.time_ns >= start[:, np.newaxis]) & (records.time_ns <= end[:, np.newaxis])
-    power, noise = np.where(inside, records.power, 0), np.where(inside, records.noise, 0)
-    total = np.sum(power, axis=1)
-    safe = np.where(known & (total > 0), total, 1.0)
-    seconds = records.bin_ns * 1e-9
-    time = np.sum(power * records.time_ns, axis=1) / safe
-    time_error = error_of_sums(noise * (records.time_ns - time[:, np.newaxis]), None, records.shared) / safe
-    level = column.level * np.exp(-column.decay * delay)
-    relative = column.level_stderr / column.level
-    mixed = 2 * column.correlation * relative * delay * column.decay_stderr
-    level_error = level * np.sqrt(np.maximum(relative**2 + (delay * column.decay_stderr) ** 2 - mixed, 0))
-    # A column that does not decay has no width.
-    decay = np.where(column.decay > 0, column.decay, np.nan)
-    half = np.log(2) / decay
-    return Echoes(
-        time,
-        level,
-        total * seconds,
-        half,
-        time_error,
-        level_error,
-        error_of_sums(noise, None, records.shared) * seconds,
-        half * column.decay_stderr / decay,
-        np.where(known, 0, int(EchoFlag.NO_ECHO)),
-    ).known_only(known)
 
 
 def _with_depths(
@@ -353,10 +350,9 @@ def _with_depths(
         own = found.own.ravel()
         flags = table["flags"][:, number, 0]
         flags |= np.where((own | np.isnan(measured)) & ~dark, 0, int(EchoFlag.NO_SURFACE_LIGHT))
-        # Without a distinct echo, the onset of the column gives the time.
         absent = np.isnan(measured) | ~own
         faint |= absent
-        flags |= np.where(faint, int(EchoFlag.NO_ECHO), 0)
+        flags |= np.where(absent, int(EchoFlag.NO_ECHO), np.where(faint, int(EchoFlag.COLUMN_ONSET), 0))
         for name in ("amplitude", "energy", "width_ns"):
             for column in (name, f"{name}_stderr"):
                 table[column][faint, number, 0] = np.nan
@@ -379,7 +375,8 @@ def _with_depths(
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
-    of_surface = np.array([index == 0 if from_mean else index > 0 for index in range(len(ECHOES))])
+    of_onset = (table["flags"] & int(EchoFlag.COLUMN_ONSET)) > 0
+    of_surface = of_onset | ((np.arange(time.shape[-1]) > 0) != from_mean)
     method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
     table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)
     if "layer_time_ns" in table:
@@ -432,7 +429,7 @@ def _label(
     coords: dict[str, Any] = {
         str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)
     }
-    coords["echo"] = ("echo", list(ECHOES), {"long_name": "kind of echo"})
+    coords["echo"] = ("echo", echo_names(table["flags"].shape[-1] - 3), {"long_name": "kind of echo"})
     if several:
         coords["estimator"] = ("estimator", list(settings.estimators), {"long_name": "estimator of the echo's time"})
     provenance = {
@@ -482,8 +479,11 @@ def _estimate(
         surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
         reflects = waveforms.geometry.off_nadir < GRAZING
         fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
-        for place, flag in places[1:]:
-            fits.append(echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface))
+        for number, (place, flag) in enumerate(places[1:], 1):
+            around = found.neighbours(number)
+            fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)
+            detected = np.where(place >= 0, records.time_of(place) - shape.peak_ns, np.nan)
+            fits.append(fit.or_at(detected, _UNFITTED * width))
         return fits
     bias = 0.0
     if estimator in ("peak", "centroid"):

@@ -167,7 +167,8 @@ def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path
         (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
         (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
         (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),
-        (["--free", "attenuation", "--receiver", "apd"], "receiver is that of a recorded signal"),
+        (["--free", "attenuation", "--receiver", "none"], "receiver = 'none' must be one of"),
+        (["--free", "attenuation,bandwidth_mhz", "--receiver", "apd"], "bandwidth_mhz and a receiver"),
         (["--free", "attenuation", "--noise", "-1"], "noise = -1 must be greater than 0"),
     ],
 )

@@ -66,7 +66,7 @@ def test_a_result_has_its_own_errors(tmp_path):
     np.testing.assert_array_equal(found.values, data["waveform"])
     np.testing.assert_array_equal(found.stderr, data["waveform_stderr"])
     assert found.calibrated
-    with pytest.raises(UserError, match="receiver is that of a recorded signal"):
+    with pytest.raises(UserError, match="receiver is that of a signal or a table"):
         measured(light, receiver="apd")
     with pytest.raises(UserError, match="no variable waveform"):
         measured(xr.Dataset({"energy": data["waveform"]}))

@@ -21,6 +21,7 @@ from synthetic_shots import (
     RHO,
     SURFACE,
     THETA,
+    TIME,
     A,
     N,
     on_axis,
@@ -31,6 +32,7 @@ from synthetic_shots import (
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
+from mitransient_lidar.analysis.retrieval.bottom_errors import COLUMN_GAIN
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import retrieval
 from mitransient_lidar.rendering import shot_series
@@ -55,6 +57,33 @@ def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
     kept = retrieve.surface_slopes(result(shot["waveform"].values))
     assert float(kept["slope_along"]) == pytest.approx(0.84, rel=0.1)
     assert float(kept["slope_refused"]) == 0
+
+
+def test_a_receiver_of_one_pixel_gives_bottom_and_water():
+    """Refused for want of slopes before, which neither needs."""
+    one = result(4 * waveform()[np.newaxis])
+    found = retrieve.retrieve(one)
+    assert np.isnan(found["slope_along"])
+    assert float(found["surface_height"]) == pytest.approx(0, abs=0.1)
+    assert float(found["depth_m"].sel(correction="level")) == pytest.approx(DEPTH, abs=0.02)
+    # The error of the surface's range by a glint of 4 ns is an optical depth of 0.03.
+    np.testing.assert_allclose(found["reflectance"], RHO * np.exp(COLUMN_GAIN), rtol=0.04)
+    np.testing.assert_allclose([found["absorption"], found["backscattering"]], [A, BB], rtol=0.05)
+    with pytest.raises(UserError, match="at least 2 pixels"):
+        retrieve.surface_slopes(one)
+
+
+def test_the_tail_of_a_bottom_counts_and_its_focusing_does_not():
+    """A tail of 6 % behind the echo, of which the Gaussian has less than 1 %, and waves that focus light."""
+    shot = on_axis()
+    plain = float(retrieve.bottom(shot, LEVEL)["reflectance"][0])
+    delay = 2 * N * DEPTH / COS_WATER / C0
+    energy = float(retrieve.bottom(shot, LEVEL)["bottom_energy"]) / 4
+    tail = 0.06 * energy * 1e9 * np.where(SURFACE + delay < TIME, np.exp(-(TIME - SURFACE - delay) / 8) / 8, 0)
+    longer = retrieve.bottom(result(shot["waveform"].values + tail), LEVEL)
+    assert float(longer["reflectance"][0]) == pytest.approx(1.06 * plain, rel=0.01)
+    waves = on_axis().assign_attrs(wave_focusing=[1.2, 1.2], wave_focusing_depths=[0.01, 1.0])
+    assert float(retrieve.bottom(waves, LEVEL)["reflectance"][0]) == pytest.approx(plain / 1.2, rel=0.01)
 
 
 def series(shots):
@@ -152,7 +181,8 @@ def test_bottom_and_water_of_the_lidar_equation():
     seabed = retrieve.bottom(shot, LEVEL)
     np.testing.assert_allclose(seabed["depth_m"].sel(correction=["level", "slope"]), DEPTH, atol=0.01)
     # The backscatter that the column shows is 1.13 times that of bb.
-    np.testing.assert_allclose(seabed["reflectance"], RHO, rtol=0.02)
+    # Once scattered light decays as that of the bottom does.
+    np.testing.assert_allclose(seabed["reflectance"], RHO * np.exp(COLUMN_GAIN), rtol=0.02)
     assert seabed["class_probability"].sel(bottom_class="bright") > 0.9
     found = retrieve.water(shot)
     assert float(found["column_attenuation"]) == pytest.approx(A + BB, rel=0.01)

@@ -35,6 +35,10 @@ ATTRIBUTES |= {"pulse_fwhm_ns": 5.0, "response_time_ns": 0.0, "surface_time_ns":
 SHIFTS = np.array([2.3, 2.1, -1.8, -2.2])
 
 
+#: Delays of targets behind the surface [ns], of four waveforms.
+PLACES = [[], [40], [40, 28], [44, 34, 54]]
+
+
 def echo(arrival, energy):
     """Mean power [W] in each bin of an ideal echo of an energy [J]."""
     return energy / (DT * 1e-9) * np.diff(norm.cdf(EDGES, arrival, SIGMA))
@@ -162,13 +166,49 @@ def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
     assert not (unknown["flags"] & EchoFlag.NO_SURFACE_LIGHT).any()
 
 
+def test_all_targets_of_a_waveform_are_listed():
+    """None, one, two and three targets: the table has as many as the waveform with most, the strongest first."""
+    shots = [waveform() + sum(echo(SURFACE + at, 5e-13 / (1 + k)) for k, at in enumerate(places)) for places in PLACES]
+    table = echo_table.extract(result(np.stack(shots)))
+    names = ["target", "target_2", "target_3"]
+    assert table["echo"].values.tolist() == ["surface", "column", *names, "bottom"]
+    for pixel, places in enumerate(PLACES):
+        own = table.isel(pixel=pixel)
+        delay = own["time_ns"].sel(echo=names[: len(places)]).values - SURFACE
+        np.testing.assert_allclose(delay, places, atol=0.3)
+        assert (own["flags"].sel(echo=names[: len(places)]) == 0).all()
+        assert (own["flags"].sel(echo=names[len(places) :]) == EchoFlag.NO_ECHO).all()
+        assert float(own["time_ns"].sel(echo="bottom")) - SURFACE == pytest.approx(70, abs=0.1)
+    assert echo_table.extract(result(np.stack(shots)), targets=1)["echo"].values.tolist() == list(echo_table.ECHOES)
+
+
+@pytest.mark.parametrize("rise", [1.5, 3.0])
+@pytest.mark.parametrize("echo_behind", [False, True])
+def test_the_edge_of_a_turbid_layer_is_no_target(rise, echo_behind):
+    """From 35 ns on the column is brighter; a target behind the edge is one, and a target of the same height, too."""
+    at = SURFACE + 35
+    level = 3e-5 * np.exp(-DECAY * 35)
+    upper = echo(SURFACE, 2e-13) + column(SURFACE, SURFACE + 70, 3e-5) + echo(SURFACE + 70, 6e-13)
+    layer = upper + column(at, SURFACE + 70, (rise - 1) * level)
+    target = upper + echo(at, (rise - 1) * level * 5e-9)
+    layer = layer + (echo(SURFACE + 52, 2e-13) if echo_behind else 0)
+    first, second = (
+        echo_table.extract(result(one[np.newaxis])).isel(pixel=0).sel(echo="target") for one in (layer, target)
+    )
+    if echo_behind:
+        assert float(first["time_ns"]) - SURFACE == pytest.approx(52, abs=0.5)
+    else:
+        assert int(first["flags"]) == EchoFlag.NO_ECHO
+    assert float(second["time_ns"]) - SURFACE == pytest.approx(35, abs=0.5)
+
+
 def test_a_surface_echo_within_its_error_is_not_listed():
     """The onset of a column without a surface echo, with noise: a time, but no amplitude or energy."""
     bare = column(SURFACE, SURFACE + 70, 3e-5) + echo(SURFACE + 70, 6e-13)
     table = echo_table.extract(recorded(np.stack([bare, waveform()]), 200, 0.02))
     none, some = (table.sel(echo="surface").isel(pixel=pixel) for pixel in (0, 1))
     # An amplitude beyond its error by chance is listed: in 1 % of the shots.
-    unlisted = (none["flags"] & EchoFlag.NO_ECHO).values > 0
+    unlisted = (none["flags"] & EchoFlag.COLUMN_ONSET).values > 0
     assert unlisted.mean() > 0.9
     none = none.isel(shot=unlisted)
     for name in ("amplitude", "energy", "width_ns"):

@@ -1,0 +1,103 @@
+"""Differences of a model and waveforms that are fitted, and the time of a waveform within a record."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+
+_COMPRESSED = 0.02  # of the largest sample, above which a logarithm is compared
+_LEAST_OVERLAP = 0.5  # share of a model's energy that lies within the record
+_BRIGHT = 0.01  # of the largest sample, above which a model has light
+_MOST_LAGS = 64  # of an estimated correlation, in samples
+
+
+class Misfit(NamedTuple):
+    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
+
+    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening). With `blur` they are
+    those of both after a Gaussian filter, so that echoes agree partly before they coincide.
+    """
+
+    weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
+    softening: FloatArray | None = None  #: In the unit of the waveforms, above 0, shape (pixel, time).
+    blur: float = 0.0  #: Standard deviation of the filter [samples].
+
+    def of(self, mean: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the differences, shape (pixel, time)."""
+        mean, values = self.blurred(mean), self.blurred(values)
+        if self.softening is None:
+            return np.asarray(self.weights * (mean - values))
+        return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
+
+    def slopes(self, mean: FloatArray, derivative: FloatArray) -> FloatArray:
+        """Return the derivatives of the differences for those of the mean, shape (parameter, pixel, time)."""
+        if self.softening is None:
+            return np.asarray(self.weights * self.blurred(derivative))
+        return np.asarray(self.weights / np.hypot(self.blurred(mean), self.softening) * self.blurred(derivative))
+
+    def blurred(self, array: FloatArray) -> FloatArray:
+        """Return an array, shape (..., pixel, time), after the filter; samples of weight 0 count as dark."""
+        if not self.blur:
+            return array
+        from scipy.ndimage import gaussian_filter1d
+
+        lit = np.where(self.weights > 0, array, 0.0)
+        return np.asarray(gaussian_filter1d(lit, self.blur, axis=-1, mode="constant"))
+
+
+def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, mean: FloatArray) -> float:
+    """Return the time [ns] that waveforms are later than a model, whose light is searched for in the whole record.
+
+    Compressed samples, asinh(value / 2 % of the largest), agree best there in the least squares over the record, with
+    a scale of their own and a model that is dark outside its own record. The column and faint echoes count beside the
+    surface echo.
+
+    Parameters
+    ----------
+    times, values
+        Times of the samples [ns], shape (time,), and waveforms, shape (pixel, time).
+    model_times, mean
+        Evenly spaced times of the model [ns], and its samples, shape (pixel, time).
+    """
+    step = float(np.median(np.diff(model_times)))
+    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
+    across, energy = np.zeros(grid.size + model_times.size - 1), np.zeros(grid.size + model_times.size - 1)
+    for row, own in zip(values, mean, strict=True):
+        sampled, shape = _compressed(np.interp(grid, times, row)), _compressed(own)
+        across += np.correlate(sampled, shape, "full")
+        energy += np.correlate(np.ones(grid.size), shape**2, "full")
+    inside = energy >= _LEAST_OVERLAP * energy.max()
+    explained = np.where(inside, np.maximum(across, 0) ** 2 / np.where(inside, energy, 1.0), 0.0)
+    lag = int(np.argmax(explained)) - (model_times.size - 1)
+    return float(grid[0] + lag * step - model_times[0])
+
+
+def light_duration(times: FloatArray, mean: FloatArray) -> float:
+    """Return the time from the first to the last sample of a model above 1 % of the largest one [ns]."""
+    bright = times[(mean > _BRIGHT * mean.max()).any(axis=0)]
+    return float(bright[-1] - bright[0]) if bright.size else 0.0
+
+
+def residual_correlation(residuals: FloatArray) -> FloatArray:
+    """Return the correlation of residuals, shape (pixel, time), by their distance, up to the first insignificant one.
+
+    It holds the correlation of unknown noise and what neighbours share of a misfit.
+    """
+    total, count = float(np.sum(residuals**2)), max(int(np.count_nonzero(residuals)), 1)
+    found = [1.0]
+    for lag in range(1, min(_MOST_LAGS, residuals.shape[-1] // 4)):
+        value = float(np.sum(residuals[:, lag:] * residuals[:, :-lag])) / max(total, 1e-300)
+        if value < 2 / math.sqrt(count):
+            break
+        found.append(value)
+    return np.array(found)
+
+
+def _compressed(values: FloatArray) -> FloatArray:
+    """Return the compressed samples of a row."""
+    level = max(_COMPRESSED * float(np.max(values, initial=0.0)), 1e-300)
+    return np.asarray(np.arcsinh(values / level))
