@@ -140,7 +140,7 @@ SPHERES = {
 
 @functools.cache
 def echo_of(sphere):
-    """Return energies [J] and times [ns] of the echo of a sphere, by places on its surface; the sum is right to 1e-4."""
+    """Return energies [J] and times [ns] of the echo of a sphere, by places on it; the sum is right to 1e-4."""
     lidar, sigma, centre, radius = SPHERES[sphere]
     (cosine, dcos), (azimuth, dphi) = grid(-1.0, 1.0, 400), grid(0.0, 2 * np.pi, 400)
     cosine, azimuth = np.meshgrid(cosine, azimuth)
