@@ -2,9 +2,9 @@
 
 The process ends with its shard, and with it the memory that Mitsuba does not give back. It ends, too, when the process
 that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. One
-that hangs is ended. Its standard input holds the store, the shard, the versions that it must have, and the runs that are not to be rendered,
-with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error``,
-``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
+that hangs is ended. Its standard input holds the store, the shard, the versions that it must have, and the runs that
+are not to be rendered, with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run,
+``done``, ``error``, ``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
 
 A log beside the store, ``NAME.zarr.log``, holds the messages of processes that ended before their shard.
 """
