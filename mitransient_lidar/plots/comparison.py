@@ -10,7 +10,6 @@ from mitransient_lidar.analysis.comparison import Comparison
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
 
-
 #: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
 _MOST_CURVES = 64
 
@@ -20,8 +19,8 @@ def plot_comparison(
 ) -> Figure:
     """Draw two results with bands of two standard errors, and below them their difference in standard errors.
 
-    Of more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results have
-    the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
+    Of more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results
+    have the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
     """
     figure = drawing.new_figure(path, 9.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
