@@ -164,10 +164,9 @@ STUDIES = {
         ["fig13_2x2", *COARSE, "--grid", 2, "--passes", 16, "-o", "t.png"],
         "a map needs all places, and",
     ),
-    "bounds": (["table1", *COARSE, "--free", "attenuation", "--passes", 4, "-o", "b.png"], "bounds need all renders,"),
     "depth-bias": (
-        ["published_airborne", "--winds", 3, "--waters", "IB", "--angles", 10, "--depths", 4, "-o", "d.nc"],
-        "after 0 of 1 renders, and none is kept.",
+        ["published_airborne", "--winds", 3, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
+        "of 3 renders, and none is kept.",
     ),
 }
 
@@ -175,7 +174,7 @@ STUDIES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("study", STUDIES)
 def test_a_study_that_needs_all_of_its_renders_ends_with_the_first_interruption(tmp_path, study):
-    """All but bounds once went on with the next render, and counted the interrupted one as complete."""
+    """It once went on with the next render, and counted the interrupted one as complete."""
     arguments, text = STUDIES[study]
     process = start(IN_A_RENDER, study, *arguments, "-q", stderr=subprocess.PIPE, cwd=tmp_path)
     _, stderr = process.communicate(timeout=600)
