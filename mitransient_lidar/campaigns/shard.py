@@ -1,10 +1,10 @@
 """Rendering of a shard of a campaign in a process of its own.
 
 The process ends with its shard, and with it the memory that Mitsuba does not give back. It ends, too, when the process
-that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. Its
-standard input holds the store, the shard, the versions that it must have, and the runs that are not to be rendered,
-with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error``,
-``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
+that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. One
+that hangs is ended. Its standard input holds the store, the shard, the versions that it must have, and the runs that
+are not to be rendered, with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run,
+``done``, ``error``, ``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
 
 A log beside the store, ``NAME.zarr.log``, holds the messages of processes that ended before their shard.
 """
@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 
 from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
@@ -51,6 +52,9 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 #: Time for a process to write the runs that it has when the campaign ends [s].
 _WRITE_S = 10.0
+
+#: Time between two looks at a process [s], and number of looks without any processor time after which it hangs.
+_LOOK_S, _MOST_STILL = 10.0, 30
 
 Report = Callable[[int, int], None]
 
@@ -201,17 +205,48 @@ def _one_process(order: dict[str, Any], report: Report | None, processes: Proces
         told: list[str] = []
         reader = threading.Thread(target=lambda: told.extend(process.stderr or ()), daemon=True)
         reader.start()
-        with processes.holding(process):
+        with processes.holding(process), _watching(process) as is_hung:
             found = _events(process, order, report, processes.place)
         code = process.wait()
         reader.join(timeout=5)
         if isinstance(found, (Outcome, _End)):
             return found
+        last = " ".join((told or ["without a message"])[-1].split())
+        why = f"ended by signal {-code}" if code < 0 else f"ended with exit code {code}: {last}"
+        if is_hung.is_set():
+            why = f"was ended after {_MOST_STILL * _LOOK_S:.0f} s without processor time"
+            told.append(f"the process {why}")
         if told:
             _log(order["store"], order["shard"], "".join(told))
-        last = " ".join((told or ["without a message"])[-1].split())
-        why = f"by signal {-code}" if code < 0 else f"with exit code {code}: {last}"
-        return _End(found, f"the process ended {why}")
+        return _End(found, f"the process {why}")
+
+
+@contextlib.contextmanager
+def _watching(process: subprocess.Popen[str]) -> Iterator[threading.Event]:
+    """Context in which a process that uses no processor time for 5 minutes is ended; yield whether it was.
+
+    Looks are counted, not time: this process may be stopped, too.
+    """
+    is_over, is_hung = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        still, before = 0, -1.0
+        # An error of psutil is a process that has ended.
+        with contextlib.suppress(psutil.Error):
+            watched = psutil.Process(process.pid)
+            while still < _MOST_STILL:
+                if is_over.wait(_LOOK_S):
+                    return
+                now = sum(watched.cpu_times()[:2])
+                still, before = (still + 1 if now == before else 0), now
+            is_hung.set()
+            process.kill()
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield is_hung
+    finally:
+        is_over.set()
 
 
 def _events(

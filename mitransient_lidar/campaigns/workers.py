@@ -24,8 +24,13 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Time between two reports of a shard, and time to wait for a scheduler [s].
+#: Time between two reports of a shard, and time to wait for a scheduler to connect [s].
 REPORT_S, _CONNECT_S = 1.0, 15.0
+
+#: Time after which a scheduler that does not answer is lost [s].
+_ANSWER_S = 300.0
+
+_LOST = "the scheduler was lost: what is written is kept, and the same command goes on"
 
 #: Function that takes a shard and its numbers of runs done and failed.
 Tell = Callable[[int, int, int], None]
@@ -79,13 +84,13 @@ class _Cluster:
 
     def wait(self) -> None:
         """Wait for the first worker."""
-        if not self._client.nthreads():
+        if not self._threads():
             _LOG.warning("the scheduler has no workers: the campaign waits for the first one")
-            while not self._client.nthreads():
+            while not self._threads():
                 time.sleep(REPORT_S)
 
     def count(self) -> int:
-        threads: dict[str, int] = self._client.nthreads()
+        threads = self._threads()
         self._check(set(threads) - self._reached)
         self._reached.update(threads)
         return max(sum(threads.values()), 1)
@@ -103,9 +108,17 @@ class _Cluster:
             return
         with contextlib.suppress(OSError):
             self._executor.shutdown(wait=False)
-            if self._client.nthreads():
+            if self._client.nthreads(callback_timeout=_CONNECT_S):
                 self._client.run(_end, self._topic, on_error="return")
             self._client.unsubscribe_topic(self._topic)
+
+    def _threads(self) -> dict[str, int]:
+        """Return the threads of each worker; raise `UserError` where the scheduler does not answer."""
+        try:
+            threads: dict[str, int] = self._client.nthreads(callback_timeout=_ANSWER_S)
+        except TimeoutError as error:
+            raise UserError(_LOST) from error
+        return threads
 
     def _check(self, addresses: set[str]) -> None:
         """Raise `UserError` for workers with other versions, and those that the scheduler cannot reach."""
@@ -117,7 +130,7 @@ class _Cluster:
             if isinstance(answer, Mapping):
                 if differs := difference(self._versions, answer):
                     raise UserError(other_versions(place, differs))
-            elif address not in self._client.nthreads():
+            elif address not in self._threads():
                 continue
             elif isinstance(answer, OSError):
                 raise UserError(
@@ -173,7 +186,7 @@ def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Ite
         # A connection that times out is an OSError, and so may be what a worker tells.
         if client.status == "running" and not isinstance(error, (CancelledError, CommClosedError)):
             raise
-        raise UserError("the scheduler was lost: what is written is kept, and the same command goes on") from error
+        raise UserError(_LOST) from error
 
 
 @contextlib.contextmanager

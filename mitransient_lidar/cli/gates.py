@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitransient_lidar.cli.files import GateFiles
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.messages import name_subject, reporting
 from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
@@ -75,21 +75,23 @@ def gates(
         if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
                 raise UserError(f"{named[0]} needs --start-ns or --start-depth, where the first gate begins.")
-            files.write(result, result, quiet)
-            return
-        train = gate_stack.train_from_options(
-            result.attrs,
-            start_ns=start_ns,
-            start_depth_m=start_depth,
-            width_ns=width_ns,
-            step_ns=step_ns,
-            count=count,
-            rise_ns=rise_ns,
-            fall_ns=fall_ns,
-            profile_file=profile,
-            pulses=pulses,
-        )
-        cut = gating.cut_gates(result, train)
+            cut = result
+        else:
+            train = gate_stack.train_from_options(
+                result.attrs,
+                start_ns=start_ns,
+                start_depth_m=start_depth,
+                width_ns=width_ns,
+                step_ns=step_ns,
+                count=count,
+                rise_ns=rise_ns,
+                fall_ns=fall_ns,
+                profile_file=profile,
+                pulses=pulses,
+            )
+            cut = gating.cut_gates(result, train)
+    name_subject(stack, result.attrs, quiet)
+    with reporting(quiet):
         files.write(cut, result, quiet)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,6 +118,15 @@ def exit_if_failed(path: Path) -> None:
         first = f"the first, {store.unit} {failed[0]}, so: {store.errors()[failed[0]]}"
         typer.echo(f"{len(failed)} of {store.count} {store.unit}s failed, {first}", err=True)
         raise typer.Exit(_FAILED)
+
+
+def name_subject(file: Path, attributes: Mapping[Hashable, Any], quiet: bool = False) -> None:
+    """Print on stderr what a command works on: a file, and scene, instrument and integrator of the result in it."""
+    found = {name: str(attributes.get(name, "")) for name in ("scene", "instrument", "integrator")}
+    found["scene"] = Path(found["scene"]).stem
+    named = ", ".join(f"{name} {value}" for name, value in found.items() if value)
+    if not quiet:
+        typer.echo(f"{file}: {named or 'it names no scene'}", err=True)
 
 
 @contextlib.contextmanager

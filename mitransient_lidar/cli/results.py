@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.messages import name_subject, reporting
 from mitransient_lidar.cli.options import RECEIVERS, DrawingOnly, Quiet, Seed, number_or_auto
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
@@ -169,7 +169,9 @@ def record(
     from mitransient_lidar.analysis import receiver as analysis
 
     with reporting(quiet):
-        recorded = analysis.detect_waveforms(results.open(file), receiver, shots, seed, background_power_w, **chosen)
+        result = results.open(file)
+        recorded = analysis.detect_waveforms(result, receiver, shots, seed, background_power_w, **chosen)
+    name_subject(file, result.attrs, quiet)
     write_netcdf(recorded, target, analysis.encoding(recorded))
     for line in analysis.describe_recording(recorded):
         typer.echo(line)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
+from mitransient_lidar.cli.messages import name_subject
 from mitransient_lidar.cli.options import pair
 from mitransient_lidar.core.errors import UserError
 
@@ -65,6 +66,7 @@ def retrieve(
         slope_deviation=deviations,
         efficiency=efficiency,
     )
+    name_subject(file, dataset.attrs)
     for line in _table(found) if "shot" in found.dims else _lines(found):
         typer.echo(line)
     if output is not None:

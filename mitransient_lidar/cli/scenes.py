@@ -33,11 +33,12 @@ def show_scene(name: Name) -> None:
 def copy_scene(
     name: Name,
     destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder, or path of the new file.")] = Path("."),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Copy a scene to a self-contained file to edit, and print its path. No file is overwritten."""
+    """Copy a scene to a self-contained file to edit, and print its path."""
     from mitransient_lidar.loading import catalogue
 
-    typer.echo(catalogue.copy_scene(name, destination))
+    typer.echo(catalogue.copy_scene(name, destination, overwrite))
 
 
 def instruments(

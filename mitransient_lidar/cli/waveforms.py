@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_suffix
+from mitransient_lidar.cli.messages import name_subject
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ def waveforms(
     )
     if corrections is not None:
         found = depth_correction.correct_depths(found, corrections, wind_speed)
+    name_subject(file, dataset.attrs)
     if table:
         _print(found)
     if output is not None:

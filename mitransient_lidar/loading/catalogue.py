@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import check_regular, read_text
+from mitransient_lidar.core.files import check_regular, read_text, replacing, together
 from mitransient_lidar.loading.document import read_document
 
 
@@ -66,7 +66,9 @@ def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
     return dict(read_document(scene_path(name)).parameters)
 
 
-def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".") -> Path:
+def copy_scene(
+    name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".", overwrite: bool = False
+) -> Path:
     """Write a scene as one self-contained file, with copies of its data files from the same folder.
 
     Parameters
@@ -75,11 +77,13 @@ def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str]
         As in `scene_path`.
     destination : path
         Folder, or path of the new file, which is returned.
+    overwrite : bool
+        Whether to replace files.
 
     Raises
     ------
     UserError
-        If there is no such scene, a file exists already, or one cannot be read or written.
+        If there is no such scene, a file exists already, or one cannot be read or written. No file is written then.
     """
     source = scene_path(name)
     text = read_document(source).text
@@ -88,15 +92,14 @@ def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str]
     neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)
     copies = {target.parent / file.name: file for file in neighbours if f'"{file.name}"' in text}
     for copy in (target, *copies):
-        if copy.exists():
-            raise UserError(f"{copy} exists already and is not overwritten.")
-    copy = target
-    try:
-        target.write_text(text, encoding="utf-8")
+        if os.path.lexists(copy) and not overwrite:
+            raise UserError(f"{copy} exists already: choose another place, or replace it with --overwrite")
+    with together():
         for copy, original in copies.items():
-            shutil.copyfile(original, copy)
-    except OSError as error:
-        raise UserError(f"cannot write {copy}: {error.strerror}.") from error
+            with replacing(copy) as temporary:
+                shutil.copyfile(original, temporary)
+        with replacing(target) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     return target
 
 

@@ -10,31 +10,41 @@ from mitransient_lidar.analysis.comparison import Comparison
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
 
+#: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
+_MOST_CURVES = 64
+
 
 def plot_comparison(
     first: xr.Dataset, second: xr.Dataset, outcome: Comparison, path: drawing.FilePath | None = None
 ) -> Figure:
     """Draw two results with bands of two standard errors, and below them their difference in standard errors.
 
-    The results have the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
+    Of more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results
+    have the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
     """
     figure = drawing.new_figure(path, 9.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
     time = first["time"].values
-    palette = drawing.pixel_colours(len(outcome.z))
-    for result, style, label in zip((first, second), ("-", "--"), _labels(first, second), strict=True):
-        power, error = _by_pixel(result, "waveform"), 2 * _by_pixel(result, "waveform_stderr")
+    are_few = len(outcome.z) <= _MOST_CURVES
+    palette = drawing.pixel_colours(len(outcome.z) if are_few else 1)
+    powers = [_curves(result, are_few) for result in (first, second)]
+    for (power, error), style, label in zip(powers, ("-", "--"), _labels(first, second), strict=True):
         for i, colour in enumerate(palette):
             curve = {"color": colour, "linestyle": style, "linewidth": 0.9, "label": "_" if i else label}
-            drawing.draw_band(upper, time, power[i], error[i], lowest=1e-30, **curve)
-    shown = _by_pixel(first, "waveform")[np.isfinite(outcome.z)]
+            drawing.draw_band(upper, time, power[i], 2 * error[i], lowest=1e-30, **curve)
+    counted = np.isfinite(outcome.z)
+    shown = powers[0][0][counted if are_few else counted.any(axis=0, keepdims=True)]
     upper.set_yscale("log")
     upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
     upper.set_xlim(drawing.time_limits(first))
-    upper.set_ylabel("received power (W)")
+    upper.set_ylabel("received power (W)" if are_few else "received power, all pixels (W)")
     upper.legend(frameon=False)
-    for z, colour in zip(outcome.z, palette, strict=True):
-        lower.plot(time, z, ".", color=colour, markersize=3)
+    if are_few:
+        for z, colour in zip(outcome.z, palette, strict=True):
+            lower.plot(time, z, ".", color=colour, markersize=3)
+    else:
+        lowest, highest = np.where(counted, outcome.z, np.inf).min(0), np.where(counted, outcome.z, -np.inf).max(0)
+        lower.vlines(time[counted.any(0)], lowest[counted.any(0)], highest[counted.any(0)], color=palette[0])
     for level in (-outcome.limit, outcome.limit):
         lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
     largest = 1.5 * max(outcome.limit, outcome.largest)
@@ -45,6 +55,12 @@ def plot_comparison(
     text += f" (limit of chance {outcome.limit:.1f})"
     figure.suptitle(drawing.titled(first.attrs, text), fontsize="medium")
     return drawing.save(figure, path)
+
+
+def _curves(result: xr.Dataset, by_pixel: bool) -> tuple[FloatArray, FloatArray]:
+    """Return the waveforms and standard errors of the pixels, or those of their sum, shape (curve, time)."""
+    power, error = (_by_pixel(result, name) for name in ("waveform", "waveform_stderr"))
+    return (power, error) if by_pixel else (power.sum(0, keepdims=True), np.sqrt((error**2).sum(0, keepdims=True)))
 
 
 def _labels(first: xr.Dataset, second: xr.Dataset) -> list[str]:

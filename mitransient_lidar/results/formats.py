@@ -122,7 +122,7 @@ def picture_order(dataset: xr.Dataset) -> xr.Dataset:
         lists = {
             key: np.flip(np.reshape(dataset.attrs[key], shape), list(IMAGE_AXES).index(dim)).ravel().tolist()
             for key in PER_PIXEL
-            if np.size(dataset.attrs.get(key, ())) == math.prod(shape)
+            if key in dataset.attrs and np.size(dataset.attrs[key]) == math.prod(shape)
         }
         numbers = np.arange(dataset.sizes[dim])
         numbered = dim in dataset.coords and np.array_equal(dataset[dim].values, numbers)

@@ -6,6 +6,7 @@ Every measurement runs in its own process, so that its peak memory and compile t
 from __future__ import annotations
 
 import json as json_module
+import os
 import resource
 import statistics
 import subprocess
@@ -141,7 +142,16 @@ def run_processes(
         print(_row([*heading, *([group_heading] if group_heading else [])], columns.values()))
     for labels, task in tasks.items():
         command = [sys.executable, "-m", module, json_module.dumps(task)]
-        done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True)
+        with tempfile.TemporaryDirectory() as folder:
+            # In a session of its own: after Ctrl-C, it would print what it has as if it were all.
+            done = subprocess.run(
+                command,
+                check=False,
+                stdout=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+                env={**os.environ, "TMPDIR": folder},
+            )
         if done.returncode:
             raise UserError(f"the benchmark of {' with '.join(labels)} ended with exit code {done.returncode}")
         values = json_module.loads(done.stdout)

@@ -161,6 +161,8 @@ def depth_bias(
     UserError
         If the instrument is unknown, a number or parameter is out of range, or the receiver counts photons and has
         less than one count in the brightest sample of a record.
+    KeyboardInterrupt
+        If a render was interrupted.
     """
     own = read_instrument(instrument)
     usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
@@ -218,6 +220,8 @@ def depth_bias(
             except DryBottomError:
                 _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
             else:
+                if rendered.attrs["interrupted"]:
+                    raise KeyboardInterrupt(f"interrupted after {number} of {total} renders, and none is kept.")
                 recorded = detect_waveforms(rendered, receiver or instrument, records, seed)
                 _check_counts(recorded)
                 cells[place] = _cell(recorded, estimators, corrections)

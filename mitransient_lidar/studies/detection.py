@@ -103,6 +103,8 @@ def detect(
     UserError
         If the scene or a parameter is invalid or out of range, the target returns no light, or the receiver does not
         detect it at any level.
+    KeyboardInterrupt
+        If a render was interrupted.
 
     Notes
     -----
@@ -170,6 +172,8 @@ def detect(
                     integrator=integrator,
                 )
             )
+            if found[-1].attrs["interrupted"]:
+                raise KeyboardInterrupt("interrupted; detection needs all renders, and none is kept.")
             if progress is not None:
                 done = len(experiments) * renders + len(found)
                 progress(Progress(done, (1 + len(depths)) * renders, "render"))

@@ -144,6 +144,8 @@ def target_map(
     ------
     UserError
         If the scene lacks these parameters, or as for `target_signal`.
+    KeyboardInterrupt
+        If a render was interrupted.
     """
     known = open_scene(scene, params).parameters
     for name in ("target_x", "target_y"):
@@ -158,6 +160,8 @@ def target_map(
             left = max(limit - (time.perf_counter() - began), 1e-3)
             options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
         cell = target_signal(scene, moved, **options).drop_dims("time")
+        if cell.attrs["interrupted"]:
+            raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
         cells.append(cell.assign(place_passes=((), cell.attrs["passes"], {"units": "1", "long_name": "passes"})))
         if progress is not None:
             progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))

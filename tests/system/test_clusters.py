@@ -17,6 +17,7 @@ from quick_campaign import files_of, planned_copy, write_toml
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
+from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
 from mitransient_lidar.campaigns.sweep import resume, sweep
 from mitransient_lidar.campaigns.versions import own_versions
@@ -38,9 +39,15 @@ def scheduler(tmp_path, request):
         process.kill()
 
 
+#: A scheduler that soon takes a worker that does not answer for lost.
+IMPATIENT = "import sys, dask; dask.config.set({'distributed.scheduler.worker-ttl': '5s'})"
+
+
 @pytest.mark.long
-def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
-    """A scheduler and two workers as on a cluster; one is killed while it renders."""
+@pytest.mark.parametrize("scheduler", [IMPATIENT], indirect=True)
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler, end):
+    """A scheduler and two workers as on a cluster; one is killed, or hangs, while it renders."""
     _, file = scheduler
     path = tmp_path / "cluster.zarr"
     command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
@@ -52,11 +59,12 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
         def watch(state):
             seen.append(state.done)
             if state.done >= 2 and nodes[0].poll() is None:
-                os.killpg(nodes[0].pid, signal.SIGKILL)
+                os.killpg(nodes[0].pid, end)
 
         address = json.loads(file.read_text())["address"]
         data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
-        assert nodes[0].wait(10) == -signal.SIGKILL
+        if end == signal.SIGKILL:
+            assert nodes[0].wait(10) == -signal.SIGKILL
         assert (data["status"] == DONE).all()
         assert seen[-1] == 12
         alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
@@ -92,7 +100,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
 
     path = planned_copy(quick, tmp_path / "lost.zarr")
 
-    def times_out():
+    def times_out(**_):
         raise OSError("Timed out trying to connect")
 
     with Client(json.loads(scheduler[1].read_text())["address"], set_as_default=False) as client:
@@ -103,6 +111,18 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
         with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
             resume(path, scheduler=client)
         monkeypatch.undo()
+        # One that is stopped never answers.
+        monkeypatch.setattr(workers, "_ANSWER_S", 1)
+        monkeypatch.setattr(workers, "_CONNECT_S", 1)
+        process = scheduler[0]
+        process.send_signal(signal.SIGSTOP)
+        goes_on = threading.Timer(30, process.send_signal, (signal.SIGCONT,))
+        goes_on.start()
+        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
+            resume(path, scheduler=client)
+        assert not goes_on.finished.is_set()
+        goes_on.cancel()
+        process.send_signal(signal.SIGCONT)
     assert (Store(path).status() == PLANNED).all()
 
 
@@ -129,6 +149,29 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
         with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
             resume(path, scheduler=address)
         worker.kill()
+
+
+@pytest.mark.slow
+def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
+    """The campaign once waited for ever."""
+    path = planned_copy(quick, tmp_path / "hung.zarr")
+    monkeypatch.setattr(shards, "_LOOK_S", 0.2)
+    processes, alarms = shards.Processes(), []
+
+    def stop(done, failed):
+        if not alarms:
+            (process,) = processes._running
+            process.send_signal(signal.SIGSTOP)
+            # Without a watch, it ends as if nothing had been.
+            alarms.append(threading.Timer(60, process.send_signal, (signal.SIGCONT,)))
+            alarms[0].start()
+
+    outcome = shards.render_in_process(str(path), 0, report=stop, processes=processes)
+    alarms[0].cancel()
+    assert outcome == (6, 0, "")
+    assert "was ended after 6 s without processor time" in shards.log_path(path).read_text()
+    shards.render_in_process(str(path), 1)
+    assert files_of(path) == files_of(quick)
 
 
 #: A worker with another version, and one of a release whose workers do not know their versions.

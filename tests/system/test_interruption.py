@@ -141,6 +141,50 @@ def test_a_full_disk_leaves_the_former_files(tmp_path, limit, file):
     assert (tmp_path / "table1.exr").read_text() == "old"
 
 
+#: The command line, with Ctrl-C during the third pass or shot of its renders.
+IN_A_RENDER = """
+import os, signal
+from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.cli import app
+check, calls = DeferredInterrupt.check, []
+def check_and_interrupt():
+    calls.append(1)
+    if len(calls) == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+    check()
+signal.signal(signal.SIGINT, signal.default_int_handler)
+DeferredInterrupt.check = staticmethod(check_and_interrupt)
+app.main()
+"""
+
+COARSE = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
+STUDIES = {
+    "detect": (["fig13_2x2", *COARSE, "--passes", 16, "-o", "d.png"], "detection needs all renders, and none"),
+    "target-signal": (
+        ["fig13_2x2", *COARSE, "--grid", 2, "--passes", 16, "-o", "t.png"],
+        "a map needs all places, and",
+    ),
+    "depth-bias": (
+        ["published_airborne", "--winds", 3, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
+        "of 3 renders, and none is kept.",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", STUDIES)
+def test_a_study_that_needs_all_of_its_renders_ends_with_the_first_interruption(tmp_path, study):
+    """It once went on with the next render, and counted the interrupted one as complete."""
+    arguments, text = STUDIES[study]
+    process = start(IN_A_RENDER, study, *arguments, "-q", stderr=subprocess.PIPE, cwd=tmp_path)
+    _, stderr = process.communicate(timeout=600)
+    assert process.returncode == 130, stderr
+    (line,) = stderr.splitlines()
+    assert line.startswith("interrupted")
+    assert text in line
+    assert names(tmp_path) == []
+
+
 #: The command line, with a signal when the command has ended and the process has not.
 LATE = """
 import atexit, os, signal, sys

@@ -285,7 +285,11 @@ def test_scenes(scene, tmp_path):
     assert_refused(run("scenes", "show", "fig9"), "did you mean fig09")
     result = run("scenes", "copy", "fig09", tmp_path)
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.xml'}\n")
-    assert_refused(run("scenes", "copy", "fig09", tmp_path), "exists already")
+    (tmp_path / "fig09.xml").write_text("mine")
+    assert_refused(run("scenes", "copy", "fig09", tmp_path), "exists already: choose another place, or replace it with")
+    assert (tmp_path / "fig09.xml").read_text() == "mine"
+    assert run("scenes", "copy", "fig09", tmp_path, "--overwrite").exit_code == 0
+    assert (tmp_path / "fig09.xml").read_text() == catalogue.scene_text("fig09")
 
 
 @pytest.mark.slow

@@ -62,3 +62,24 @@ def test_curves_bands_and_differences():
     assert high > outcome.largest
     assert lower.get_ylabel() == "difference\n(standard errors)"
     assert figure.get_suptitle().startswith(f"made: 120 bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f}")
+
+
+def test_many_pixels_are_drawn_as_their_sum():
+    """A curve of each of 64x64 pixels once took minutes."""
+    power = np.repeat(DECAY[:1], 100, axis=0)
+    first, second = (
+        results.build(
+            1e-9 * scale * power, 2e-11 * power, scale * power, 0.02 * power, time=TimeAxis(0.0, 1.0, 60),
+            pixel_names=[f"{number}" for number in range(100)],
+            pixel_centres_mrad=[(number, 0) for number in range(100)],
+            attributes={"passes": 50},
+        )
+        for scale in (1.0, 1.1)
+    )  # fmt: skip
+    outcome = compare(first, second)
+    upper, lower = plot_comparison(first, second, outcome).axes
+    np.testing.assert_allclose([line.get_ydata() for line in upper.lines], [100 * power[0], 110 * power[0]])
+    # The error of a sum of 100 independent pixels is a tenth of theirs.
+    assert upper.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(0.1004)
+    (ranges,) = lower.collections
+    np.testing.assert_allclose([path.vertices[0, 1] for path in ranges.get_paths()], outcome.z.min(axis=0))
