@@ -452,6 +452,8 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
 def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
     if "shot" in dataset.dims:
         raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
+    if (bins := dataset.sizes["time"]) > MOST_EXR_BINS:
+        raise UserError(f"cannot write {path}: {bins} bins are more than {MOST_EXR_BINS}, its most; use a .nc file.")
     if extra := [str(name) for name in dataset.data_vars if name not in _VARIABLES]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     stacks: dict[str, dict[str, npt.NDArray[Any]]] = {}
