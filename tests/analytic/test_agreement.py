@@ -175,8 +175,8 @@ CASES = {
         (510.0, 1.0, 110),
         *(4, 0.02, None),
     ),
-    # One table of heights below all of the beam would not resolve the waves: the water of this record, which begins
-    # behind the surface, was 1.05 times too bright.
+    # One table of heights below all of the beam would not resolve the waves: the water, of which alone this record is,
+    # would scatter six times as much from pass to pass.
     "beam of 2 rad over waves": (
         {
             "tx": {"divergence_mrad": 2000.0},

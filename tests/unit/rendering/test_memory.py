@@ -4,6 +4,7 @@ import resource
 import subprocess
 import sys
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,7 +14,10 @@ from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.catalogue import scene_text
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea.sea_mesh import grid_indices
+from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.rendering.shot_batches import check_size
 from mitransient_lidar.transport.merging.renderer import MergingRenderer
 
 #: A task after a small one, within a limit of the memory; prints the bytes that were estimated, and its peak above that
@@ -72,8 +76,32 @@ def test_the_memory_of_a_limited_process_is_half_of_its_limit(monkeypatch):
 def test_records_that_exceed_the_memory_are_refused():
     coords = {"pixel": list("abcd"), "time": 1380.5 + np.arange(200.0)}
     result = xr.Dataset({"waveform": (("pixel", "time"), np.zeros((4, 200)))}, coords, {"bin_width_ns": 1.0})
-    with pytest.raises(UserError, match=r"1000000000 records of 800 samples take 6\.4e\+03 GB of memory"):
+    with pytest.raises(UserError, match=r"1000000000 records of 800 samples take 1\.28e\+04 GB of memory"):
         mitransient_lidar.record(result, "apd", shots=10**9)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "count"), [("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass")]
+)
+def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatch):
+    session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
+    options = mi.load_dict({"type": integrator, count: 2**28}, parallel=False)
+    renderer = options.prepare(session.scene, session.sensor)
+    monkeypatch.setattr(validation, "usable_memory", lambda: 2e9)
+    with pytest.raises(UserError, match=rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}"):
+        renderer.render_pass(0)
+
+
+def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
+    monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
+    with pytest.raises(UserError, match="1 meshes of 2114 x 2114 cells take 1.25 GB"):
+        grid_indices(2048, 50_000)
+    with pytest.raises(UserError, match="64 meshes of 5.. x 5.. cells take .* GB"):
+        grid_indices(512, 1000, 2.0, meshes=64)
+    with pytest.raises(UserError, match="1000 shots of 4 pixels x 4000 bins take 1.02 GB"):
+        check_size(1000, 4, 4000)
+    with pytest.raises(UserError, match="1000 frames of 65536 pixels take 3.94 GB"):
+        render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
 
 
 def test_too_many_solids_for_components_are_refused_before_a_renderer_is_prepared(tmp_path, monkeypatch):
