@@ -94,13 +94,13 @@ def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatc
 
 def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
-    with pytest.raises(UserError, match="1 meshes of 2114 x 2114 cells take 1.25 GB"):
+    with pytest.raises(UserError, match=r"1 meshes of 2114 x 2114 cells take 1\.25 GB"):
         grid_indices(2048, 50_000)
-    with pytest.raises(UserError, match="64 meshes of 5.. x 5.. cells take .* GB"):
+    with pytest.raises(UserError, match=r"64 meshes of 5.. x 5.. cells take .* GB"):
         grid_indices(512, 1000, 2.0, meshes=64)
-    with pytest.raises(UserError, match="1000 shots of 4 pixels x 4000 bins take 1.02 GB"):
+    with pytest.raises(UserError, match=r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB"):
         check_size(1000, 4, 4000)
-    with pytest.raises(UserError, match="1000 frames of 65536 pixels take 3.94 GB"):
+    with pytest.raises(UserError, match=r"1000 frames of 65536 pixels take 3\.94 GB"):
         render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
 
 
