@@ -144,7 +144,7 @@ TASKS = {
     "sea": (RENDER.format('"surface_cell_size": 0.01, "surface_refined_size": 20.48', ""), ""),
     "photons": (RENDER.format("", MERGING.format("photons")), ""),
     "paths": (RENDER.format("", MERGING.format("paths")), ""),
-    "shots": (SHOTS.format(20000, 128), SHOTS.format(400, 2)),
+    "shots": (SHOTS.format(20000, 48), SHOTS.format(400, 2)),
     "record": ("record(20000)", "record(2)"),
     "passive": ("passive(1024)", "passive(64)"),
     "frames": ("passive(256, frames=40)", "passive(64, frames=2)"),
