@@ -24,7 +24,7 @@ from mitransient_lidar.physics.receiver.receiver_files import receiver as receiv
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
-_BYTES_PER_SAMPLE = 8  # memory of a sample: signal, saturation, and what is computed of them
+_BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when its record is written
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 

@@ -1,6 +1,7 @@
 """Validators of numeric parameters: each returns the clean value or raises ``UserError`` with one sentence."""
 
 import contextlib
+import logging
 import math
 import operator
 import os
@@ -16,6 +17,8 @@ from mitransient_lidar.core.errors import UserError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+_LOG = logging.getLogger(__name__)
 
 
 def finite(name: str, value: object) -> float:
@@ -178,5 +181,6 @@ def usable_memory() -> float:
 
 def require_memory(what: str, size: float, advice: str) -> None:
     """Raise `UserError` if arrays of a size [bytes] exceed `usable_memory`; `what` is their name in the plural."""
+    _LOG.debug("%s take %g bytes", what, size)
     if size > (most := usable_memory()):
         raise UserError(f"{what} take {size / 1e9:.3g} GB of memory, and at most {most / 1e9:.3g} GB may be: {advice}")

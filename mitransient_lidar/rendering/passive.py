@@ -15,7 +15,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer, positive, shown
+from mitransient_lidar.core.validation import FloatArray, integer, positive, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -43,6 +43,9 @@ DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
 
 #: Largest number of frames.
 MOST_FRAMES = 10_000
+
+#: Memory of a pixel in the passes of a frame, and of one of an image that is kept, and labelled at the end [bytes].
+_BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
 
 _TIME_PARAMETER = "surface_time"  # time of the sea of an XML scene [s]
 
@@ -118,8 +121,10 @@ def render_passive(
         chosen = choose_integrator(session.scene, integrator, passive=True)
         renderer = chosen.prepare(session.scene, session.sensor)
         if frame == 0:
-            described, first = _describe(renderer), session
-            pixels, etendue = renderer.scene.receiver.pixels, _etendue(renderer)
+            pixels = renderer.scene.receiver.pixels
+            size = (_BYTES_PER_PIXEL + _BYTES_PER_FRAME * frames) * pixels.count
+            require_memory(f"{frames} frames of {pixels.count} pixels", size, "take fewer of them")
+            described, first, etendue = _describe(renderer), session, _etendue(renderer)
         try:
             statistics, log, share = _render_frame(renderer, goals[frame], pass_seed(seed, frame), progress)
         except KeyboardInterrupt:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.errors import raise_if_out_of_memory
+from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
@@ -32,8 +32,8 @@ _PATHS, _BINS = 2**17, 2**24
 #: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
 _MOST_SHOTS = 64
 
-#: Largest number of bins of a series, for mean and standard error of energy and power.
-_MOST_BINS = 2**26
+#: Memory of a bin of a series, for mean and standard error of energy and power, and their copy in the result [bytes].
+_BYTES_PER_BIN = 64
 
 #: Fewest and most passes that are repeated until an error is reached.
 _PASSES_FOR_ERROR, MOST_PASSES_FOR_ERROR = 4, 400
@@ -262,13 +262,11 @@ def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) 
 
 def check_size(shots: int, pixels: int, bins: int, origins: int = 0, parameters: int = 0) -> None:
     """Refuse series that do not fit the memory, with light by `origins` and derivatives beside the whole."""
-    if shots * pixels * bins * (1 + origins + parameters) > _MOST_BINS:
-        components = f", and {origins} components of each," if origins else ""
-        components += f", and {parameters} derivatives of each," if parameters else ""
-        raise UserError(
-            f"{shots} shots of {pixels} pixels x {bins} bins{components} are more than {_MOST_BINS} bins: "
-            "take fewer shots, or reduce the pixels or bin_count"
-        )
+    components = f", and {origins} components of each," if origins else ""
+    components += f", and {parameters} derivatives of each," if parameters else ""
+    size = _BYTES_PER_BIN * shots * pixels * bins * (1 + origins + parameters)
+    what = f"{shots} shots of {pixels} pixels x {bins} bins{components}"
+    require_memory(what, size, "take fewer shots, or reduce the pixels or bin_count")
 
 
 def scene_of_shapes(shapes: Sequence[mi.Shape]) -> mi.Scene | None:

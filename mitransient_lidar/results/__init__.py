@@ -1,6 +1,7 @@
 """Datasets of results, and their files."""
 
 from mitransient_lidar.results.dataset import (
+    MOST_EXR_BINS,
     add_batches,
     add_components,
     add_derivatives,
@@ -16,6 +17,7 @@ from mitransient_lidar.results.dataset import (
 )
 
 __all__ = [
+    "MOST_EXR_BINS",
     "add_batches",
     "add_components",
     "add_derivatives",

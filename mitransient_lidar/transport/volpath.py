@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
@@ -45,6 +46,9 @@ _DIFFUSE_RADIANCE = 0.5
 
 #: Number of the random streams within a pass.
 _STREAM = 3
+
+#: Memory of a path: the state of its random numbers [bytes].
+BYTES_PER_PATH = 18
 
 #: How connections are estimated: by both samplings with multiple importance sampling, or by one of them.
 CONNECTIONS = ("mis", "emitter", "phase")
@@ -476,6 +480,7 @@ def trace_connected(
     scene: LidarScene, sampler: SensorSampler, options: VolpathOptions, record: PassRecord, shots: Shots, paths: int
 ) -> None:
     """Trace a number of paths from the receiver for each shot and connect them to the laser, into a record."""
+    require_memory(f"{shots.count * paths} paths", BYTES_PER_PATH * shots.count * paths, "take fewer paths_per_pass")
     lanes = shots.paths(paths)
     scene, rng = scene.of(lanes), shots.streams(_STREAM, lanes)
     start = sampler.sample_shots(lanes, paths, rng)

@@ -175,15 +175,15 @@ CASES = {
         (510.0, 1.0, 110),
         *(4, 0.02, None),
     ),
-    # One table of heights below all of the beam would not resolve the waves.
+    # One table of heights below all of the beam would not resolve the waves: the water, of which alone this record is,
+    # would scatter six times as much from pass to pass.
     "beam of 2 rad over waves": (
         {
             "tx": {"divergence_mrad": 2000.0},
             "rx": {"layout": "1x1"},
-            **{"sea": {**WAVES, "wind_speed": 6.0}, "bottom": None},
-            "water": SMOOTH,
+            **{"sea": WAVES, "bottom": None, "water": SMOOTH},
         },
-        (1410.0, 5.0, 18),
+        (1432.0, 5.0, 14),
         *(2, 0.03, None),
     ),
     # Scattered light prevails where the beam itself stays narrow.

@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each end of a kernel
 _MOST_BINS = 10**7  # of a kernel
+_LONGEST_DIRECT = 2000  # bins of a kernel from which Fourier transforms are faster
 
 #: Lowest sample of a file relative to the largest one; what lies below 0 is noise.
 _LOWEST_SAMPLE = -0.1
@@ -225,10 +226,24 @@ def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, Floa
     padded[:, :count] = record.reshape(-1, count)
     power = np.zeros((len(padded), count))
     if lags.size and len(padded):
-        found = np.convolve(padded.ravel(), weights / seconds)[: padded.size].reshape(padded.shape)
+        found = _convolved(padded, weights / seconds)
         start, end = max(lags[0], 0), min(count + lags[-1], count)
         power[:, start:end] = found[:, start - lags[0] : end - lags[0]]
     return power.reshape(record.shape)
+
+
+def _convolved(padded: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the convolution of records that end in as many zeros as there are weights, but one."""
+    if weights.size <= _LONGEST_DIRECT:
+        return np.convolve(padded.ravel(), weights)[: padded.size].reshape(padded.shape)
+    length = 1 << (padded.shape[1] - 1).bit_length()
+    spectrum, found = np.fft.rfft(weights, length), np.empty_like(padded)
+    for row, record in zip(found, padded, strict=True):
+        row[:] = np.fft.irfft(np.fft.rfft(record, length) * spectrum, length)[: record.size]
+        if not np.any(record < 0):
+            # Rounding, of the largest power, must not make power negative.
+            np.maximum(row, 0, out=row)
+    return found
 
 
 def _gaussian_response(t: FloatArray, sigma: float, tau: float) -> FloatArray:

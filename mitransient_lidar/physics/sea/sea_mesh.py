@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
 
 #: Ratio of the lengths of neighbouring cells outside the fine patch.
 _GROWTH = 1.3
+
+#: Memory of a cell: its heights, triangles, their copy in Mitsuba and the tree in which rays meet them [bytes].
+_BYTES_PER_CELL = 280
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,7 @@ class SeaMesh:
     texcoords: FloatArray  #: Coordinates along and across the wind [m], axes of the ripples, shape (vertices, 2).
 
 
-def grid_indices(cells: int, extent: int, growth: float = _GROWTH) -> IntArray:
+def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int = 1) -> IntArray:
     """Return the positions of grid lines in cells of the fine patch, counted from its centre.
 
     Parameters
@@ -34,11 +37,18 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH) -> IntArray:
         Side of the whole mesh in these cells, at least `cells`.
     growth
         Ratio of the lengths of neighbouring cells outside the patch, above 1.
+    meshes
+        Number of such meshes that are made at a time.
 
     Returns
     -------
     ndarray of int
         Symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
+
+    Raises
+    ------
+    UserError
+        If the meshes exceed the memory.
     """
     inner = np.arange(-(cells // 2), cells // 2 + 1, dtype=np.int64)
     outer, step, end = [], 1.0, cells // 2
@@ -47,6 +57,9 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH) -> IntArray:
         end = min(end + int(step), -(-extent // 2))
         outer.append(end)
     right = np.array(outer, dtype=np.int64)
+    side = cells + 2 * len(outer)
+    size = _BYTES_PER_CELL * float(meshes) * side**2
+    require_memory(f"{meshes} meshes of {side} x {side} cells", size, "take larger cells or a smaller refined_size")
     return np.concatenate([-right[::-1], inner, right])
 
 

@@ -229,7 +229,7 @@ class SeaSurface:
         """
         cells = max(2, 2 * math.ceil(0.5 * refined_size / self.cell_size))
         size = max(refined_size, min(self.size, max(_SIZE_OF_PATCH, 2 * refined_size)))
-        indices = grid_indices(cells, math.ceil(size / self.cell_size), _GROWTH_OF_PATCH)
+        indices = grid_indices(cells, math.ceil(size / self.cell_size), _GROWTH_OF_PATCH, len(places))
         side = math.ceil(math.sqrt(len(places)))
         stride = (indices[-1] - indices[0] + 2) * self.cell_size
         number = np.arange(len(places))

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.daylight.sampling import FovSampler
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 from mitransient_lidar.transport.perturbations import Sums
@@ -18,7 +19,13 @@ from mitransient_lidar.transport.refracted_connection import (
     connect_sun,
 )
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.volpath import PathLight, PathTracer, VolpathOptions, level_transmittance
+from mitransient_lidar.transport.volpath import (
+    BYTES_PER_PATH,
+    PathLight,
+    PathTracer,
+    VolpathOptions,
+    level_transmittance,
+)
 
 #: Number of the random streams within a pass.
 _STREAM = 4
@@ -127,6 +134,7 @@ class DaylightRenderer:
     def render_pass(self, seed: int, *, paths: int | None = None) -> DaylightRecord:
         """Render one pass; passes of different seeds are independent."""
         count = self.paths if paths is None else paths
+        require_memory(f"{count} paths", BYTES_PER_PATH * count, "take fewer paths_per_pass")
         with dr.suspend_grad():
             rng = pass_streams(seed, _STREAM, count)
             start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells, WaterGrid
@@ -20,7 +20,7 @@ from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPat
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL, PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
-from mitransient_lidar.transport.merging.segments import SegmentBuffer
+from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
@@ -75,14 +75,12 @@ _UPPERMOST_PER_SPREAD, _UPPERMOST_PER_FACET, _UPPERMOST_PER_ATTENUATION = 0.25, 
 #: displace light, and over the depth, for scattering.
 _SPREAD_PER_BLUR, _SPREAD_PER_DEPTH = 3.0, 0.5
 
-#: Least attenuation, against division by zero [1/m].
-_LEAST_ATTENUATION = 1e-6
+_LEAST_ATTENUATION = 1e-6  # against division by zero [1/m]
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
 
-#: Least number of paths of the path tracer in a pass of all shots.
-_COMPLEMENT_PATHS = 1024
+_COMPLEMENT_PATHS = 1024  # least number of paths of the path tracer in a pass of all shots
 
 #: Bits of the number of buckets of a shot above those of its number of photons: of cells, and of patches along both
 #: sides.
@@ -101,11 +99,9 @@ _COARSE, _PHOTONS_OF_COARSE, _COARSE_PATCHES = 8.0, 32, 2.0
 #: Points of a light path that are expected, over those of a straight one, to scale the rate of connections.
 _POINTS_OF_LIGHT = 0.8
 
-#: Largest capacity for segments of a path before a pass has needed more: light that is scattered more often is weak.
-_MOST_SEGMENTS = 64.0
-
-#: Capacity for segments and hits over the need of the last pass.
-_CAPACITY_MARGIN = 1.25
+#: Largest capacity for segments of a path before a pass has needed more: light that is scattered more often is weak;
+#: and capacity for segments and hits over the need of the last pass.
+_MOST_SEGMENTS, _CAPACITY_MARGIN = 64.0, 1.25
 
 
 @dataclass(frozen=True)
@@ -368,6 +364,7 @@ class MergingRenderer(PassRenderer):
     def _attempt(self, record: PassRecord, shots: Shots, paths: int) -> bool:
         """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
+        self._require_memory(shots, paths)
         shifts = shots.uniform(_COMMON_STREAM, 6)
         cells = layout.grid.cells(mi.Point4f(shifts[:4]))
         patches = SolidPatches(
@@ -385,6 +382,15 @@ class MergingRenderer(PassRenderer):
             paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, _COMPLEMENT_PATHS // shots.count)
         trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)
         return True
+
+    def _require_memory(self, shots: Shots, paths: int) -> None:
+        """Raise `UserError` if light and paths of a pass exceed the memory."""
+        layout, count, sums = self.layout, shots.count, self.scene.perturbations.count
+        points = layout.reach / layout.spacing
+        size = self.photons * memory_of_path(layout.light_segments, points, sums, layout.hits)
+        size += paths * memory_of_path(layout.sensor_segments, points, sums)
+        what = f"{count * self.photons} photons and {count * paths} paths"
+        require_memory(what, count * size, "take fewer photons_per_pass or paths_per_pass")
 
     def _trace_light(
         self,

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -19,8 +18,17 @@ from mitransient_lidar.transport.scene import LidarScene
 #: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
 _KEYS_PER_PATH = 1021
 
-#: Memory of a segment, and of four of its sums of perturbations [bytes].
-_BYTES_PER_SEGMENT, _BYTES_PER_SUMS = 60, 16
+#: Memory of a path, of a segment, of a point, of light in a cell, of a hit of a solid, and of four of the sums of
+#: perturbations of any of these [bytes].
+_BYTES_PER_PATH, _BYTES_PER_SEGMENT, _BYTES_PER_POINT = 32, 60, 14
+_BYTES_IN_CELL, _BYTES_PER_HIT, _BYTES_PER_SUMS = 26, 64, 16
+
+
+def memory_of_path(segments: float, points: float, perturbations: int, hits: float | None = None) -> float:
+    """Return the memory of a path with a number of segments and points [bytes]; light has `hits` on solids, too."""
+    sums = _BYTES_PER_SUMS * -(-perturbations // 4)
+    size = _BYTES_PER_PATH + segments * (_BYTES_PER_SEGMENT + sums) + points * _BYTES_PER_POINT
+    return size if hits is None else size + points * (_BYTES_IN_CELL + sums) + hits * (_BYTES_PER_HIT + sums)
 
 
 @dataclass(frozen=True)
@@ -143,8 +151,6 @@ class SegmentBuffer:
         self.paths, self._shots = paths, shots
         self.spacing = opaque(spacing)
         self.capacity, self._capacity = capacity, opaque_index(capacity)
-        size = capacity * (_BYTES_PER_SEGMENT + _BYTES_PER_SUMS * -(-self._perturbations.count // 4))
-        require_memory(f"{capacity} segments of {shots * paths} paths", size, "take fewer paths_per_pass")
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)

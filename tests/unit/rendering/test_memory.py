@@ -4,6 +4,7 @@ import resource
 import subprocess
 import sys
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,30 +14,50 @@ from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.catalogue import scene_text
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea.sea_mesh import grid_indices
+from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.rendering.shot_batches import check_size
 from mitransient_lidar.transport.merging.renderer import MergingRenderer
 
-#: A render within a limit of the memory [bytes] of the process; prints its peak above that before it [bytes].
+#: A task after a small one, within a limit of the memory; prints the bytes that were estimated, and its peak above that
+#: before it [bytes].
 LIMITED = """
-import re, resource, sys
-resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[1]),) * 2)
-import mitransient_lidar
+import logging, re, resource, sys
+resource.setrlimit(resource.RLIMIT_DATA, (6 * 2**30,) * 2)
+import mitransient_lidar as ml
+from mitransient_lidar.analysis import receiver
+from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.results import netcdf
 small = {"bin_count": 400, "time_start_ns": 1380}
-mitransient_lidar.render("table1", params=small, passes=2)
+def record(shots):
+    found = ml.record(result, "apd", shots=shots)
+    netcdf.dump(found, sys.argv[3], receiver.encoding(found))
+result = ml.render("table1", params=small, passes=2)
+def passive(pixels, **options):
+    render_passive("passive_sea", params={"layout": f"{pixels}x{pixels}"}, passes=2, **options)
+exec(sys.argv[1])
+found = {}
+class Handler(logging.Handler):
+    def emit(self, record):
+        if len(record.args) == 2 and record.msg.endswith("bytes"):
+            found[record.args[0]] = record.args[1]
+log = logging.getLogger("mitransient_lidar.core.validation")
+log.setLevel(logging.DEBUG)
+log.addHandler(Handler())
 # A child begins with the ru_maxrss of its parent.
 peak = lambda: int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1])
 before = peak()
-mitransient_lidar.render("table1", params=eval(sys.argv[2]), passes=2, **eval(sys.argv[3]))
-print(1024 * (peak() - before))
+exec(sys.argv[2])
+print(sum(found.values()), 1024 * (peak() - before))
 """
 
 
-def limited(params, options, limit=6 * 2**30):
-    run = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(limit), repr(params), repr(options)], capture_output=True, text=True
-    )
+def limited(task, path, small=""):
+    """Return the bytes that are estimated of a task, and its peak above that of a small one."""
+    run = subprocess.run([sys.executable, "-c", LIMITED, small, task, str(path)], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-2000:]
-    return float(run.stdout)
+    return map(float, run.stdout.split())
 
 
 def test_arrays_that_exceed_the_memory_are_refused(monkeypatch):
@@ -55,8 +76,32 @@ def test_the_memory_of_a_limited_process_is_half_of_its_limit(monkeypatch):
 def test_records_that_exceed_the_memory_are_refused():
     coords = {"pixel": list("abcd"), "time": 1380.5 + np.arange(200.0)}
     result = xr.Dataset({"waveform": (("pixel", "time"), np.zeros((4, 200)))}, coords, {"bin_width_ns": 1.0})
-    with pytest.raises(UserError, match=r"1000000000 records of 800 samples take 6\.4e\+03 GB of memory"):
+    with pytest.raises(UserError, match=r"1000000000 records of 800 samples take 1\.28e\+04 GB of memory"):
         mitransient_lidar.record(result, "apd", shots=10**9)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "count"), [("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass")]
+)
+def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatch):
+    session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
+    options = mi.load_dict({"type": integrator, count: 2**28}, parallel=False)
+    renderer = options.prepare(session.scene, session.sensor)
+    monkeypatch.setattr(validation, "usable_memory", lambda: 2e9)
+    with pytest.raises(UserError, match=rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}"):
+        renderer.render_pass(0)
+
+
+def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
+    monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
+    with pytest.raises(UserError, match=r"1 meshes of 2114 x 2114 cells take 1\.25 GB"):
+        grid_indices(2048, 50_000)
+    with pytest.raises(UserError, match=r"64 meshes of 5.. x 5.. cells take .* GB"):
+        grid_indices(512, 1000, 2.0, meshes=64)
+    with pytest.raises(UserError, match=r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB"):
+        check_size(1000, 4, 4000)
+    with pytest.raises(UserError, match=r"1000 frames of 65536 pixels take 3\.94 GB"):
+        render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
 
 
 def test_too_many_solids_for_components_are_refused_before_a_renderer_is_prepared(tmp_path, monkeypatch):
@@ -84,19 +129,30 @@ def test_a_long_record_needs_no_more_segments_at_first():
 
 
 @pytest.mark.slow
-def test_a_long_record_is_rendered_in_little_memory():
-    assert limited({"bin_width_ns": 1e6, "aim_x": -1e6}, {}) < 5e8
+def test_a_long_record_is_rendered_in_little_memory(tmp_path):
+    _, peak = limited('ml.render("table1", params={"bin_width_ns": 1e6, "aim_x": -1e6}, passes=2)', tmp_path)
+    assert peak < 5e8
+
+
+RENDER = 'ml.render("table1", params={{**small, {}}}, passes=2, {})'
+MERGING = 'integrator={{"type": "lidar_merging", "{}_per_pass": 2**20}}'
+SHOTS = 'ml.render_shots("table1", params={{**small, "bin_count": {}}}, count={}, passes=2)'
+#: Tasks that take memory, and small ones that compile their kernels.
+TASKS = {
+    "bins": (RENDER.format('"bin_count": 10**6', ""), ""),
+    "derivatives": (RENDER.format('"bin_count": 2 * 10**5', 'derivatives=["attenuation", "scattering"]'), ""),
+    "sea": (RENDER.format('"surface_cell_size": 0.01, "surface_refined_size": 20.48', ""), ""),
+    "photons": (RENDER.format("", MERGING.format("photons")), ""),
+    "paths": (RENDER.format("", MERGING.format("paths")), ""),
+    "shots": (SHOTS.format(20000, 48), SHOTS.format(400, 2)),
+    "record": ("record(20000)", "record(2)"),
+    "passive": ("passive(1024)", "passive(64)"),
+    "frames": ("passive(256, frames=40)", "passive(64, frames=2)"),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("params", "options", "bins"),
-    [
-        ({"bin_count": 10**6, "time_start_ns": 1380}, {}, 4e6),
-        ({"bin_count": 2 * 10**5, "time_start_ns": 1380}, {"components": True, "max_memory": 5}, 4 * 8e5),
-        ({"bin_count": 2 * 10**5, "time_start_ns": 1380}, {"derivatives": ["attenuation", "scattering"]}, 3 * 8e5),
-    ],
-)
-def test_the_estimate_is_within_a_factor_of_two_of_the_peak(params, options, bins):
-    estimate = 116 * bins  # of `choose_accumulator`
-    assert 0.5 < estimate / limited(params, options) < 2
+@pytest.mark.parametrize("name", TASKS)
+def test_the_estimate_is_within_a_factor_of_two_of_the_peak(name, tmp_path):
+    estimate, peak = limited(TASKS[name][0], tmp_path / "record.nc", TASKS[name][1])
+    assert 0.5 < estimate / peak < 2, (estimate, peak)

@@ -11,6 +11,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import dataset as dataset_module
 from mitransient_lidar.results.formats import picture_order
 
 ATTRIBUTES = {
@@ -261,6 +262,13 @@ def test_format_follows_the_content_not_the_suffix(tmp_path, suffix):
     results.save(make(), tmp_path / f"a{suffix}")
     os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
     assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
+
+
+def test_exr_files_of_too_many_bins_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset_module, "MOST_EXR_BINS", 1)
+    with pytest.raises(UserError, match=r"cannot write .*a\.exr: \d+ bins are more than 1, its most; use a \.nc file"):
+        results.save(make(), tmp_path / "a.exr")
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.slow

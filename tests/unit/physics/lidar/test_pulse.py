@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import exponnorm
 
+from mitransient_lidar.physics.lidar import pulse
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 
 SIGMA_5 = 5 / 2.3548200450309493
@@ -117,7 +118,10 @@ def test_waveform_of_one_echo():
     assert np.sum(power) * 0.5e-9 == pytest.approx(2e-12, rel=1e-12, abs=0)
 
 
-def test_waveform_matches_direct_sum_within_the_record():
+@pytest.mark.parametrize("longest_direct", [2000, 0])
+def test_waveform_matches_direct_sum_within_the_record(longest_direct, monkeypatch):
+    """By direct sums and Fourier transforms."""
+    monkeypatch.setattr(pulse, "_LONGEST_DIRECT", longest_direct)
     rng = np.random.default_rng(5)
     energy = rng.random((3, 20))
     kernel = (-7, rng.random(40))
