@@ -80,9 +80,7 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
-    if target.suffix == ".exr" and (bins := dataset.sizes["time"]) > results.MOST_EXR_BINS:
-        typer.echo(f"no EXR file: {bins} bins are more than {results.MOST_EXR_BINS}, its most", err=True)
-    elif target.suffix == ".exr":
+    if target.suffix == ".exr":
         results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
     elif target.suffix == ".nc":
         (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)

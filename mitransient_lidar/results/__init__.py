@@ -1,7 +1,6 @@
 """Datasets of results, and their files."""
 
 from mitransient_lidar.results.dataset import (
-    MOST_EXR_BINS,
     add_batches,
     add_components,
     add_derivatives,
@@ -17,7 +16,6 @@ from mitransient_lidar.results.dataset import (
 )
 
 __all__ = [
-    "MOST_EXR_BINS",
     "add_batches",
     "add_components",
     "add_derivatives",

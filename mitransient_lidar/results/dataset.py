@@ -48,9 +48,6 @@ from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
 _LOG = logging.getLogger(__name__)
 
-#: Largest number of bins of an EXR file: OpenEXR needs 2 s for 8000, and 16 times as long for four times as many.
-MOST_EXR_BINS = 10_000
-
 _VARIABLES: dict[str, dict[str, str]] = {
     "impulse_response": {
         "units": "J",
@@ -457,8 +454,6 @@ def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
         raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
     # The attributes have the curve of the errors of sums in its place.
     dataset = dataset.drop_dims(sum_errors.DIMS, errors="ignore")
-    if (bins := dataset.sizes["time"]) > MOST_EXR_BINS:
-        raise UserError(f"cannot write {path}: {bins} bins are more than {MOST_EXR_BINS}, its most; use a .nc file.")
     if extra := [str(name) for name in dataset.data_vars if name not in _VARIABLES]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     stacks: dict[str, dict[str, npt.NDArray[Any]]] = {}

@@ -2,7 +2,8 @@
 
 A file has one or more parts of scan lines, compressed with ZIP. A stack of time bins is one part whose layers are the
 bins: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``,
-``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs.
+``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs. Beyond 1024 channels it
+has several parts, named by their first channel.
 
 The attributes are written twice: OpenEXR supports only integers and floats of 32 bits and no empty list, so a JSON
 string (header attribute ``mitransientLidar``) stores them exactly; ``exrheader`` and other programs read the copies
@@ -31,6 +32,8 @@ _EXACT = "mitransientLidar"
 _CHECKSUM = "mitransientLidarSha256"
 _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
 _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
+#: Channels of a part: OpenImageIO reads no more, and OpenEXR takes a time that grows with their square.
+_MOST_CHANNELS = 1024
 _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
@@ -78,7 +81,18 @@ def write(
             digits = max(4, len(str(len(images) - 1)))
             for index, image in enumerate(images):
                 channels[f"{stack}{index:0{digits}d}.{component}"] = image
-    write_parts(path, [Part("", header(readable, exact), channels)])
+    names = sorted(channels)
+    several = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
+    shared = header(readable, exact)
+    parts = [
+        Part(
+            chosen[0] if len(several) > 1 else "",
+            shared if number == 0 else {},
+            {name: channels[name] for name in chosen},
+        )
+        for number, chosen in enumerate(several)
+    ]
+    write_parts(path, parts)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
@@ -91,12 +105,11 @@ def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
     """
     parts = read_parts(path)
     exact = exact_metadata(path, parts[0].attributes)
-    if len(parts) > 1:
-        raise UserError(f"{path} holds {len(parts)} images and no time bins.")
     layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
-    for name, image in parts[0].channels.items():
-        if match := _LAYER.fullmatch(name):
-            layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
+    for part in parts:
+        for name, image in part.channels.items():
+            if match := _LAYER.fullmatch(name):
+                layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
     stacks: Stacks = {}
     for (stack, component), by_bin in layers.items():
         if sorted(by_bin) != list(range(len(by_bin))):

@@ -11,7 +11,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import dataset as dataset_module
+from mitransient_lidar.results import exr
 from mitransient_lidar.results.formats import picture_order
 
 ATTRIBUTES = {
@@ -264,11 +264,21 @@ def test_format_follows_the_content_not_the_suffix(tmp_path, suffix):
     assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
 
 
-def test_exr_files_of_too_many_bins_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset_module, "MOST_EXR_BINS", 1)
-    with pytest.raises(UserError, match=r"cannot write .*a\.exr: \d+ bins are more than 1, its most; use a \.nc file"):
-        results.save(make(), tmp_path / "a.exr")
-    assert not any(tmp_path.iterdir())
+def test_images_of_many_bins_have_several_parts(tmp_path):
+    """OpenImageIO opens no part of more than 1024 channels, and 8000 bins in one took OpenEXR 2 s."""
+    many = np.random.default_rng(1).random((1, 2, 1500), dtype=np.float32)
+    exr.write(tmp_path / "a.exr", {"bin": {"Y": many, "stderr": 2 * many}}, {"exact": 1}, {"readable": 2})
+    stacks, exact = exr.read(tmp_path / "a.exr")
+    np.testing.assert_array_equal(stacks["bin"]["stderr"], 2 * many)
+    assert exact == {"exact": 1}
+    parts = exr.read_parts(tmp_path / "a.exr")
+    sizes = {part.name: len(part.channels) for part in parts}
+    assert sizes == {"bin0000.Y": 1024, "bin0512.Y": 1024, "bin1024.Y": 952}
+    # A file without its middle is not taken for a shorter record.
+    own = {"mitransientLidar": parts[0].attributes["mitransientLidar"]}
+    exr.write_parts(tmp_path / "b.exr", [parts[0]._replace(attributes=own), parts[2]._replace(attributes={})])
+    with pytest.raises(UserError, match="damaged"):
+        exr.read(tmp_path / "b.exr")
 
 
 @pytest.mark.slow
