@@ -81,8 +81,9 @@ def fit(
 
     Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc (with
     covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times the
-    expected one is refused: it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it
-    prints and writes (exit code 130).
+    expected one is refused, or, where the noise is unknown, one that leaves 10 % of the squares of the samples: it is
+    printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it prints and writes (exit code
+    130).
     """
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))

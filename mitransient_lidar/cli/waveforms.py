@@ -117,7 +117,7 @@ def _print(found: xr.Dataset) -> None:
     for line in lines:
         cells = dict(zip(names, line, strict=True))
         # Of missing echoes, only surface and bottom are listed.
-        if "no_echo" in cells["flags"] and cells["echo"] in ("column", "target"):
+        if "no_echo" in cells["flags"] and cells["echo"] not in ("surface", "bottom"):
             continue
         if table.row_count >= _MOST_LINES:
             left_out += 1

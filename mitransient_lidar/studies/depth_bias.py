@@ -220,7 +220,7 @@ def depth_bias(
             except DryBottomError:
                 _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
             else:
-                if rendered.attrs["interrupted"]:
+                if rendered.attrs.get("interrupted"):
                     raise KeyboardInterrupt(f"interrupted after {number} of {total} renders, and none is kept.")
                 recorded = detect_waveforms(rendered, receiver or instrument, records, seed)
                 _check_counts(recorded)

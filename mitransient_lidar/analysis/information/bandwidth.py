@@ -37,11 +37,13 @@ class BehindBandwidth:
         smoothed = light.assign({name: _behind(light[name], bandwidth, width) for name in names})
         ends = [_behind(light["waveform"], factor * bandwidth, width) for factor in (1 + _STEP, 1 - _STEP)]
         slope = ((ends[0] - ends[1]) / (2 * _STEP * bandwidth)).expand_dims(parameter=[BANDWIDTH])
-        slopes = smoothed["waveform_derivative"]
-        if "parameter_units" in slopes.coords:
+        # A model without other free parameters has no derivatives.
+        slopes = smoothed.get("waveform_derivative")
+        if slopes is not None and "parameter_units" in slopes.coords:
             slope = slope.assign_coords(parameter_units=("parameter", ["MHz"]))
-        joined = xr.concat([slopes, slope], "parameter", coords="minimal", compat="override", join="override")
-        return smoothed.drop_dims("parameter").assign(waveform_derivative=joined)
+        both = [slope] if slopes is None else [slopes, slope]
+        joined = xr.concat(both, "parameter", coords="minimal", compat="override", join="override")
+        return smoothed.drop_dims("parameter", errors="ignore").assign(waveform_derivative=joined)
 
 
 def _behind(array: xr.DataArray, bandwidth_mhz: float, width_ns: float) -> xr.DataArray:

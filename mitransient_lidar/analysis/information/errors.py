@@ -41,6 +41,8 @@ class Errors:
     chi_squared, expected, freedom
         Sum of the squared residuals, its mean, and the degrees of freedom of the chi-squared distribution, scaled to
         this mean, that has its variance.
+    grown
+        Whether the covariance is multiplied by the reduced chi-squared.
     """
 
     covariance: FloatArray
@@ -50,6 +52,7 @@ class Errors:
     chi_squared: float
     expected: float
     freedom: float
+    grown: bool = False
 
     @property
     def stderr(self) -> FloatArray:
@@ -80,7 +83,7 @@ class Errors:
 
     def grown_with_misfit(self) -> Errors:
         """Return errors whose covariance is multiplied by the reduced chi-squared if there is a misfit."""
-        return replace(self, covariance=self.covariance * self.reduced) if self.is_misfit else self
+        return replace(self, covariance=self.covariance * self.reduced, grown=True) if self.is_misfit else self
 
     def refusal(self) -> str:
         """Return why the scene does not explain waveforms of known noise, empty if it does."""
@@ -97,7 +100,7 @@ class Errors:
         if self.is_misfit and self.reduced <= WORST_CHI_SQUARED:
             found.append(
                 f"chi-squared is {self.reduced:.3g} times the expected one: scene or noise are not those of the "
-                "waveforms, and the stated errors are multiplied by its root"
+                f"waveforms, and the stated errors are {'' if self.grown else 'not '}multiplied by its root"
             )
         for name, value, influence, held in zip(names, values, self.influence, self.held, strict=True):
             if held:
@@ -215,7 +218,7 @@ def estimate_errors(
     by_model = np.full(held.size, np.nan)
     by_model[known] = np.sqrt(np.maximum(np.diag(parts[1]), 0)) / influence[known]
     freedom = 2 * expected**2 / variance if variance > 0 else math.nan
-    return Errors(covariance, by_model, influence, held, chi_squared, expected, freedom)
+    return Errors(covariance, by_model, influence, held, chi_squared, expected, freedom, scaled and expected > 0)
 
 
 def refusal_of_unknown_noise(unexplained: float) -> str:
@@ -223,8 +226,8 @@ def refusal_of_unknown_noise(unexplained: float) -> str:
     if unexplained <= WORST_UNEXPLAINED:
         return ""
     return (
-        f"the fit is refused: its residuals have {100 * unexplained:.3g} % of the squares of the samples, more than "
-        f"{100 * WORST_UNEXPLAINED:g} %. Start from other values, or check scene and receiver"
+        f"the fit is refused: its residuals, but for their noise, have {100 * unexplained:.3g} % of the squares of the "
+        f"samples, more than {100 * WORST_UNEXPLAINED:g} %. Start from other values, or check scene and receiver"
     )
 
 

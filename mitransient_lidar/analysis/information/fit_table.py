@@ -46,7 +46,9 @@ def fit_table(
     residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
     sentences = list(messages)
     if noise is None:
-        unexplained = errors.chi_squared / max(float(np.nansum(found.values[weights > 0] ** 2)), 1e-300)
+        # Noise of a sample is independent of that of the next one: it is left out of what the scene does not explain.
+        shared = float(np.nansum(residual[:, 1:] * residual[:, :-1]))
+        unexplained = max(shared, 0.0) / max(float(np.nansum(found.values[weights > 0] ** 2)), 1e-300)
         deviation = math.sqrt(errors.reduced) if errors.reduced > 0 else 1.0
         residual, errors = residual / deviation, replace(errors, chi_squared=errors.expected)
         refusal = refusal_of_unknown_noise(unexplained)

@@ -460,7 +460,7 @@ class WaveformFit:
             noise = noise - recorded
         residuals = weights * (np.nan_to_num(self.found.values) - mean)
         alike = self.found.correlation
-        if not self.found.calibrated and self.found.receiver is None:
+        if noise is None and not self.found.calibrated and self.found.receiver is None:
             alike = residual_correlation(residuals)
         errors = estimate_errors(
             residuals,
