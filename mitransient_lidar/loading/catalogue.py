@@ -91,7 +91,9 @@ def copy_scene(
     target = destination / source.name if destination.is_dir() else destination
     neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)
     copies = {target.parent / file.name: file for file in neighbours if f'"{file.name}"' in text}
-    for copy in (target, *copies):
+    for copy, original in ((target, source), *copies.items()):
+        if copy.exists() and copy.samefile(original):
+            raise UserError(f"{copy} is the file to be copied: choose another place")
         if os.path.lexists(copy) and not overwrite:
             raise UserError(f"{copy} exists already: choose another place, or replace it with --overwrite")
     with together():

@@ -187,7 +187,7 @@ def leave_the_gpu(what: str) -> None:
     """
     import mitsuba as mi
 
-    if mi.variant() == "cuda_ad_mono":
+    if (mi.variant() if mi.variant() in SUPPORTED_VARIANTS else choose_variant()) == "cuda_ad_mono":
         _LOG.warning("%s by llvm_ad_mono: a kernel of cuda_ad_mono can trace rays through one scene only", what)
         set_variant("llvm_ad_mono")
 

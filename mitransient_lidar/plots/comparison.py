@@ -27,13 +27,18 @@ def plot_comparison(
     time = first["time"].values
     are_few = len(outcome.z) <= _MOST_CURVES
     palette = drawing.pixel_colours(len(outcome.z) if are_few else 1)
-    powers = [_curves(result, are_few) for result in (first, second)]
-    for (power, error), style, label in zip(powers, ("-", "--"), _labels(first, second), strict=True):
+    powers, errors = ([_by_pixel(one, name) for one in (first, second)] for name in ("waveform", "waveform_stderr"))
+    counted = np.isfinite(outcome.z)
+    if not are_few:
+        # Pixels share light: the error of their sum is not that of independent ones, and has no band.
+        known = np.isfinite(powers[0]) & np.isfinite(powers[1])
+        powers = [np.where(known, power, 0).sum(axis=0, keepdims=True) for power in powers]
+        errors = [np.zeros_like(power) for power in powers]
+    for power, error, style, label in zip(powers, errors, ("-", "--"), _labels(first, second), strict=True):
         for i, colour in enumerate(palette):
             curve = {"color": colour, "linestyle": style, "linewidth": 0.9, "label": "_" if i else label}
             drawing.draw_band(upper, time, power[i], 2 * error[i], lowest=1e-30, **curve)
-    counted = np.isfinite(outcome.z)
-    shown = powers[0][0][counted if are_few else counted.any(axis=0, keepdims=True)]
+    shown = powers[0][counted if are_few else counted.any(axis=0, keepdims=True)]
     upper.set_yscale("log")
     upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
     upper.set_xlim(drawing.time_limits(first))
@@ -55,12 +60,6 @@ def plot_comparison(
     text += f" (limit of chance {outcome.limit:.1f})"
     figure.suptitle(drawing.titled(first.attrs, text), fontsize="medium")
     return drawing.save(figure, path)
-
-
-def _curves(result: xr.Dataset, by_pixel: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the waveforms and standard errors of the pixels, or those of their sum, shape (curve, time)."""
-    power, error = (_by_pixel(result, name) for name in ("waveform", "waveform_stderr"))
-    return (power, error) if by_pixel else (power.sum(0, keepdims=True), np.sqrt((error**2).sum(0, keepdims=True)))
 
 
 def _labels(first: xr.Dataset, second: xr.Dataset) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
@@ -120,6 +121,8 @@ def render_found_shots(
     UserError
         If the scene is invalid, has no waves or no parameters ``aim_x`` and ``aim_y``, or `max_time` is out of range.
     """
+    if waveforms:
+        variants.leave_the_gpu("shots are rendered")
     session = open_scene(scene, params)
     loaded = session.scene
     sea = SeaMap.of_scene(loaded)

@@ -239,11 +239,20 @@ def _convolved(padded: FloatArray, weights: FloatArray) -> FloatArray:
     length = 1 << (padded.shape[1] - 1).bit_length()
     spectrum, found = np.fft.rfft(weights, length), np.empty_like(padded)
     for row, record in zip(found, padded, strict=True):
-        row[:] = np.fft.irfft(np.fft.rfft(record, length) * spectrum, length)[: record.size]
+        unknown = np.isnan(record)
+        row[:] = np.fft.irfft(np.fft.rfft(np.where(unknown, 0, record), length) * spectrum, length)[: record.size]
+        # Rounding, of the largest power, must neither make power negative nor light bins that no energy reaches.
         if not np.any(record < 0):
-            # Rounding, of the largest power, must not make power negative.
             np.maximum(row, 0, out=row)
+        row[~_reached(record != 0, weights.size)] = 0
+        row[_reached(unknown, weights.size)] = np.nan
     return found
+
+
+def _reached(sources: npt.NDArray[np.bool_], size: int) -> npt.NDArray[np.bool_]:
+    """Return the bins in which a kernel of some bins has a share of any of the sources."""
+    known = np.concatenate([np.zeros(size, dtype=np.int64), np.cumsum(sources)])
+    return np.asarray(known[size:] > known[: sources.size])
 
 
 def _gaussian_response(t: FloatArray, sigma: float, tau: float) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.validation import integer, relative_error
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
@@ -110,6 +111,8 @@ class Renders:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
         if key not in self._sessions:
+            # Series of its shots are rendered later.
+            variants.leave_the_gpu("figures are rendered")
             self._sessions[key] = open_scene(scene, {"surface_seed": sea} if sea else None)
         return self._sessions[key]
 

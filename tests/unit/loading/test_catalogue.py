@@ -109,6 +109,13 @@ def test_copy_overwrites_nothing(folder, tmp_path):
     assert not (tmp_path / "fig09.xml").exists()
 
 
+def test_a_scene_is_not_copied_onto_itself(folder, tmp_path):
+    """A copy has no includes: the scene's own file would be lost."""
+    copy = catalogue.copy_scene("fig09", tmp_path)
+    with pytest.raises(UserError, match=r"fig09\.xml is the file to be copied: choose another place"):
+        catalogue.copy_scene(copy, tmp_path, overwrite=True)
+
+
 def test_copy_into_a_missing_folder(folder, tmp_path):
     with pytest.raises(UserError, match=r"cannot write .*missing.*No such file"):
         catalogue.copy_scene("fig10", tmp_path / "missing" / "a.xml")

@@ -76,10 +76,12 @@ def test_many_pixels_are_drawn_as_their_sum():
         )
         for scale in (1.0, 1.1)
     )  # fmt: skip
+    # What one of them lacks is left out of both.
+    first["waveform"][7] = np.nan
     outcome = compare(first, second)
     upper, lower = plot_comparison(first, second, outcome).axes
-    np.testing.assert_allclose([line.get_ydata() for line in upper.lines], [100 * power[0], 110 * power[0]])
-    # The error of a sum of 100 independent pixels is a tenth of theirs.
-    assert upper.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(0.1004)
+    np.testing.assert_allclose([line.get_ydata() for line in upper.lines], [99 * power[0], 1.1 * 99 * power[0]])
+    # Pixels share light, so that the error of the sum is unknown.
+    np.testing.assert_allclose(np.ptp(upper.collections[0].get_paths()[0].vertices[:, 1]), np.ptp(99 * power[0]))
     (ranges,) = lower.collections
-    np.testing.assert_allclose([path.vertices[0, 1] for path in ranges.get_paths()], outcome.z.min(axis=0))
+    np.testing.assert_allclose([path.vertices[0, 1] for path in ranges.get_paths()], np.nanmin(outcome.z, axis=0))

@@ -134,6 +134,17 @@ def test_waveform_matches_direct_sum_within_the_record(longest_direct, monkeypat
     np.testing.assert_array_equal(waveform(energy, 2.0, (25, np.ones(3))), 0)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_transforms_light_no_bins_that_no_energy_reaches(sign, monkeypatch):
+    """Rounding of the largest power would be light before the surface that is the same in each pass."""
+    monkeypatch.setattr(pulse, "_LONGEST_DIRECT", 0)
+    energy = np.zeros((2, 300))
+    energy[0, 100], energy[1, 200] = sign, np.nan
+    power = waveform(energy, 1.0, (-10, np.linspace(1.0, 2.0, 31)))
+    assert np.flatnonzero(power[0]).tolist() == list(range(90, 121))
+    assert np.flatnonzero(np.isnan(power[1])).tolist() == list(range(190, 221))
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
