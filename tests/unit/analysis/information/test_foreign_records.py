@@ -100,6 +100,16 @@ def test_a_scene_that_does_not_explain_waveforms_of_unknown_noise_is_refused(tmp
     fitted = fit(write(tmp_path / "shot.csv", 1e6 * other, TIME), (1, 1, 1))
     assert fitted.attrs["refused"] == 1
     assert any("of the squares of the samples, more than 10 %" in text for text in fitted.attrs["messages"])
+    # Noise alone, of more than a tenth of the squares, is none of its faults.
+    light = 1e6 * model(TRUTH)["waveform"].values[0]
+    noisy = light + np.random.default_rng(2).normal(0, 0.5 * np.sqrt(np.mean(light**2)), TIME.size)
+
+    def of_depth(values):
+        return model({**TRUTH, **values}).sel(parameter=["bottom_depth"])
+
+    path = write(tmp_path / "noisy.csv", noisy, TIME)
+    fitted = mitransient_lidar.fit(path, of_depth, "bottom_depth", start={"bottom_depth": 6.0})
+    assert fitted.attrs["refused"] == 0
 
 
 def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
@@ -115,6 +125,9 @@ def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
     assert fit(path, (1, 1, 1), noise=0.003 * SCALE).attrs["refused"] == 1
     with pytest.raises(UserError, match="alternatives"):
         fit(path, (1, 1, 1), free=[*TRUTH, "bandwidth_mhz"], receiver="apd")
+    # A scene of which nothing is free has no derivatives.
+    alone = BehindBandwidth(lambda _: model(TRUTH).drop_dims("parameter"))({"bandwidth_mhz": 80.0})
+    assert alone["waveform_derivative"].sizes["parameter"] == 1
 
 
 def test_volts_behind_a_logarithm_are_expanded(tmp_path):
