@@ -172,7 +172,7 @@ def detect(
                     integrator=integrator,
                 )
             )
-            if found[-1].attrs["interrupted"]:
+            if found[-1].attrs.get("interrupted"):
                 raise KeyboardInterrupt("interrupted; detection needs all renders, and none is kept.")
             if progress is not None:
                 done = len(experiments) * renders + len(found)

@@ -160,7 +160,7 @@ def target_map(
             left = max(limit - (time.perf_counter() - began), 1e-3)
             options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
         cell = target_signal(scene, moved, **options).drop_dims("time")
-        if cell.attrs["interrupted"]:
+        if cell.attrs.get("interrupted"):
             raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
         cells.append(cell.assign(place_passes=((), cell.attrs["passes"], {"units": "1", "long_name": "passes"})))
         if progress is not None:

@@ -73,7 +73,7 @@ def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
         (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532 nm for kd"),
         (["jerlov", "IV"], "IV"),
         (["petzold"], "value is missing: petzold needs one"),
-        (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid for petzold"),
+        (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid, autec_7, "),
         (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533 nm for petzold"),
         (["profile"], "value is missing: profile needs one"),
         (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
