@@ -127,8 +127,8 @@ class ErrorCorrelation:
     def over(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return the middles of the blocks [ns], and their correlations; None before the second pass.
 
-        That of two blocks is the mean correlation of a bin of one with a bin of the other, that of a block with itself
-        the mean over pairs of different bins, 1 for one bin. Bins without light have none.
+        Entry (A, B) is the mean correlation of a bin in A with a bin in B. Entry (A, A) is the mean over pairs of
+        different bins; for a block of one bin it is 1. Other entries of blocks without light are 0.
         """
         if self._count < 2:
             return None
@@ -140,9 +140,8 @@ class ErrorCorrelation:
         found[of_block] -= parts.sum(axis=0)
         known = possible > _SHARED * np.outer(*2 * [np.sqrt(np.maximum(np.sum(sums**2, axis=0), 0))])
         correlation = np.divide(found, possible, out=np.zeros_like(found), where=known)
-        if self._edges.size == time_ns.size:
-            correlation[of_block] = 1.0
         sizes = np.diff(np.append(self._edges, time_ns.size))
+        correlation[of_block] = np.where(sizes == 1, 1.0, correlation[of_block])
         return np.add.reduceat(time_ns, self._edges) / sizes, np.clip(correlation, -1, 1)
 
 

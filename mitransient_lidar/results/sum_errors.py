@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, IntArray
 
 #: Variable with the correlation of the errors of bins, and its dimensions.
 VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")
@@ -18,7 +18,69 @@ VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")
 #: Most sums of a length, and smallest sum over the largest one, for the curve.
 _SUMS, _FAINT = 256, 1e-6
 
+#: Passes below which correlations are hardly known, smallest ratio of means, and samples in memory at a time for them.
+_FEW_PASSES, _LEAST_RATIO, _TOGETHER = 8, 0.1, 2**18
+
 _CURVE = ("error_inflation_bins", "error_inflation")
+
+
+@dataclass(frozen=True)
+class BlockCorrelation:
+    """Correlation of the errors of bins, of which those in two blocks of bins have the same.
+
+    Attributes
+    ----------
+    correlation
+        Mean correlation of a bin of one block with a bin of another, shape (blocks, blocks); on the diagonal, of
+        different bins of a block.
+    block
+        Block of each bin, ascending, shape (time,).
+    inflation
+        Ratio of the errors that are given to those of bins, shape () or (time,).
+    """
+
+    correlation: FloatArray
+    block: np.ndarray[Any, np.dtype[np.intp]]
+    inflation: FloatArray = field(default_factory=lambda: np.ones(()))
+
+    def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
+        """Return the covariances of k sums over the same bins, shape (..., k, k).
+
+        Parameters
+        ----------
+        scaled
+            Errors of neighbouring bins times their weights, shape (..., k, bins).
+        first
+            Number of the first of them in the record.
+        """
+        part = slice(first, first + scaled.shape[-1])
+        own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
+        edges = np.flatnonzero(np.diff(own, prepend=-1))
+        sums = np.add.reduceat(scaled, edges, axis=-1)
+        shared = self.correlation[np.ix_(own[edges], own[edges])]
+        between = np.tensordot(sums, shared, 1) @ np.swapaxes(sums, -1, -2)
+        return np.asarray(between + (scaled * self._alone[own]) @ np.swapaxes(scaled, -1, -2))
+
+    def variances(self, scaled: FloatArray, places: IntArray) -> FloatArray:
+        """Return the variances of sums, shape (n,), over the bins `places` of their own, shape (n, bins)."""
+        own = self.block[places]
+        scaled = scaled / np.broadcast_to(self.inflation, self.block.shape)[places]
+        local = own - own.min(axis=1, keepdims=True)
+        count, width = len(own), int(local.max(initial=0)) + 1
+        index = local + width * np.arange(count)[:, np.newaxis]
+        sums = np.bincount(index.ravel(), scaled.ravel(), count * width).reshape(count, width)
+        blocks = np.minimum(own.min(axis=1, keepdims=True) + np.arange(width), len(self.correlation) - 1)
+        variance = np.sum(self._alone[own] * scaled**2, axis=1)
+        for lag in range(width):
+            one, other = slice(width - lag), slice(lag, None)
+            shared = self.correlation[blocks[:, one], blocks[:, other]]
+            variance += (2 if lag else 1) * np.sum(sums[:, one] * sums[:, other] * shared, axis=1)
+        return np.asarray(variance)
+
+    @property
+    def _alone(self) -> FloatArray:
+        """Part of the variance of a bin of each block that is its own: a bin is fully correlated with itself."""
+        return np.asarray(1 - np.diagonal(self.correlation))
 
 
 @dataclass(frozen=True)
@@ -27,30 +89,27 @@ class SumErrors:
 
     Attributes
     ----------
-    correlation
-        Mean correlation of the errors of the bins of two blocks of bins, shape (blocks, blocks); within one block, of
-        different bins. None where only the curve is known, as from an EXR file.
-    block
-        Block of each bin, shape (time,).
+    shared
+        The correlation; None where only the curve is known, as from an EXR file.
     curve
         Numbers of bins, and the median ratios of the errors of their sums to those of independent bins, shape (2, n);
         empty where nothing is known.
     """
 
-    correlation: FloatArray | None
-    block: np.ndarray[Any, np.dtype[np.intp]]
+    shared: BlockCorrelation | None
     curve: FloatArray
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
         """Return what a result states, None without a statement."""
         curve = _curve(dataset.attrs)
-        time = np.asarray(dataset["time"].values, dtype=np.float64)
         if VARIABLE not in dataset:
-            return cls(None, np.zeros(time.size, dtype=np.intp), curve) if curve.size else None
-        middles = np.asarray(dataset[DIMS[0]].values, dtype=np.float64)
-        block = np.abs(time[:, np.newaxis] - middles).argmin(axis=1)
-        return cls(np.asarray(dataset[VARIABLE].values, dtype=np.float64), block, curve)
+            return cls(None, curve) if curve.size else None
+        time, middles = (np.asarray(dataset[name].values, dtype=np.float64) for name in ("time", DIMS[0]))
+        # All blocks but the last one are of one size. A sum of pixels may have given the correlation their dimension.
+        edges = middles[:-1] + 0.5 * (middles[1:2] - middles[:1])
+        correlation = np.reshape(dataset[VARIABLE].values, 2 * (middles.size,)).astype(np.float64)
+        return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:
         """Return the standard error of a sum of weighted bins.
@@ -65,43 +124,33 @@ class SumErrors:
             Number of the first of them in the record.
         """
         scaled = deviation * weights
-        squares = np.sum(scaled**2, axis=-1)
-        if self.correlation is None:
+        if self.shared is None:
             number = float(np.sum(weights) ** 2 / max(np.sum(weights**2), 1e-300))
-            number = max(number, 1.0)
-            bound = np.sum(np.abs(scaled), axis=-1)
-            return np.asarray(np.minimum(np.sqrt(squares) * self._of_curve(number), bound))
-        own = self.block[first : first + scaled.shape[-1]]
-        edges = np.flatnonzero(np.diff(own, prepend=-1))
-        sums, parts = (np.add.reduceat(values, edges, axis=-1) for values in (scaled, scaled**2))
-        shared = self.correlation[np.ix_(own[edges], own[edges])]
-        # A bin is fully correlated with itself, whatever its block is.
-        diagonal = np.diagonal(shared)
-        variance = np.sum((sums @ shared) * sums, axis=-1) + np.sum((1 - diagonal) * parts, axis=-1)
+            alone, bound = np.linalg.norm(scaled, axis=-1), np.sum(np.abs(scaled), axis=-1)
+            return np.asarray(np.minimum(alone * self._of_curve(max(number, 1.0)), bound))
+        variance = self.shared.covariance(scaled[..., np.newaxis, :], first)[..., 0, 0]
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
-    def of_means(self, deviation: FloatArray, run: int) -> FloatArray:
+    def of_means(self, deviation: FloatArray, run: int, passes: int) -> FloatArray:
         """Return the ratio of the errors of means over `run` bins about each bin to those of independent bins.
 
         The ratio is for the mean over pixels of the squares of the errors, shape (pixels, time); it is of the shape
-        (time,).
+        (time,). A few passes may show correlations far below the true ones: the ratio is then at least the median one.
         """
         count = deviation.shape[-1]
-        if self.correlation is None:
-            return np.full(count, self._of_curve(run))
-        typical = np.sqrt(np.mean(deviation**2, axis=0))
-        start = np.clip(np.arange(count) - run // 2, 0, max(count - run, 0))
-        whole = [self.of_sum(typical[at : at + run], np.ones(min(run, count)), at) for at in start]
-        alone = [math.sqrt(float(np.sum(typical[at : at + run] ** 2))) for at in start]
-        return np.divide(whole, alone, out=np.ones(count), where=np.array(alone) > 0)
-
-    def matrix(self) -> FloatArray | None:
-        """Return the correlations of all bins, shape (time, time), None where only the curve is known."""
-        if self.correlation is None:
-            return None
-        whole = self.correlation[np.ix_(self.block, self.block)]
-        np.fill_diagonal(whole, 1.0)
-        return whole
+        least = max(self._of_curve(run), 1.0) if passes < _FEW_PASSES else _LEAST_RATIO
+        if self.shared is None:
+            return np.full(count, max(self._of_curve(run), least))
+        typical, run = np.sqrt(np.mean(deviation**2, axis=0)), min(run, count)
+        ratio, together = np.ones(count), max(_TOGETHER // run, 1)
+        for at in range(0, count, together):
+            start = np.clip(np.arange(at, min(at + together, count)) - run // 2, 0, count - run)
+            places = start[:, np.newaxis] + np.arange(run)
+            own = typical[places]
+            whole, alone = self.shared.variances(own, places), np.sum(own**2, axis=1)
+            known = alone > 0
+            ratio[at : at + together][known] = np.sqrt(np.maximum(whole[known], 0) / alone[known])
+        return np.maximum(ratio, least)
 
     def median_curve(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
         """Return numbers of bins, 1, 2, 4, ..., and the median ratios of the errors of their sums to independent bins.
@@ -125,7 +174,12 @@ class SumErrors:
         return bins, inflation
 
     def _of_curve(self, number: float) -> float:
-        """Return the ratio for a number of bins: linear in its logarithm, with the square root beyond the last one."""
+        """Return the ratio for a number of bins: linear in its logarithm, with the square root beyond the last one.
+
+        It is 1 without a curve.
+        """
+        if not self.curve.size:
+            return 1.0
         known, values = self.curve
         return float(np.interp(math.log(number), np.log(known), values)) * math.sqrt(max(number / known[-1], 1))
 

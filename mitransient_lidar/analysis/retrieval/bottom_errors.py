@@ -15,6 +15,7 @@ import xarray as xr
 from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.analysis.waveforms.column_onset import Focusing
+from mitransient_lidar.analysis.waveforms.echo_detection import error_of_sums
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
@@ -33,6 +34,7 @@ _OF_ECHO = 0.03  # relative error of the energy of the bottom echo with its tail
 #: that the water scatters twice by large angles joins the column within its first metres, and its decay is slower.
 COLUMN_GAIN, _OF_COLUMN_GAIN = 0.035, 0.04
 _AROUND = (2.0, 4.0)  # echo widths before and behind a bottom echo whose light counts
+_APART = 4.0  # echo widths between a bottom echo and others that leave this light its own
 _OF_LOSS = 0.05  # relative error of the optical depth of both ways: the bottom's light decays unlike the column's
 _UNTESTED = 0.15  # the same for a column that is too short to be tested for layers
 _DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
@@ -124,7 +126,8 @@ def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, Fl
 
     Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of it are not in the Gaussian
     that is fitted to the echo. The sum of the signal about the echo, less the column before it, is all of it. The
-    Gaussian counts where noise makes the sum less certain than 10 %, or there is no column.
+    Gaussian counts where noise makes the sum less certain than 10 %, there is no column, the sum would reach beyond the
+    record, or another echo is less than four echo widths before the bottom's.
 
     Parameters are those of `loss_error`.
     """
@@ -137,9 +140,13 @@ def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, Fl
     column = np.where(from_echo < 0, _column_of(waveforms, records.time_ns, echoes), 0)
     seconds = 1e-9 * records.bin_ns
     total = seconds * np.sum(np.where(inside, records.power - column, 0), axis=1).reshape(energy.shape)
-    noise = np.where(inside, np.broadcast_to(records.noise, inside.shape), 0)
-    of_total = seconds * np.sqrt(np.sum(noise**2, axis=1)).reshape(energy.shape)
-    better = np.isfinite(total) & (of_total < _CERTAIN * total)
+    of_total = seconds * error_of_sums(np.where(inside, records.noise, 0), None, records.shared).reshape(energy.shape)
+    start, end = records.time_ns[[0, -1]] + 0.5 * records.bin_ns * np.array([-1, 1])
+    whole = (middle - _AROUND[0] * width >= start) & (middle + _AROUND[1] * width <= end)
+    others = echoes["time_ns"].drop_sel(echo=["column", "bottom"]).transpose("echo", ...).values
+    # Comparisons with the times of echoes that are not there are false.
+    alone = ~(others > middle - _APART * width).any(axis=0)
+    better = np.isfinite(total) & (of_total < _CERTAIN * total) & whole & alone
     return np.where(better, total, energy), np.where(better, of_total, error)
 
 

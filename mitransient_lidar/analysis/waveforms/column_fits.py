@@ -87,11 +87,11 @@ def column_fit(
     if records.shared is not None:
         # The fit weights samples as independent ones; the errors that it states have their correlation.
         weighted = np.stack(parts, axis=1) * np.where(inside, 1 / noise, 0.0)[:, np.newaxis]
-        of_samples = covariance @ weighted
-        covariance = of_samples @ records.shared @ of_samples.transpose(0, 2, 1)
+        covariance = records.shared.covariance(covariance @ weighted)
     errors = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0))
     known = enough & np.isfinite(errors).all(axis=1) & (errors[:, 0] < 1) & (level > 0)
-    correlation = covariance[:, 0, 1] / np.where(known, errors.prod(axis=1), 1.0)
+    product = errors.prod(axis=1)
+    correlation = covariance[:, 0, 1] / np.where(known & (product > 0), product, 1.0)
     numbers = [level, level * errors[:, 0], rate, errors[:, 1], correlation, residual]
     level, level_error, rate, rate_error, correlation, residual = (np.where(known, one, np.nan) for one in numbers)
     return ColumnFit(level, level_error, rate, rate_error, correlation, residual, np.where(known, count, 0))

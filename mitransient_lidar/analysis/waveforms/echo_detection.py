@@ -12,12 +12,12 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, positive
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+from mitransient_lidar.results.sum_errors import BlockCorrelation
 
 IntArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
 
 _NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a record
-_TOGETHER = 256  # records whose correlated samples are in memory at a time
 _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
@@ -64,14 +64,14 @@ class Records:
     noise
         Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
     shared
-        Covariance of samples over the product of their noise, shape (time, time), where sums of samples are not those
-        of independent bins; on its diagonal below 1 where the noise is that of means over neighbours. None otherwise.
+        Correlation of the samples, and the inflation of their noise to that of means over neighbours, where sums of
+        samples are not those of independent bins. None otherwise.
     """
 
     power: FloatArray
     time_ns: FloatArray
     noise: FloatArray
-    shared: FloatArray | None = None
+    shared: BlockCorrelation | None = None
 
     @classmethod
     def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
@@ -132,7 +132,7 @@ class Records:
         return power, noise, inside
 
 
-def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: FloatArray | None) -> FloatArray:
+def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: BlockCorrelation | None) -> FloatArray:
     """Return the standard errors of sums of samples, shape (n,).
 
     Parameters
@@ -147,13 +147,8 @@ def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: FloatArra
     if shared is None:
         return np.asarray(np.linalg.norm(scaled, axis=1))
     if places is None:
-        return np.asarray(np.sqrt(np.maximum(np.sum((scaled @ shared) * scaled, axis=1), 0)))
-    variance = np.zeros(len(scaled))
-    for start in range(0, len(scaled), _TOGETHER):
-        own, at = scaled[start : start + _TOGETHER], places[start : start + _TOGETHER]
-        matrices = shared[at[:, :, np.newaxis], at[:, np.newaxis, :]]
-        variance[start : start + _TOGETHER] = np.einsum("ni,nij,nj->n", own, matrices, own, optimize=True)
-    return np.sqrt(np.maximum(variance, 0))
+        return np.sqrt(np.maximum(shared.covariance(scaled[:, np.newaxis])[:, 0, 0], 0))
+    return np.sqrt(np.maximum(shared.variances(scaled, places), 0))
 
 
 def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:

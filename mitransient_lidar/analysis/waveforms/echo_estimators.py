@@ -20,6 +20,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 )
 from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.results.sum_errors import BlockCorrelation
 
 _SUMMIT = 0.5  # lower limit of the summit of an echo, relative to its peak
 _EDGE = 0.15  # half the samples that a crossing is read from, in pulse widths
@@ -51,7 +52,7 @@ class Window:
     ramps: FloatArray
     level_noise: FloatArray
     places: IntArray
-    shared: FloatArray | None
+    shared: BlockCorrelation | None
 
     @classmethod
     def around(

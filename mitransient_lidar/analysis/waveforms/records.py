@@ -27,7 +27,7 @@ from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
-from mitransient_lidar.results.sum_errors import SumErrors
+from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -116,7 +116,7 @@ class Waveforms:
     lines: LinesOfSight
     event_height: FloatArray
     lowest_m: float
-    shared: FloatArray | None = None
+    shared: BlockCorrelation | None = None
 
     @property
     def count(self) -> int:
@@ -350,13 +350,15 @@ def _noise(
     return np.asarray(np.hypot(by_receiver, by_render))
 
 
-def _noise_of_render(dataset: xr.Dataset, deviation: FloatArray, run: int) -> tuple[FloatArray, FloatArray | None]:
+def _noise_of_render(
+    dataset: xr.Dataset, deviation: FloatArray, run: int
+) -> tuple[FloatArray, BlockCorrelation | None]:
     """Return the noise for means of `run` samples of a render with the errors `deviation`, and its correlation."""
     errors = SumErrors.of(dataset)
     if errors is None:
         return deviation, None
-    factor, correlation = errors.of_means(deviation, run), errors.matrix()
-    return factor * deviation, None if correlation is None else correlation / np.outer(factor, factor)
+    factor = errors.of_means(deviation, run, int(dataset.attrs.get("passes", 0)))
+    return factor * deviation, None if errors.shared is None else replace(errors.shared, inflation=factor)
 
 
 def _receiver_noise(

@@ -73,7 +73,7 @@ def test_errors_of_sums_over_any_bins_are_those_of_the_passes(bins):
         own = result["waveform_stderr"].values[:, first : first + count]
         errors, seen = SumErrors.of(result), sums.std(ddof=1) / np.sqrt(40)
         assert errors.of_sum(own, weights, first).item() == pytest.approx(seen, rel=1e-5 if bins < 512 else 0.05)
-        by_curve.append(SumErrors(None, errors.block, errors.curve).of_sum(own, weights, first).item() / seen)
+        by_curve.append(SumErrors(None, errors.curve).of_sum(own, weights, first).item() / seen)
     assert max(by_curve) > 1.3 or min(by_curve) < 0.7
 
 

@@ -24,6 +24,8 @@ from synthetic_shots import (
 
 from mitransient_lidar.analysis.retrieval import bottom_errors, retrieve, surface_inputs
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
+from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.results.sum_errors import with_correlation
 
 
 def with_shares(shot, shares):
@@ -125,3 +127,24 @@ def test_layers_leave_no_reflectance_that_looks_sure():
     one = retrieve.bottom(layered(0.2, 0.2, 4.0), LEVEL)
     assert abs(float(one["reflectance"][2]) - RHO) < 0.2 * float(one["reflectance_stderr"][2])
     assert float(one["reflectance_stderr"][2]) < 0.2 * float(one["reflectance"][2])
+
+
+@pytest.mark.parametrize(
+    ("target_depth", "end", "summed"), [(None, 500, True), (DEPTH - 1.5, 500, False), (None, 3.5, False)]
+)
+def test_energy_of_a_bottom_is_the_sum_only_where_its_light_is_alone(target_depth, end, summed):
+    """A target 1.5 m, less than four echo widths, above the bottom; a record that ends 3.5 echo widths behind it."""
+    values = waveform(share=1.0) + (0 if target_depth is None else 0.5 * waveform(depth=target_depth, glint=0.0))
+    last = np.searchsorted(TIME, SURFACE + 2 * N * DEPTH / COS_WATER / C0 + end * 4.0)
+    shot = result(values[np.newaxis])[["waveform", "waveform_stderr"]].isel(time=slice(last))
+    echoes = echo_table.extract(shot, depth_from="mean", layers=2).isel(pixel=0)
+    own = echoes.sel(echo="bottom")
+    energy, error = bottom_errors.whole_energy(shot, echoes)
+    assert (energy != own["energy"].values) == (error != own["energy_stderr"].values) == summed
+    # Errors that all bins share add up.
+    whole = with_correlation(shot, shot["time"].values, np.ones(2 * (shot.sizes["time"],)))
+    together = bottom_errors.whole_energy(whole, echoes)[1]
+    count = np.sum((np.abs(shot["time"] - own["time_ns"] - 4.0) < 12.0).values)
+    assert not summed or together > 0.5 * np.sqrt(count) * error
+    known = with_correlation(on_axis(), TIME, np.eye(TIME.size))
+    np.testing.assert_allclose(retrieve.bottom(known, LEVEL)["depth_m"], retrieve.bottom(on_axis(), LEVEL)["depth_m"])

@@ -12,6 +12,7 @@ from mitransient_lidar.analysis.waveforms.column_fits import column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, find_echoes
 from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+from mitransient_lidar.results.sum_errors import BlockCorrelation
 
 DT = 0.5
 TIME = (np.arange(400) + 0.5) * DT
@@ -154,8 +155,9 @@ def test_errors_of_energies_and_columns_have_the_correlation_of_samples():
     signal = echoes([60.0]) + 0.4 * np.exp(-0.02 * TIME) * (TIME > 80)
     noise = np.apply_along_axis(np.convolve, 1, rng.normal(size=(1500, TIME.size + 11)), kernel, "valid")
     records = Records.of(signal + 0.01 * noise, TIME, 0.01)
-    lags = np.abs(np.subtract.outer(np.arange(TIME.size), np.arange(TIME.size)))
-    records = replace(records, shared=np.clip(1 - lags / 12, 0, 1))
+    bins = np.arange(TIME.size)
+    shared = np.clip(1 - np.abs(np.subtract.outer(bins, bins)) / 12, 0, 1)
+    records = replace(records, shared=BlockCorrelation(shared, bins))
     top = echo_estimators.Window.around(records, np.full(1500, 120), 6.0)
     ends = np.full(1500, 90.0), np.full(1500, 190.0), np.full(1500, 80.0)
     fit = column_fit(records, *ends)
