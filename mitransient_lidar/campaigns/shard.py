@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -35,13 +36,15 @@ from mitransient_lidar.campaigns.versions import difference, other_versions, own
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.files import open_log
 
+_LOG = logging.getLogger(__name__)
+
 #: Time between two writes of a shard that is not finished [s].
 _INTERVAL_S = 60.0
 
 #: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
 _MOST_DEATHS, _MOST_STARTS = 2, 3
 
-#: Number of runs with an error of the program after which the rest of a shard is left.
+#: Number of runs with an error of the program, or that hang, after which the rest of a shard is left.
 _MOST_BUGS = 3
 
 #: Length of the reason of an error of the program, whose traceback is in the log.
@@ -53,7 +56,8 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: Time for a process to write the runs that it has when the campaign ends [s].
 _WRITE_S = 10.0
 
-#: Time between two looks at a process [s], and number of looks without any processor time after which it hangs.
+#: Time between two looks at a process [s], and number of looks without any processor time after which it hangs; while
+#: it waits for a disk, which may be that of a server, they do not count.
 _LOOK_S, _MOST_STILL = 10.0, 30
 
 Report = Callable[[int, int], None]
@@ -68,11 +72,14 @@ class Outcome(NamedTuple):
 
 
 class _End(NamedTuple):
-    """End of a process before that of its shard: the run that it was rendering, why, and whether by a bug."""
+    """End of a process before that of its shard: the run that it was rendering, why, and whether the run is left.
+
+    Runs that meet a bug or hang are left: they stay planned.
+    """
 
     run: int | None
     reason: str
-    is_bug: bool = False
+    is_left: bool = False
 
 
 class Processes:
@@ -129,8 +136,8 @@ def render_in_process(
 ) -> Outcome:
     """Render the runs of a shard that are not done in a new process.
 
-    A run in which the process ends twice has failed. Runs that meet an error of the program stay planned, and so do all
-    where the process ends three times before the first run.
+    A run in which the process ends twice has failed. Runs that meet an error of the program or hang stay planned, and
+    so do all where the process ends three times before the first run.
 
     Parameters
     ----------
@@ -162,7 +169,7 @@ def render_in_process(
         if processes.is_ended:
             return Outcome(0, 0, f"shard {shard}: the campaign was ended")
         deaths[ended.run] += 1
-        if ended.run is not None and ended.is_bug:
+        if ended.run is not None and ended.is_left:
             left[ended.run] = f"run {ended.run}: {ended.reason}"
             if len(left) < _MOST_BUGS:
                 continue
@@ -218,7 +225,7 @@ def _one_process(order: dict[str, Any], report: Report | None, processes: Proces
             told.append(f"the process {why}")
         if told:
             _log(order["store"], order["shard"], "".join(told))
-        return _End(found, f"the process {why}")
+        return _End(found, f"the process {why}", is_hung.is_set())
 
 
 @contextlib.contextmanager
@@ -231,16 +238,23 @@ def _watching(process: subprocess.Popen[str]) -> Iterator[threading.Event]:
 
     def watch() -> None:
         still, before = 0, -1.0
-        # An error of psutil is a process that has ended.
-        with contextlib.suppress(psutil.Error):
+        try:
             watched = psutil.Process(process.pid)
             while still < _MOST_STILL:
                 if is_over.wait(_LOOK_S):
                     return
                 now = sum(watched.cpu_times()[:2])
-                still, before = (still + 1 if now == before else 0), now
-            is_hung.set()
-            process.kill()
+                if now != before:
+                    still, before = 0, now
+                elif watched.status() != psutil.STATUS_DISK_SLEEP:
+                    still += 1
+        except psutil.NoSuchProcess:
+            return
+        except psutil.Error as error:
+            _LOG.warning("process %d of a shard is not watched: %s", process.pid, error)
+            return
+        is_hung.set()
+        process.kill()
 
     threading.Thread(target=watch, daemon=True).start()
     try:
@@ -271,7 +285,7 @@ def _events(
                 raise UserError(other_versions(place, event["differs"]))
             if "bug" in event:
                 _log(order["store"], order["shard"], event["traceback"])
-                return _End(run, event["bug"], is_bug=True)
+                return _End(run, event["bug"], is_left=True)
             run = event.get("begin", run)
             if "end" in event and report is not None:
                 report(*event["end"])
@@ -352,8 +366,6 @@ def _arrays(
 
 def _main() -> None:
     """Render the shard that standard input names."""
-    import logging
-
     import drjit as dr
 
     ended = threading.Event()

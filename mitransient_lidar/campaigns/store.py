@@ -48,7 +48,7 @@ _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 _MOST_BYTES = 2**29
 
 #: Memory of a byte of a shard: itself, and its chunk while that is written.
-_BYTES_PER_BYTE = 2
+BYTES_PER_BYTE = 2
 
 #: Most runs of a shard that is asked for, and of a chunk of an array of all runs.
 LARGEST_SHARD = 10**6
@@ -155,7 +155,7 @@ class Store:
         bytes_of_run = sum(array.values.nbytes for array in arrays.values())
         size = _shard_size(count, bytes_of_run)
         size = size if shard_size is None else integer("shard_size", shard_size, 1, LARGEST_SHARD)
-        needed = _BYTES_PER_BYTE * bytes_of_run * min(size, count)
+        needed = BYTES_PER_BYTE * bytes_of_run * min(size, count)
         require_memory(f"shards of {size} runs", needed, "take a smaller shard_size, or fewer pixels or bins")
         # Beside its place, so that a store is always whole.
         temporary = temporary_beside(path)

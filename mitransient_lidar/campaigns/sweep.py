@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import math
 import os
 import threading
 import time
@@ -19,12 +20,12 @@ import xarray as xr
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer, check_names, record_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path
-from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.versions import check_versions
 from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.processors import usable_processors
-from mitransient_lidar.core.validation import integer, shown
+from mitransient_lidar.core.validation import integer, require_memory, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 
 if TYPE_CHECKING:
@@ -82,8 +83,9 @@ def sweep(
     ------
     UserError
         If the campaign is invalid, the store holds another one, was begun by other versions or cannot be written, the
-        first runs all fail, the scheduler or one of its workers cannot be reached, a worker has other versions, or runs
-        could not be rendered for another reason than their parameters, after the others.
+        first runs all fail, the shards of all workers exceed the memory of this machine, the scheduler or one of its
+        workers cannot be reached, a worker has other versions, or runs could not be rendered for another reason than
+        their parameters, after the others.
     KeyboardInterrupt
         After Ctrl-C; processes write the runs that they have, which stay.
     """
@@ -208,10 +210,12 @@ def complete(
         if shards:
             store.check_pixel_order()
             check_versions(store.path, store.attributes)
+            few = min(number, len(shards))
+            if client is None:
+                _require_memory(store, few)
             tally = _Tally(store, progress)
             given = str(store.path.resolve()), retry_failed, tally.count
             try:
-                few = min(number, len(shards))
                 with on_cluster(client, *given) if client else on_this_machine(few, *given) as pool:
                     _render(store, shards, pool, tally)
             except KeyboardInterrupt as error:
@@ -221,6 +225,13 @@ def complete(
                 text += "; the same command goes on."
                 raise KeyboardInterrupt(text) from error
     return store
+
+
+def _require_memory(store: Store, workers: int) -> None:
+    """Raise `UserError` if the shards of workers of this machine exceed its memory."""
+    bytes_of_shard = sum(one.dtype.itemsize * math.prod(one.chunks) for one in map(store.array, store.variables))
+    what = f"shards of {store.shard_size} {store.unit}s, {workers} at a time,"
+    require_memory(what, BYTES_PER_BYTE * workers * bytes_of_shard, "take fewer workers")
 
 
 def _render(store: Store, shards: list[int], workers: Workers, tally: _Tally) -> None:

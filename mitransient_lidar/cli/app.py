@@ -35,7 +35,7 @@ from mitransient_lidar.cli import (
     studies,
     waveforms,
 )
-from mitransient_lidar.cli.messages import exit_on_error, printable_streams
+from mitransient_lidar.cli.messages import exit_on_error, printable_streams, silenced
 from mitransient_lidar.cli.overwriting import keeping
 from mitransient_lidar.core.errors import UserError
 
@@ -209,7 +209,7 @@ def _scenes(context: typer.Context) -> None:
 
 for _heading, _functions in _COMMANDS.items():
     for _function in _functions:
-        app.command(rich_help_panel=_heading)(keeping(_function))
+        app.command(rich_help_panel=_heading)(keeping(silenced(_function)))
 for _name, _function in (("list", scenes.list_scenes), ("show", scenes.show_scene), ("copy", scenes.copy_scene)):
     _scenes_app.command(_name)(_function)
 app.add_typer(_scenes_app, name="scenes", rich_help_panel="Scenes and system")

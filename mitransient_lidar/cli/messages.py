@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import sys
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -145,20 +146,28 @@ def _logging(handler: logging.Handler, level: int, *, propagate: bool) -> Iterat
         logger.propagate = before[1]
 
 
-def silent(quiet: bool) -> contextlib.AbstractContextManager[None]:
-    """Show no log messages if `quiet`."""
-    return _logging(logging.NullHandler(), logging.NOTSET, propagate=False) if quiet else contextlib.nullcontext()
+def silenced(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that shows no log messages with --quiet, to its end: files are written and drawn late."""
+
+    @functools.wraps(command)
+    def run(**options: Any) -> None:
+        if not options.get("quiet"):
+            command(**options)
+            return
+        with _logging(logging.NullHandler(), logging.NOTSET, propagate=False):
+            command(**options)
+
+    return run
 
 
 @contextlib.contextmanager
 def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """Show log messages and progress on stderr; yield the function that takes the progress.
+    """Show log messages and progress on stderr; yield the function that takes the progress, None if `quiet`.
 
     On a terminal it is a bar; elsewhere, as in a pipe or a log, a line every 15 s.
     """
     if quiet:
-        with silent(quiet):
-            yield None
+        yield None
         return
     from rich.logging import RichHandler
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
-from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, silent, summarise
+from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
 from mitransient_lidar.cli.options import OUTPUT, Define, Instrument, Quiet, SceneOrResult, parameters, render_options
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
@@ -57,7 +57,7 @@ def render(
     check_targets(output, [*targets, *gates.names()], scene)
     from mitransient_lidar.rendering import render as rendering
 
-    with DeferredInterrupt(at_once=False), silent(quiet):
+    with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:
             dataset = rendering.render(
                 scene, params=params, instrument=instrument, integrator=integrator, progress=progress, **options

@@ -179,8 +179,14 @@ def usable_memory() -> float:
     return min(limits) / 2
 
 
-def require_memory(what: str, size: float, advice: str) -> None:
-    """Raise `UserError` if arrays of a size [bytes] exceed `usable_memory`; `what` is their name in the plural."""
-    _LOG.debug("%s take %g bytes", what, size)
-    if size > (most := usable_memory()):
-        raise UserError(f"{what} take {size / 1e9:.3g} GB of memory, and at most {most / 1e9:.3g} GB may be: {advice}")
+def require_memory(what: str, size: float, advice: str, least: float | None = None) -> float:
+    """Raise `UserError` if arrays of a size [bytes] exceed `usable_memory`; `what` is their name in the plural.
+
+    Return their size: arrays that work with less, down to `least`, are cut to that memory.
+    """
+    most = usable_memory()
+    taken = size if least is None else max(min(size, most), least)
+    _LOG.debug("%s take %g bytes", what, taken)
+    if taken > most:
+        raise UserError(f"{what} take {taken / 1e9:.3g} GB of memory, and at most {most / 1e9:.3g} GB may be: {advice}")
+    return taken

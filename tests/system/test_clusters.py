@@ -9,8 +9,10 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from command_line import assert_refused, run
 from quick_campaign import files_of, planned_copy, write_toml
@@ -153,7 +155,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
 
 @pytest.mark.slow
 def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
-    """The campaign once waited for ever."""
+    """The campaign once waited for ever, and later stored a run in which processes hung as failed."""
     path = planned_copy(quick, tmp_path / "hung.zarr")
     monkeypatch.setattr(shards, "_LOOK_S", 0.2)
     processes, alarms = shards.Processes(), []
@@ -168,10 +170,45 @@ def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
 
     outcome = shards.render_in_process(str(path), 0, report=stop, processes=processes)
     alarms[0].cancel()
-    assert outcome == (6, 0, "")
+    assert outcome[:2] == (5, 0)
+    assert re.fullmatch(r"run [01]: the process was ended after 6 s without processor time", outcome.left)
     assert "was ended after 6 s without processor time" in shards.log_path(path).read_text()
-    shards.render_in_process(str(path), 1)
+    assert resume(path, workers=1)["status"].values.tolist() == [DONE] * 12
     assert files_of(path) == files_of(quick)
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "hangs"),
+    [
+        (psutil.STATUS_STOPPED, None, True),
+        (psutil.STATUS_DISK_SLEEP, None, False),
+        (None, psutil.NoSuchProcess(1), False),
+        (None, psutil.AccessDenied(1), False),
+    ],
+)
+def test_a_process_hangs_that_neither_computes_nor_waits_for_a_disk(state, error, hangs, monkeypatch, caplog):
+    """One that waited for a server's disk was killed, and an error of the watch was silent."""
+    looks, enough = [], threading.Event()
+
+    def cpu_times():
+        looks.append(0)
+        if error or len(looks) > 20:
+            enough.set()
+        if error:
+            raise error
+        return 1.0, 1.0
+
+    monkeypatch.setattr(shards, "_LOOK_S", 0.001)
+    monkeypatch.setattr(psutil, "Process", lambda pid: SimpleNamespace(cpu_times=cpu_times, status=lambda: state))
+    monkeypatch.setattr(shards, "_MOST_STILL", 10)
+    process = SimpleNamespace(pid=1, kill=enough.set)
+    with shards._watching(process) as is_hung:
+        assert enough.wait(60)
+        while isinstance(error, psutil.AccessDenied) and not caplog.messages:
+            time.sleep(0.01)
+    assert is_hung.is_set() == hangs
+    expected = ["process 1 of a shard is not watched: (pid=1)"] if isinstance(error, psutil.AccessDenied) else []
+    assert caplog.messages == expected
 
 
 #: A worker with another version, and one of a release whose workers do not know their versions.

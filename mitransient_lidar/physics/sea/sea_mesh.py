@@ -50,16 +50,15 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
     UserError
         If the meshes exceed the memory.
     """
-    inner = np.arange(-(cells // 2), cells // 2 + 1, dtype=np.int64)
     outer, step, end = [], 1.0, cells // 2
     while end < extent / 2:
         step *= growth
         end = min(end + int(step), -(-extent // 2))
         outer.append(end)
-    right = np.array(outer, dtype=np.int64)
     side = cells + 2 * len(outer)
     size = _BYTES_PER_CELL * float(meshes) * side**2
     require_memory(f"{meshes} meshes of {side} x {side} cells", size, "take larger cells or a smaller refined_size")
+    inner, right = np.arange(-(cells // 2), cells // 2 + 1, dtype=np.int64), np.array(outer, dtype=np.int64)
     return np.concatenate([-right[::-1], inner, right])
 
 

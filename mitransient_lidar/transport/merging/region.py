@@ -43,6 +43,10 @@ _MOST_CROSSINGS = 4
 #: Largest distance below the sea at which vertical rays to solids start [m].
 _MARGIN_BELOW_SEA = 1.0
 
+#: Least width of patches over the size of the largest solid, eight times the rounding of positions on it; and that of
+#: cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
+_PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
+
 #: Height of the bed of columns without a solid below [m].
 _NO_BED = -1e9
 
@@ -297,3 +301,15 @@ class SurfaceHeights:
         """Return the height of the first solid below the surface at (x, y) [m], -1e9 where there is none."""
         height, _, _ = self._bed.at(x, y)
         return height
+
+
+def least_cell(scene: LidarScene, reach: float) -> float:
+    """Return the least width of cells that a narrow view limits [m]."""
+    spots = [pose.ground_point()[:2] for pose in (scene.transmitter.pose, scene.receiver.pose)]
+    return _CELL_PER_COORDINATE * float(np.abs(spots).max() + reach)
+
+
+def least_patch(scene: LidarScene) -> float:
+    """Return the least width of the patches of solids [m]."""
+    sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
+    return float(_PATCH_PER_SOLID * max(sizes, default=0.0))

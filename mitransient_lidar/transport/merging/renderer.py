@@ -18,7 +18,7 @@ from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterCo
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL, PhotonBuffer, PhotonMap
-from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
+from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries, least_cell, least_patch
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
@@ -58,10 +58,6 @@ _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 
 #: Width of the patches of solids, over the width of the cells at the surface.
 _PATCH_PER_CELL = 3.2
-
-#: Least width of the patches over the size of the largest solid, eight times the rounding of positions on it; and that
-#: of cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
-_PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
@@ -144,6 +140,8 @@ class MergingLayout:
         Distance from the view, on the sea, from which light reaches the view in the water [m].
     light_segments, sensor_segments, hits
         Capacities for segments and hits of solids of each path; they grow when a pass needs more.
+    least_segments
+        Segments of each path of light and of sensors that a pass has been found to need, or one.
     side_bits
         Logarithm to base 2 of the number of buckets of patches along one side.
     widens
@@ -166,6 +164,7 @@ class MergingLayout:
     light_segments: float
     sensor_segments: float
     hits: float = 2.0
+    least_segments: tuple[float, float] = (1.0, 1.0)
     widening: float = 1.0
     spread: float = 0.0
     side_bits: int = MOST_SIDE_BITS
@@ -242,7 +241,7 @@ class MergingLayout:
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
             rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0, 0.0)
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
-            patches = _PATCH_PER_CELL * width, _least_patch(scene)
+            patches = _PATCH_PER_CELL * width, least_patch(scene)
             return cls(
                 *(region, np.zeros(3), uneven, grid, rings, spacing, reach, depth, *patches, None, segments, segments),
                 widens=not options.cell_size,
@@ -254,7 +253,7 @@ class MergingLayout:
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
         widest = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
-        width = options.cell_size or min(max(_CELL_PER_VIEW * view, _least_cell(scene, reach)), widest)
+        width = options.cell_size or min(max(_CELL_PER_VIEW * view, least_cell(scene, reach)), widest)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
         depth = reach * -float(refract_level(pose.axis, scene.refractive_index)[2])
@@ -276,25 +275,13 @@ class MergingLayout:
             view_growth=by_ripples,
             widening=widest / width,
         )
-        patches = _PATCH_PER_CELL * width, _least_patch(scene)
+        patches = _PATCH_PER_CELL * width, least_patch(scene)
         return cls(
             *(region, entries[0], uneven, grid, rings, spacing, reach, depth, *patches, by_ripples, segments, segments),
             widening=widest / width,
             spread=(_SPREAD_PER_BLUR * profile.blur + _SPREAD_PER_DEPTH) * depth,
             widens=not options.cell_size,
         )
-
-
-def _least_cell(scene: LidarScene, reach: float) -> float:
-    """Return the least width of cells that a narrow view limits [m]."""
-    spots = [pose.ground_point()[:2] for pose in (scene.transmitter.pose, scene.receiver.pose)]
-    return _CELL_PER_COORDINATE * float(np.abs(spots).max() + reach)
-
-
-def _least_patch(scene: LidarScene) -> float:
-    """Return the least width of the patches of solids [m]."""
-    sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
-    return float(_PATCH_PER_SOLID * max(sizes, default=0.0))
 
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
@@ -360,11 +347,12 @@ class MergingRenderer(PassRenderer):
         """Trace the paths of one pass into a record."""
         while not self._attempt(record, shots, paths):
             record.clear()
+            dr.flush_malloc_cache()  # with the buffers that were too small
 
     def _attempt(self, record: PassRecord, shots: Shots, paths: int) -> bool:
         """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
-        self._require_memory(shots, paths)
+        self._fit_segments(shots, paths)
         shifts = shots.uniform(_COMMON_STREAM, 6)
         cells = layout.grid.cells(mi.Point4f(shifts[:4]))
         patches = SolidPatches(
@@ -383,14 +371,22 @@ class MergingRenderer(PassRenderer):
         trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)
         return True
 
-    def _require_memory(self, shots: Shots, paths: int) -> None:
-        """Raise `UserError` if light and paths of a pass exceed the memory."""
+    def _fit_segments(self, shots: Shots, paths: int) -> None:
+        """Cut the capacities for segments to the memory; raise `UserError` if it cannot hold what a pass needs."""
         layout, count, sums = self.layout, shots.count, self.scene.perturbations.count
         points = layout.reach / layout.spacing
-        size = self.photons * memory_of_path(layout.light_segments, points, sums, layout.hits)
-        size += paths * memory_of_path(layout.sensor_segments, points, sums)
+
+        def size(light: float, sensor: float) -> float:
+            of_light = self.photons * memory_of_path(light, points, sums, layout.hits)
+            return count * (of_light + paths * memory_of_path(sensor, points, sums))
+
+        needed, wanted = layout.least_segments, (layout.light_segments, layout.sensor_segments)
+        least, most = size(*needed), size(*wanted)
         what = f"{count * self.photons} photons and {count * paths} paths"
-        require_memory(what, count * size, "take fewer photons_per_pass or paths_per_pass")
+        taken = require_memory(what, most, "take fewer photons_per_pass or paths_per_pass", least)
+        if taken < most:
+            share = (taken - least) / (most - least)
+            layout.light_segments, layout.sensor_segments = np.add(needed, share * np.subtract(wanted, needed)).tolist()
 
     def _trace_light(
         self,
@@ -425,7 +421,9 @@ class MergingRenderer(PassRenderer):
         points, wanted = segments.finalize()
         on_patches, met = hits.sort(shots.count * patches.buckets, shots)
         if wanted > segments.capacity or met > hits.capacity:
-            layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
+            # One more, against rounding.
+            layout.least_segments = (wanted + 1) / count, layout.least_segments[1]
+            layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * layout.least_segments[0])
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
         in_cells = store_points(segments, points, cells, self.classes, shots, layout.photons_of_cell)
@@ -471,7 +469,8 @@ class MergingRenderer(PassRenderer):
         dr.schedule(record.rays)
         points, wanted = segments.finalize()
         if wanted > segments.capacity:
-            layout.sensor_segments = max(layout.sensor_segments, _CAPACITY_MARGIN * wanted / count)
+            layout.least_segments = layout.least_segments[0], (wanted + 1) / count
+            layout.sensor_segments = _CAPACITY_MARGIN * layout.least_segments[1]
             return False
         if points == 0:
             return True

@@ -1,3 +1,4 @@
+import contextlib
 import errno
 import os
 import re
@@ -11,6 +12,7 @@ import pytest
 import xarray as xr
 import zarr
 
+from mitransient_lidar.campaigns import sweep
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
 from mitransient_lidar.campaigns.store import (
@@ -23,6 +25,7 @@ from mitransient_lidar.campaigns.store import (
     seal,
 )
 from mitransient_lidar.campaigns.sweep import describe_campaign
+from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import load_scene
@@ -342,6 +345,21 @@ def test_size_of_shards(tmp_path, count, size):
     columns = {"altitude": np.arange(count)}
     made = Store.create(tmp_path / "a.zarr", RunRenderer(CAMPAIGN, RECORD, AXIS), columns, ARRAYS, COORDINATES)
     assert made.shard_size == size
+
+
+def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
+    """One shard was: each worker has one."""
+    monkeypatch.setattr(validation, "usable_memory", lambda: 2000.0)
+    rendered = []
+    monkeypatch.setattr(sweep, "on_this_machine", lambda few, *_: contextlib.nullcontext(few))
+    monkeypatch.setattr(sweep, "_render", lambda store, shards, pool, tally: rendered.append(pool))
+    sweep.complete(lambda: store, 2, None, False, None)
+    message = (
+        r"shards of 4 runs, 3 at a time, take 2\.78e-06 GB of memory, and at most 2e-06 GB may be: take fewer workers"
+    )
+    with pytest.raises(UserError, match=message):
+        sweep.complete(lambda: store, 4, None, False, None)
+    assert rendered == [2]
 
 
 def test_other_folders_are_refused(tmp_path):

@@ -134,12 +134,17 @@ def test_progress_is_lines_where_there_is_no_terminal(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("quiet", [True, False])
-def test_logging_after_a_command_is_as_before_it(quiet):
-    """A quiet command once kept all later messages of the package from handlers of the program that called it."""
+def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
+    """They once were shown after its report, and earlier, those of the program that called it were silent, too."""
     logger = logging.getLogger("mitransient_lidar")
     before = logger.propagate, logger.level, [*logger.handlers]
-    with messages.reporting(quiet):
-        assert (logger.propagate, logger.level, len(logger.handlers)) != (*before[:2], len(before[2]))
+    monkeypatch.setattr("mitransient_lidar.results.open", lambda _: logger.warning("early") or xr.Dataset())
+    for name in ("detect_waveforms", "encoding", "describe_recording"):
+        monkeypatch.setattr(f"mitransient_lidar.analysis.receiver.{name}", lambda *_, **__: ())
+    monkeypatch.setattr("mitransient_lidar.cli.results.write_netcdf", lambda *_: logger.warning("late"))
+    done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
+    assert done.exit_code == 0, done.output
+    assert ("early" in done.stderr, caplog.messages) == ((False, []) if quiet else (True, ["early", "late"]))
     assert (logger.propagate, logger.level, logger.handlers) == before
 
 

@@ -3,6 +3,7 @@
 import resource
 import subprocess
 import sys
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +20,7 @@ from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_batches import check_size
 from mitransient_lidar.transport.merging.renderer import MergingRenderer
+from mitransient_lidar.transport.rng import Shots
 
 #: A task after a small one, within a limit of the memory; prints the bytes that were estimated, and its peak above that
 #: before it [bytes].
@@ -92,10 +94,50 @@ def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatc
         renderer.render_pass(0)
 
 
+def fitted(monkeypatch, memory, **layout):
+    """Return the renderer of images of turbid water, whose capacities for segments are cut to a memory [bytes]."""
+    monkeypatch.setattr(validation, "usable_memory", lambda: memory)
+    water = {"attenuation": 10, "scattering": 8, "bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"}
+    session = open_scene("table1", {**water, "layout": "256x256"})
+    renderer = session.scene.integrator().prepare(session.scene, session.sensor)
+    renderer.layout = replace(renderer.layout, **layout)
+    renderer._fit_segments(Shots([0]), renderer.paths)
+    return renderer
+
+
+def test_images_of_turbid_water_are_fitted_to_the_memory(monkeypatch):
+    """Half of 8 GiB was too little for the capacity of 64 segments a path, of which 11 are stored."""
+    layout = fitted(monkeypatch, 4.29e9).layout
+    assert 11 < layout.light_segments < 64
+    assert layout.light_segments == layout.sensor_segments
+    # Until a pass has needed more.
+    with pytest.raises(UserError, match=r"65536 photons and 1048576 paths take 4\.3. GB of memory"):
+        fitted(monkeypatch, 4.29e9, least_segments=(62.0, 62.0))
+
+
+def test_a_pass_of_cut_buffers_has_the_bits_of_one_of_large_ones(monkeypatch):
+    session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
+    options = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 1024}, parallel=False)
+    energies, segments = [], []
+    for memory in (1e9, 2.92e7):
+        monkeypatch.setattr(validation, "usable_memory", lambda memory=memory: memory)
+        renderer = options.prepare(session.scene, session.sensor)
+        energies.append(renderer.render_pass(0).histogram.energy())
+        segments.append(renderer.layout.light_segments)
+    np.testing.assert_array_equal(*energies)
+    assert segments == [4.5, pytest.approx(2.6, abs=0.3)]
+    # What a pass has needed is known after it, and no less is tried again.
+    monkeypatch.setattr(validation, "usable_memory", lambda: 2.7e7)
+    with pytest.raises(UserError, match=r"32768 photons and 1024 paths take 0\.02[78]. GB of memory"):
+        options.prepare(session.scene, session.sensor).render_pass(0)
+
+
 def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
     with pytest.raises(UserError, match=r"1 meshes of 2114 x 2114 cells take 1\.25 GB"):
         grid_indices(2048, 50_000)
+    with pytest.raises(UserError, match=r"1 meshes of 17592186044416 x 17592186044416 cells"):
+        grid_indices(2**44, 50_000)
     with pytest.raises(UserError, match=r"64 meshes of 5.. x 5.. cells take .* GB"):
         grid_indices(512, 1000, 2.0, meshes=64)
     with pytest.raises(UserError, match=r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB"):
