@@ -297,7 +297,7 @@ def test_command(tmp_path):
     assert done.exit_code == 0, done.output
     for text in ("slope along: ", "bottom depth: 8.0", "bright 9", "water (1/m): a 0.1", "attenuation (1/m): c "):
         assert text in done.output
-    for line in done.output.splitlines()[1:-1]:
+    for line in done.stdout.splitlines()[1:-1]:
         assert " +- " in line or " %" in line or " to " in line, line
     expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
     xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
