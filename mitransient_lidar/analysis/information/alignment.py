@@ -52,9 +52,9 @@ class Misfit(NamedTuple):
 def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, mean: FloatArray) -> float:
     """Return the time [ns] that waveforms are later than a model, whose light is searched for in the whole record.
 
-    Compressed samples, asinh(value / 2 % of the largest), agree best there in the least squares over the record, with
-    a scale of their own and a model that is dark outside its own record. The column and faint echoes count beside the
-    surface echo.
+    At this time the squared difference of compressed samples, asinh(value / 2 % of the largest), is least over the
+    record, with a scale of their own and a model that is dark outside its own record. The column and faint echoes
+    count beside the surface echo.
 
     Parameters
     ----------

@@ -124,10 +124,10 @@ def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
 def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, FloatArray]:
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
-    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of it are not in the Gaussian
-    that is fitted to the echo. The sum of the signal about the echo, less the column before it, is all of it. The
-    Gaussian counts where noise makes the sum less certain than 10 %, there is no column, the sum would reach beyond the
-    record, or another echo is less than four echo widths before the bottom's.
+    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy are
+    not in the Gaussian that is fitted to the echo. The sum of the signal about the echo, less the column before it, is
+    all of it. The Gaussian counts where noise makes the sum less certain than 10 %, there is no column, the sum would
+    reach beyond the record, or another echo is less than four echo widths before the bottom's.
 
     Parameters are those of `loss_error`.
     """
