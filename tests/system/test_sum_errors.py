@@ -41,11 +41,12 @@ def variance_ratios(results, windows):
 @pytest.mark.parametrize(
     "params",
     [
-        {},
-        {"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"},
-        {"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"},
+        pytest.param({}, id="default"),
+        pytest.param({"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"}, id="turbid", marks=pytest.mark.long),
+        pytest.param(
+            {"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"}, id="clear", marks=pytest.mark.long
+        ),
     ],
-    ids=["default", "turbid", "clear"],
 )
 def test_stated_errors_of_sums_are_those_of_sixty_renders(params):
     """Windows of 3 to 7 m between surface and bottom."""

@@ -74,7 +74,9 @@ def alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threads", [2, 4, 8])
+@pytest.mark.parametrize(
+    "threads", [2, pytest.param(4, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long)]
+)
 def test_renders_have_the_bits_of_those_alone(alone, threads):
     """Without a lock, 2 of 6 in two threads had others: long kernels, which begin at once, overlap."""
     starts, interval = threading.Barrier(threads), sys.getswitchinterval()
