@@ -106,9 +106,11 @@ class SumErrors:
         if VARIABLE not in dataset:
             return cls(None, curve) if curve.size else None
         time, middles = (np.asarray(dataset[name].values, dtype=np.float64) for name in ("time", DIMS[0]))
-        # All blocks but the last one are of one size. A sum of pixels may have given the correlation their dimension.
+        # All blocks but the last one are of one size.
         edges = middles[:-1] + 0.5 * (middles[1:2] - middles[:1])
-        correlation = np.reshape(dataset[VARIABLE].values, 2 * (middles.size,)).astype(np.float64)
+        # Joined results have one for each: alike scenes have alike correlations.
+        several = [name for name in dataset[VARIABLE].dims if name not in DIMS]
+        correlation = dataset[VARIABLE].mean(several).transpose(*DIMS).values.astype(np.float64)
         return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:

@@ -86,3 +86,12 @@ def test_a_record_of_very_many_bins_needs_little_memory():
     finally:
         tracemalloc.stop()
     np.testing.assert_allclose(table["time_ns"].sel(echo="bottom"), SURFACE + 70, atol=0.05)
+
+
+def test_joined_results_have_the_mean_of_their_correlations():
+    correlation, time = ErrorCorrelation(), 1385.0 + np.arange(60)
+    for values in np.random.default_rng(4).normal(size=(9, 1, 60)):
+        correlation.add(values)
+    one = with_correlation(record(np.ones(60), np.ones(60)), *correlation.over(time))
+    joined = SumErrors.of(xr.concat([one, one], "shot"))
+    np.testing.assert_allclose(joined.shared.correlation, SumErrors.of(one).shared.correlation)
