@@ -1,6 +1,6 @@
 """Fits of shots that another recorder wrote: scaled, shifted in time, behind the receiver of an instrument.
 
-Run by hand: ``python tests/foreign_shots.py --folder /tmp/foreign --count 5``. Each instrument has one shot at known
+Run by hand: ``python tests/foreign_shots.py --folder foreign --count 5``. Each instrument has one shot at known
 parameters, rendered once with many passes and kept in the folder. Every fit has a record with noise of its own in a CSV
 file without errors, whose unit and time zero are unknown, starts that are wrong by a quarter or more, and a model with
 random numbers of its own.

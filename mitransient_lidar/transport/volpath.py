@@ -47,8 +47,7 @@ _DIFFUSE_RADIANCE = 0.5
 #: Number of the random streams within a pass.
 _STREAM = 3
 
-#: Memory of a path: the state of its random numbers [bytes].
-BYTES_PER_PATH = 18
+BYTES_PER_PATH = 18  #: Memory of a path: the state of its random numbers [bytes].
 
 #: How connections are estimated: by both samplings with multiple importance sampling, or by one of them.
 CONNECTIONS = ("mis", "emitter", "phase")
