@@ -22,7 +22,15 @@ from mitransient_lidar.studies import fit as study
 TRUTH = {"attenuation": 0.4, "bottom_reflectance": 0.1, "bottom_depth": 6.0}
 PARAMS = {"spectrum": "flat", "scattering": 0.2}
 #: Instruments with the share of their energy that is emitted: noise of the record exceeds that of the render.
-INSTRUMENTS = {"published_airborne": 0.1, "leica_chiroptera4x": 1.0, "riegl_vq840g": 1.0, "leica_hawkeye4x_deep": 0.1}
+INSTRUMENTS = {
+    "published_airborne": 0.1,
+    "leica_chiroptera4x": 1.0,
+    "riegl_vq840g": 1.0,
+    "leica_hawkeye4x_deep": 0.1,
+    "usgs_eaarl_b": 1.0,
+}
+#: Bins of shots whose instrument has wider ones than the light needs [ns].
+BINS = {"usgs_eaarl_b": 0.1}
 #: Passes of the shots behind the records, and passes of a model and their size.
 SHOT_PASSES, MODEL_PASSES, PASS_SHARE = 64, 16, 1 / 16
 
@@ -31,8 +39,9 @@ def shot_of(instrument, folder, passes=SHOT_PASSES, **options):
     """Return the shot of an instrument at the truth, rendered unless the folder has it."""
     path = Path(folder) / f"{instrument}.nc"
     if not path.exists():
+        bins = {"bin_width_ns": BINS[instrument]} if instrument in BINS else {}
         shot = mitransient_lidar.render(
-            "table1", params=PARAMS | TRUTH, instrument=instrument, passes=passes, seed=10**6, **options
+            "table1", params=PARAMS | TRUTH | bins, instrument=instrument, passes=passes, seed=10**6, **options
         )
         results.save(shot, path)
     shot = results.open(path)
@@ -45,7 +54,9 @@ def write_foreign(shot, instrument, random, path):
     recorded = mitransient_lidar.record(shot, instrument, gain="auto", seed=int(random.integers(2**31)))
     signal = recorded["signal"].isel(shot=0)
     scale, delay = float(10 ** random.uniform(-2, 4)), float(random.uniform(-300, 1300))
-    counts = scale * (signal - signal.isel(time=slice(8)).median("time"))
+    # In one unit, whatever gains the channels have.
+    gain = np.broadcast_to(recorded.attrs["gain"], signal.sizes["pixel"])[:, None]
+    counts = scale / (gain / gain[0]) * (signal.transpose("pixel", "time") - signal.isel(time=slice(8)).median("time"))
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["time_ns", *counts["pixel"].values.tolist()])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
@@ -23,6 +24,7 @@ from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import RANGES
 from mitransient_lidar.core.validation import integer, shown
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
@@ -39,7 +41,8 @@ _FEWEST_PASSES, _MOST_PASSES = 16, 256  # that are chosen
 #: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
 #: their own noise to matter little, and few because each is kept.
 _BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
-_WIDEST_BIN = 0.4  # of the scene's record, in widths of the pulse, that an interpolation needs
+_WIDEST_BIN, _FINE_BIN = 0.4, 0.2  # of the scene's record, in widths of the pulse, that an interpolation needs
+_BIN_WIDTH = "bin_width_ns"
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
 
 
@@ -80,7 +83,8 @@ def fit(
     start
         Starts of free parameters, by default their values in the scene; also of ``scale`` and ``time_offset_ns``.
     bounds
-        Lowest and highest values of free parameters, by default their physical ranges.
+        Lowest and highest values of free parameters, by default their physical ranges; of an attenuation whose
+        scattering is fixed from that on, and of a scattering up to a fixed attenuation.
     free_scale, free_time
         Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
         file, whose unit and time zero are unknown.
@@ -151,8 +155,10 @@ def fit(
         coarse,
         _seed(seed, attributes),
         progress,
+        between_bins=not found.calibrated if free_time is None else free_time,
     )
     starts = {**model.starts(start or {}), **(start or {})}
+    bounds = {**model.bounds(), **(bounds or {})}
     light: Model = BehindBandwidth(model) if BANDWIDTH in names else model
     problem = WaveformFit(found, light, starts, bounds, **options)
     problem.approach(most_renders=most_renders, until=began + limit)
@@ -187,7 +193,10 @@ def _run(problem: WaveformFit, began: float, limit: float, most_renders: int, sc
 
 
 class _RenderedModel:
-    """Renders of a scene by values of its free parameters, all with the same random numbers."""
+    """Renders of a scene by values of its free parameters, all with the same random numbers.
+
+    Where light is interpolated `between_bins` that are too wide for it, the scene is rendered with narrower ones.
+    """
 
     def __init__(
         self,
@@ -198,7 +207,10 @@ class _RenderedModel:
         passes: int,
         seed: int,
         progress: ProgressCallback | None,
+        *,
+        between_bins: bool,
     ) -> None:
+        self.between_bins = between_bins
         self.scene, self.params, self.instrument = scene, dict(params or {}), instrument
         self.names, self.passes, self.seed, self.progress = list(names), passes, seed, progress
         own = scene.parameters if isinstance(scene, SceneRecord) else scene_parameters(scene)
@@ -208,6 +220,25 @@ class _RenderedModel:
 
     def __call__(self, values: Mapping[str, float]) -> xr.Dataset:
         """Render the scene with other values of the free parameters; a Ctrl-C ends the fit."""
+        dataset = self._render(values)
+        if self.done == 0 and self.between_bins and (width := _narrower_bins(dataset)):
+            if _BIN_WIDTH in self.texts and _BIN_WIDTH not in self.params:
+                self.params[_BIN_WIDTH] = width
+                logger.info("the model has bins of %.3g ns, so that its light is known between them", width)
+                dataset = self._render(values)
+            else:
+                logger.warning(
+                    "the bins of the model are too wide for its pulse: times between them are interpolated, set "
+                    "bin_width_ns to %.2g or less",
+                    width,
+                )
+        self.done += 1
+        if self.progress is not None:
+            self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
+        return dataset
+
+    def _render(self, values: Mapping[str, float]) -> xr.Dataset:
+        """Render the scene with other values of the free parameters; raise KeyboardInterrupt after a Ctrl-C."""
         dataset: xr.Dataset = render(
             self.scene,
             params=self.with_values(values),
@@ -219,16 +250,26 @@ class _RenderedModel:
         )
         if dataset.attrs.get("interrupted"):
             raise KeyboardInterrupt
-        if self.done == 0:
-            _warn_of_wide_bins(dataset)
-        self.done += 1
-        if self.progress is not None:
-            self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
         return dataset
 
     def starts(self, given: Mapping[str, float]) -> dict[str, float]:
         """Return the starts of the free parameters, by default their values in the scene."""
         return {name: given.get(name, value_of(self.texts, name)) for name in self.names}
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Return the bounds that fixed coefficients set: a layer attenuates at least as much as it scatters."""
+        found = {}
+        for name in self.names:
+            base = parameter_of(name)
+            fixed = {"attenuation": "scattering", "scattering": "attenuation"}.get(base, "")
+            other = fixed + name.removeprefix(base)
+            if not fixed or other in self.names:
+                continue
+            # Coefficients may also be those of a water by name, or of layers that the name does not tell apart.
+            with contextlib.suppress(UserError):
+                value = value_of(self.texts, other)
+                found[name] = (value, RANGES[base][1]) if base == "attenuation" else (0.0, value)
+        return found
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, Any]:
         """Return the parameters of the scene with other values, those of layers in their list."""
@@ -238,17 +279,10 @@ class _RenderedModel:
         return {**self.params, **{parameter_of(name): texts[parameter_of(name)] for name in values}}
 
 
-def _warn_of_wide_bins(dataset: xr.Dataset) -> None:
-    """Warn of bins between which a waveform is not known: splines through them would err by more than its noise."""
-    width, pulse = (float(dataset.attrs.get(name, math.nan)) for name in ("bin_width_ns", "pulse_fwhm_ns"))
-    if width > _WIDEST_BIN * pulse:
-        logger.warning(
-            "bins of %g ns are too wide for pulses of %g ns: times between them are interpolated, set bin_width_ns to "
-            "%.2g or less",
-            width,
-            pulse,
-            pulse / 3,
-        )
+def _narrower_bins(dataset: xr.Dataset) -> float:
+    """Return a width of bins [ns] between which light is known, 0 where it is: splines err by less than its noise."""
+    width, pulse = (float(dataset.attrs.get(name, math.nan)) for name in (_BIN_WIDTH, "pulse_fwhm_ns"))
+    return float(f"{_FINE_BIN * pulse:.2g}") if width > _WIDEST_BIN * pulse else 0.0
 
 
 def _names(free: Sequence[str]) -> list[str]:

@@ -163,7 +163,7 @@ def test_surface_of_gaussian_slopes(lidar_scene, passes, case, integrator):
 @pytest.mark.parametrize(
     ("integrator", "wind", "angle", "wind_from_deg"),
     [
-        ("lidar_merging", 6.0, 20.0, 0.0),
+        pytest.param("lidar_merging", 6.0, 20.0, 0.0, marks=pytest.mark.slow),
         *(("lidar_volpath", 6.0, *place) for place in ((20.0, 0.0), (20.0, 180.0), (12.0, 120.0))),
         *(("lidar_volpath", 10.0, 30.0, wind_from_deg) for wind_from_deg in (0.0, 180.0)),
     ],
@@ -233,13 +233,10 @@ def test_column_and_bottom_of_layered_water(lidar_scene, case, integrator):
 CLEAR_RIPPLED, TURBID_SMOOTH = (0.005, 0.05, 2e-3, 16), (1e-5, 0.5, 0.4, 64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "case"),
-    [
-        ("lidar_merging", CLEAR_RIPPLED),
-        pytest.param("lidar_volpath", CLEAR_RIPPLED, marks=pytest.mark.slow),
-        pytest.param("lidar_merging", TURBID_SMOOTH, marks=pytest.mark.slow),
-    ],
+    [("lidar_merging", CLEAR_RIPPLED), ("lidar_volpath", CLEAR_RIPPLED), ("lidar_merging", TURBID_SMOOTH)],
 )
 def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, integrator, case):
     """Ripples spread both: the echo falls to a tenth in half a metre. Thick cells lost 20 % of it.

@@ -73,6 +73,7 @@ def connected(lidar_scene, passes, sea, count, **integrator):
     return passes(scene, count)[:, 0]
 
 
+@pytest.mark.slow
 def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
     """Through absorbing water and a rough sea, where both connections find the bottom about as often."""
     sea, water = {"slope_variance": "0.1"}, {"attenuation": 0.4, "scattering": 0.0, "backscattering": 0.0}

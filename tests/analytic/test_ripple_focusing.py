@@ -15,7 +15,6 @@ from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.ripple_focusing import Echo
 
-INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 SEA = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "shortest_wave": 1.0}
 CLEAR = {"attenuation": 0.1, "scattering": 1e-4, "backscattering": 1e-6, "group_index": 1.364}
 
@@ -30,7 +29,7 @@ def factors_at(focusing, depth, events):
     return np.interp(np.log(depth), np.log(depths), focusing.factors[events])
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", [pytest.param("lidar_merging", marks=pytest.mark.slow), "lidar_volpath"])
 def test_echoes_in_clear_water_have_the_factor_of_their_depth(lidar_scene, integrator):
     """The same paths with it and with factors of 1: bottom, column, and a surface echo that stays."""
     pose = {"altitude": 200.0, "off_nadir_deg": 8.0}

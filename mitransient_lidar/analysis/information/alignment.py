@@ -11,7 +11,7 @@ from mitransient_lidar.core.validation import FloatArray
 
 _COMPRESSED = 0.02  # of the largest sample, above which a logarithm is compared
 _LEAST_OVERLAP = 0.5  # share of a model's energy that lies within the record
-_BRIGHT = 0.01  # of the largest sample, above which a model has light
+_BRIGHT = 1e-3  # of the largest sample of a pixel, above which it has light: the bottom's is far below the surface's
 _MOST_LAGS = 64  # of an estimated correlation, in samples
 
 
@@ -77,8 +77,8 @@ def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, 
 
 
 def light_duration(times: FloatArray, mean: FloatArray) -> float:
-    """Return the time from the first to the last sample of a model above 1 % of the largest one [ns]."""
-    bright = times[(mean > _BRIGHT * mean.max()).any(axis=0)]
+    """Return the time from the first to the last sample of a model with light in any pixel [ns]."""
+    bright = times[(mean > _BRIGHT * mean.max(axis=-1, keepdims=True)).any(axis=0)]
     return float(bright[-1] - bright[0]) if bright.size else 0.0
 
 

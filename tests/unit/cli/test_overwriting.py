@@ -216,6 +216,7 @@ def small_figures(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_figures")
+@pytest.mark.slow
 def test_line_names_what_differs():
     first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
     assert line(run(*first)) == []

@@ -115,6 +115,7 @@ def test_images_of_turbid_water_are_fitted_to_the_memory(monkeypatch):
         fitted(monkeypatch, 4.29e9, least_segments=(62.0, 62.0))
 
 
+@pytest.mark.slow
 def test_a_pass_of_cut_buffers_has_the_bits_of_one_of_large_ones(monkeypatch):
     session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
     options = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 1024}, parallel=False)

@@ -79,8 +79,38 @@ def test_passes_make_the_error_of_the_model_small_against_the_data(deviation, pa
     assert mitransient_lidar.fit(data, "table1", NAMES, passes=4).attrs["passes"] == 4
 
 
+def model_of(scene, names, between_bins=False, **params):
+    return study._RenderedModel(scene, params, None, names, 4, 1, None, between_bins=between_bins)
+
+
+def test_a_fixed_coefficient_bounds_a_free_one():
+    """A fit ended where the attenuation would have fallen below the scattering, since such a step is refused."""
+    assert model_of("fig15_2x2", ["attenuation[1]"]).bounds() == {"attenuation[1]": (0.25, 1000.0)}
+    assert model_of("table1", ["scattering"], attenuation=0.5).bounds() == {"scattering": (0.0, 0.5)}
+    assert model_of("table1", ["attenuation", "scattering"]).bounds() == {}
+    assert model_of("table1", ["attenuation"], scattering="0.1, 0.2").bounds() == {}
+
+
+@pytest.mark.parametrize(("width", "given"), [(0.5, None), (0.5, 0.25), (0.1, None)])
+def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
+    """Of pulses of 0.6 ns in bins of 0.5 ns, splines give another waveform: bins become narrower, or a line says so."""
+    renders = []
+
+    def render(scene, *, params, **options):
+        renders.append(params.get("bin_width_ns", width))
+        return closed_form({"attenuation": 0.3}).assign_attrs(bin_width_ns=renders[-1], pulse_fwhm_ns=0.6)
+
+    monkeypatch.setattr(study, "render", render)
+    others = {} if given is None else {"bin_width_ns": given}
+    model_of("table1", ["attenuation"], between_bins=True, **others)({"attenuation": 0.3})
+    model_of("table1", ["attenuation"], **others)({"attenuation": 0.3})
+    first = width if given is None else given
+    assert renders == ([first, 0.12, first] if width == 0.5 and given is None else [first, first])
+    assert ("set bin_width_ns to 0.12 or less" in caplog.text) == (given is not None)
+
+
 def test_values_of_layers_are_set_in_their_list():
-    model = study._RenderedModel("fig15_2x2", {"wind_speed": 3}, None, ["attenuation[1]"], 4, 1, None)
+    model = model_of("fig15_2x2", ["attenuation[1]"], wind_speed=3)
     assert model.starts({}) == {"attenuation[1]": 0.5}
     assert model.with_values({"attenuation[1]": 0.4}) == {"wind_speed": 3, "attenuation": "0.9, 0.4"}
     assert model.with_values({"attenuation[0]": 1.0, "attenuation[1]": 0.4})["attenuation"] == "1.0, 0.4"

@@ -6,6 +6,7 @@ import xarray as xr
 from closed_form_waveform import METRES_PER_NS, SURFACE_NS
 
 import mitransient_lidar
+from mitransient_lidar.analysis.information.alignment import light_duration
 from mitransient_lidar.analysis.information.bandwidth import BehindBandwidth
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
@@ -70,6 +71,15 @@ def test_a_shifted_and_scaled_shot_is_found_from_wrong_starts(factors, tmp_path)
     assert np.abs(z).max() < 4, z
     assert fitted["value"].sel(parameter="time_offset_ns") == pytest.approx(SHIFT, abs=0.2)
     assert fitted.attrs["probability"] > 1e-4
+
+
+def test_light_lasts_to_the_bottom_however_bright_the_surface_is():
+    """The bottom at 1/200 of the surface, or in another pixel alone: EAARL-B was searched for by its surface."""
+    lit = np.zeros((2, 100))
+    lit[0, [10, 60]] = 1.0, 0.005
+    assert light_duration(np.arange(100.0), lit) == 50
+    lit[:, 60] = 0, 1e-5
+    assert light_duration(np.arange(100.0), lit) == 50
 
 
 def test_the_squares_of_stored_residuals_are_the_chi_squared(tmp_path):

@@ -212,6 +212,7 @@ def stated(seed, realisations=20):
     return np.array(squares)
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     squares = stated(1)
     error = squares.std(ddof=1) / np.sqrt(squares.size)
@@ -219,6 +220,7 @@ def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     assert abs(squares.mean() - 1) < 4 * error
 
 
+@pytest.mark.slow
 def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
     """Rates of left-out nodes over those of differences of the same nodes, along depths and waters of eight tables."""
     names = (
