@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
@@ -153,12 +154,18 @@ class PassIntegrator(mi.CppADIntegrator):
         TensorXf
             Received energy [J], shape (pixel, time) or (row, column, time); by daylight radiance [W m^-2 sr^-1 nm^-1],
             shape (pixel,) or (row, column), 0 where no path started.
+
+        Raises
+        ------
+        UserError
+            When `prepare` does, or `seed` is not within 0 to 2^64 - 1, or `spp` not within 0 to 2^28.
         """
+        seed, spp = integer("seed", int(np.array(seed).item()), 0, 2**64 - 1), integer("spp", spp, 0, 2**28)
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         renderer = self.prepare(scene, sensor)
         paths = spp * renderer.scene.receiver.pixels.count if spp > 0 else None
-        result = self.develop(renderer.render_pass(int(np.array(seed).item()), paths=paths), sensor)
+        result = self.develop(renderer.render_pass(seed, paths=paths), sensor)
         return result if develop else mi.TensorXf()
 
     def render_forward(self, *args: Any, **kwargs: Any) -> mi.TensorXf:

@@ -35,6 +35,9 @@ _UNKNOWN_SLOPE_VARIANCE = 0.04
 #: Difference of wavelengths that no water tells apart [nm].
 _SAME_NM = 1.0
 
+#: Relative difference of refractive indices that does not matter, more than the index of air.
+_SAME_INDEX = 1e-3
+
 #: Vertical component of an axis under water above which it looks up.
 _SMALLEST_RISE = 0.1
 
@@ -188,9 +191,26 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
     if len(waters) > 1:
         raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
     for water in waters:
+        _check_index(surfaces, water)
         _check_layers(scene, surfaces, water)
     variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
+    """Refuse surfaces that bend light by another index than that of the water, in which paths are timed."""
+    index = float(water.refractive_index)
+    for surface in surfaces:
+        bsdf = surface.bsdf()
+        own = getattr(bsdf, "parameters", {})
+        values = [own["int_ior"] / own["ext_ior"]] if "int_ior" in own else []
+        values += [np.array(value).item() for name, value in mi.traverse(bsdf) if name.split(".")[-1] == "eta"]
+        for value in values:
+            if abs(value - index) > _SAME_INDEX * index:
+                raise UserError(
+                    f"shape {surface.id()!r}: its bsdf has the index eta = {value:.6g}, and the water below it "
+                    f"refractive_index = {index:.6g}: give both the same (int_ior of the bsdf over ext_ior)"
+                )
 
 
 def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
