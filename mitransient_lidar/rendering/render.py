@@ -114,7 +114,8 @@ def render(
         Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
         whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
     variant
-        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
+        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. What was active
+        before is active afterwards.
     progress
         Called with a `passes.Progress` after every pass.
     **others

@@ -11,7 +11,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.checks import check_dict
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.loading.scenes import as_user_error, load
 from mitransient_lidar.rendering.passes import PassLog
@@ -76,7 +76,7 @@ class Session:
             logger.info("%s%s", text, end)
 
 
-@alone
+@alone_with_scene
 def open_scene(
     scene: Any,
     params: Mapping[str, Any] | None = None,
