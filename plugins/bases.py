@@ -182,6 +182,7 @@ class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
     def __init__(self, props: mi.Properties, pixels: PixelArray) -> None:
+        refuse_medium(props)
         super().__init__(props)
         pose, optics = KernelPose.from_properties(props), ReceiverOptics.from_properties(props)
         self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
@@ -202,8 +203,21 @@ class ReceiverSensor(mi.Sensor):
         """Expose no parameters: a changed receiver is loaded again."""
 
 
+def refuse_medium(props: mi.Properties) -> None:
+    """Raise UserError for a medium inside a sensor or an emitter, which would have no effect."""
+    if any(isinstance(child, mi.Medium) for _, child in props.objects()):
+        raise UserError(
+            f"{props.plugin_name()}: a medium inside it would have no effect, leave it out: what lies below the sea "
+            "surface is in its water, and what lies above in clear air"
+        )
+
+
 class EmitterWithoutExtent(mi.Emitter):
     """Emitter that does not extend the scene and exposes no parameters."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        refuse_medium(props)
+        super().__init__(props)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the emitter does not extend the scene."""

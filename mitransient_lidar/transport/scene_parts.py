@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
@@ -85,23 +86,29 @@ def find_lidar_scene(
     return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
 
 
-def lidar_sensor(scene: mi.Scene) -> mi.Sensor:
+def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
     """Return the receiver among the sensors of a scene, wherever cameras stand beside it; of several, the first.
+
+    `wanted` is the id of the receiver instead.
 
     Raises
     ------
     UserError
-        If the scene has none.
+        If the scene has none, or none of that id.
     """
     sensors = scene.sensors()
     receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
     if not receivers:
         found = f"has only {', '.join(sensor.class_name() for sensor in sensors)}" if sensors else "has none"
         raise UserError(f"sensor: the scene {found}; add a multipixel_receiver or pixel_fov")
-    if len(receivers) > 1:
-        names = ", ".join(repr(sensor.id()) for sensor in sensors if sensor in receivers)
-        logger.warning("the scene has %d receivers, %s: the first one is used", len(receivers), names)
-    return receivers[0]
+    ids = [sensor.id() for sensor in sensors if sensor in receivers]
+    names = ", ".join(map(repr, ids))
+    if wanted and wanted not in ids:
+        raise UserError(f"sensor = {shown(wanted)} is no receiver of the scene: it has {names}")
+    if len(receivers) > 1 and not wanted:
+        text = "the scene has %d receivers, %s: the first one is used, unless sensor names one"
+        logger.warning(text, len(receivers), names)
+    return receivers[ids.index(wanted) if wanted else 0]
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
