@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
@@ -153,12 +154,18 @@ class PassIntegrator(mi.CppADIntegrator):
         TensorXf
             Received energy [J], shape (pixel, time) or (row, column, time); by daylight radiance [W m^-2 sr^-1 nm^-1],
             shape (pixel,) or (row, column), 0 where no path started.
+
+        Raises
+        ------
+        UserError
+            When `prepare` does, or `seed` is not within 0 to 2^64 - 1, or `spp` not within 0 to 2^28.
         """
+        seed, spp = integer("seed", int(np.array(seed).item()), 0, 2**64 - 1), integer("spp", spp, 0, 2**28)
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         renderer = self.prepare(scene, sensor)
         paths = spp * renderer.scene.receiver.pixels.count if spp > 0 else None
-        result = self.develop(renderer.render_pass(int(np.array(seed).item()), paths=paths), sensor)
+        result = self.develop(renderer.render_pass(seed, paths=paths), sensor)
         return result if develop else mi.TensorXf()
 
     def render_forward(self, *args: Any, **kwargs: Any) -> mi.TensorXf:
@@ -175,6 +182,7 @@ class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
     def __init__(self, props: mi.Properties, pixels: PixelArray) -> None:
+        refuse_medium(props)
         super().__init__(props)
         pose, optics = KernelPose.from_properties(props), ReceiverOptics.from_properties(props)
         self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
@@ -195,8 +203,21 @@ class ReceiverSensor(mi.Sensor):
         """Expose no parameters: a changed receiver is loaded again."""
 
 
+def refuse_medium(props: mi.Properties) -> None:
+    """Raise UserError for a medium inside a sensor or an emitter, which would have no effect."""
+    if any(isinstance(child, mi.Medium) for _, child in props.objects()):
+        raise UserError(
+            f"{props.plugin_name()}: a medium inside it would have no effect, leave it out: what lies below the sea "
+            "surface is in its water, and what lies above in clear air"
+        )
+
+
 class EmitterWithoutExtent(mi.Emitter):
     """Emitter that does not extend the scene and exposes no parameters."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        refuse_medium(props)
+        super().__init__(props)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the emitter does not extend the scene."""

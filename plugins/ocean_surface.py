@@ -20,6 +20,9 @@ from mitransient_lidar.transport.plugin_types import WaterMedium
 #: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` knows the lidar.
 WAITS = "_waits"
 
+#: Buffers of a mesh that `OceanSurface.fit` makes anew.
+_BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
+
 
 class OceanSurface(mi.Mesh):
     r"""Sea surface with waves of wind and swell, or from a height map (``ocean_surface``).
@@ -139,7 +142,10 @@ class OceanSurface(mi.Mesh):
     Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
     scattered far. Light beyond ``size`` is lost and reported after rendering.
 
-    Other surfaces: any mesh (``ply``, ``obj``) with a ``layered_water`` as its interior medium and a dielectric BSDF.
+    Edits by ``mi.traverse`` act, those of the mesh after the first render, which fits it to the lidar.
+
+    Other surfaces: any mesh (``ply``, ``obj``) with a ``layered_water`` as its interior medium and a dielectric BSDF of
+    the water's index.
 
     .. code-block:: xml
 
@@ -157,6 +163,8 @@ class OceanSurface(mi.Mesh):
         self._values: dict[str, Any] = {}
         #: Footprints for which automatic values are chosen; None before `fit`.
         self.footprints: Sequence[Footprint] | None = None
+        #: Buffers of the mesh that have been edited before `fit`.
+        self._edited: set[str] = set()
         waits = bool(props.take(WAITS, False))
 
         def get(name: str, default: Any) -> Any:
@@ -178,25 +186,43 @@ class OceanSurface(mi.Mesh):
         mesh = self.sea.mesh()
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
+        self._edited.clear()
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Take edits of `mi.traverse`, of which those of the mesh must come after `fit`."""
+        super().parameters_changed(list(keys))
+        if self.footprints is None:
+            self._edited |= _BUFFERS & set(keys)
 
     def fit(self, footprints: Sequence[Footprint]) -> bool:
-        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
+
+        Edits of the ripples stay. Raises UserError if the mesh has been edited, and must change.
+        """
 
         def get(name: str, _: Any) -> Any:
             return self._values[name]
 
-        former, self.footprints = self._resolution, footprints
-        self._resolution = Resolution.read(get, footprints)
-        if self._resolution == former:
+        resolution = Resolution.read(get, footprints)
+        if self._edited and resolution != self._resolution:
+            raise UserError(
+                f"ocean_surface {self.id()!r}: {sorted(self._edited)[0]} was changed before the mesh was fitted to the "
+                "lidar, as the first render does: render once, then change it and update"
+            )
+        former, self._resolution, self.footprints = self._resolution, resolution, footprints
+        if resolution == former:
             return False
+        unfitted = self._roughness()
         self._use(SeaSurface.read(get, footprints))
         fill_mesh(self, self.sea.mesh())
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)
         elif self.has_ripples:
             buffers = mi.traverse(self)
-            for axis, alpha in zip("uv", self._roughness(), strict=True):
-                buffers[f"bsdf.alpha_{axis}.value"] = alpha
+            for axis, alpha, own in zip("uv", self._roughness(), unfitted, strict=True):
+                name = f"bsdf.alpha_{axis}.value"
+                if np.float32(own) == np.array(buffers[name]).item():
+                    buffers[name] = alpha
             buffers.update()
         return True
 

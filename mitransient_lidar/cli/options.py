@@ -16,6 +16,9 @@ from mitransient_lidar.rendering.options import RenderOptions
 Instrument = Annotated[
     str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
 ]
+Sensor = Annotated[
+    str | None, typer.Option(metavar="ID", help="Receiver of a scene that has several, instead of the first one.")
+]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene, or path of a Mitsuba XML file.")]
 SceneOrResult = Annotated[
     str,

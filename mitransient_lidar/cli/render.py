@@ -10,7 +10,16 @@ import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import OUTPUT, Define, Instrument, Quiet, SceneOrResult, parameters, render_options
+from mitransient_lidar.cli.options import (
+    OUTPUT,
+    Define,
+    Instrument,
+    Quiet,
+    SceneOrResult,
+    Sensor,
+    parameters,
+    render_options,
+)
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -29,6 +38,7 @@ def render(
     define: Define = None,
     output: Folder = OUTPUT,
     instrument: Instrument = None,
+    sensor: Sensor = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
@@ -59,9 +69,8 @@ def render(
 
     with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:
-            dataset = rendering.render(
-                scene, params=params, instrument=instrument, integrator=integrator, progress=progress, **options
-            )
+            chosen: dict[str, Any] = {"instrument": instrument, "sensor": sensor, "integrator": integrator}
+            dataset = rendering.render(scene, params=params, progress=progress, **chosen, **options)
         output.mkdir(parents=True, exist_ok=True)
         if "waveform" not in dataset:
             targets = [output / f"{name}.nc"]
@@ -112,6 +121,7 @@ def passive(
     scene: SceneOrResult,
     define: Define = None,
     output: Folder = OUTPUT,
+    sensor: Sensor = None,
     frames: Annotated[
         int | None, typer.Option(help="Number of frames of an animation, 1 to 10 000; 1 by default.")
     ] = None,
@@ -143,7 +153,7 @@ def passive(
     from mitransient_lidar.rendering.render import render_again
     from mitransient_lidar.results.radiance import save_radiance
 
-    series = {"frames": frames, "frame_step_s": frame_step, "filter_width_nm": filter_width_nm}
+    series = {"sensor": sensor, "frames": frames, "frame_step_s": frame_step, "filter_width_nm": filter_width_nm}
     options |= {option: value for option, value in series.items() if value is not None}
     with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:

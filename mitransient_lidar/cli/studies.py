@@ -28,6 +28,7 @@ from mitransient_lidar.cli.options import (
     Scene,
     SceneOrResult,
     Seed,
+    Sensor,
     numbers,
     pair,
     parameters,
@@ -95,6 +96,7 @@ def shots(
     scene: SceneOrResult,
     define: Define = None,
     instrument: Instrument = None,
+    sensor: Sensor = None,
     count: Annotated[
         int | None, typer.Option(help="Number of shots at random places, 2 to 100 000; 20 by default.")
     ] = None,
@@ -139,6 +141,7 @@ def shots(
         if is_result(scene):
             raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument.")
         options["instrument"] = instrument
+    options["sensor"] = sensor
     default = {} if is_result(scene) else {"count": 20}
     render = render_again if is_result(scene) else study.render_shots
     with DeferredInterrupt(at_once=False):

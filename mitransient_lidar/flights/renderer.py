@@ -41,6 +41,7 @@ from mitransient_lidar.flights.recording import (
     record,
     saturated_pulses,
 )
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import read_record
@@ -273,6 +274,8 @@ class FlightRenderer:
 
     def _scene_of(self, inputs: Mapping[str, Column]) -> ShotScene:
         """Return the loaded scene of the lidar of pulses of one group."""
+        # That of a scene which was loaded before.
+        variants.leave_the_gpu("shots are rendered")
         return _shot_scene(self, *self._lidar_and_record(inputs))
 
     def _lidar_and_record(self, inputs: Mapping[str, Column]) -> tuple[float, float, float, float, TimeAxis]:

@@ -1,4 +1,4 @@
-"""One thread at a time uses Mitsuba and Dr.Jit; others wait.
+"""One thread at a time uses Mitsuba and Dr.Jit; others wait. It leaves Mitsuba's variant as it finds it.
 
 Where a kernel adds to an array, each thread of Dr.Jit's pool has its own copy. All other threads of the process share
 one copy, and they help with kernels while they wait: two that wait at once overwrite each other's sums and lose light.
@@ -7,6 +7,7 @@ The virtual function calls that one thread records also see the objects of a sce
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import sys
@@ -15,6 +16,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.loading.variants import kept
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -29,10 +31,12 @@ class _Turn:
     def __init__(self) -> None:
         self._lock, self._depth = threading.RLock(), 0
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> bool:
+        """Return whether the thread has just got the turn."""
         while not self._lock.acquire(timeout=_LOOK_S):
             DeferredInterrupt.check()
         self._depth += 1
+        return self._depth == 1
 
     def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
         try:
@@ -56,8 +60,20 @@ os.register_at_fork(after_in_child=_turn.renew)
 def alone(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that runs in one thread at a time, alone among all of these functions.
 
-    It may call others of them. A Ctrl-C in the main thread ends its waiting.
+    It may call others of them. The first one leaves the active variant of Mitsuba as it found it. A Ctrl-C in the main
+    thread ends its waiting.
     """
+
+    @functools.wraps(function)
+    def waiting(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with _turn as is_first, kept() if is_first else contextlib.nullcontext():
+            return function(*args, **kwargs)
+
+    return waiting
+
+
+def alone_with_scene(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return a function as `alone` does, that leaves the variant of the scene which it returns."""
 
     @functools.wraps(function)
     def waiting(*args: _P.args, **kwargs: _P.kwargs) -> _R:

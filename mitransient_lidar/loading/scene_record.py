@@ -8,6 +8,8 @@ A result has these attributes:
     Instead, a scene given as a dict, as JSON: a transform is {"matrix": 4x4, "inverse_transpose": 4x4}.
 ``instrument``
     Name of the instrument whose laser and receiver the XML holds in place of the scene's own.
+``sensor``
+    Id of the receiver that was chosen among several.
 ``scene_files``
     JSON list of the files that the scene names: ``plugin``, ``name`` as in the scene, absolute ``path``, ``sha256``.
 ``plugin_parameters``
@@ -68,6 +70,8 @@ class SceneRecord:
         Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     instrument
         Name of the instrument of an XML scene; empty if its laser and receiver are its own.
+    sensor
+        Id of a receiver of the scene; empty for the first one.
     """
 
     name: str
@@ -76,6 +80,7 @@ class SceneRecord:
     parameters: Mapping[str, str]
     files: Mapping[tuple[str, str], tuple[str, str]]
     instrument: str = ""
+    sensor: str = ""
 
     @classmethod
     def of_document(cls, document: SceneDocument, former: SceneRecord | None = None) -> SceneRecord:
@@ -87,7 +92,8 @@ class SceneRecord:
         files = _found(((plugin, setting.value) for plugin, setting in _files_of(document)), document.folders)
         if former is not None:
             files |= {file: found for file, found in former.files.items() if file[1] not in document.given.values()}
-        return cls(document.name, document.text, True, dict(document.parameters), files, document.instrument)
+        sensor = former.sensor if former is not None else ""
+        return cls(document.name, document.text, True, dict(document.parameters), files, document.instrument, sensor)
 
     @classmethod
     def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
@@ -127,21 +133,21 @@ class SceneRecord:
             files = {(row["plugin"], row["name"]): (str(row["path"]), str(row["sha256"])) for row in rows}
         except (KeyError, TypeError) as error:
             raise UserError("the attribute scene_files of the result is damaged: it must be a list of files") from error
-        name, instrument = attributes.get("scene", "scene"), str(attributes.get("instrument", ""))
+        name = attributes.get("scene", "scene")
+        instrument, sensor = (str(attributes.get(one, "")) for one in ("instrument", "sensor"))
         # Names of outputs begin with it.
         if not is_file_name(name):
             raise UserError(
                 f"the attribute scene = {shown(name)} of the result is damaged: it must be the name of a file, without "
                 "folders and control characters"
             )
-        return cls(name, attributes[kind], kinds[0] == "xml", parameters, files, instrument)
+        return cls(name, attributes[kind], kinds[0] == "xml", parameters, files, instrument, sensor)
 
     def attributes(self) -> dict[str, str]:
         """Return the attributes of a result from which `from_attributes` returns this record."""
         described = {f"scene.{name}": value for name, value in self.parameters.items()}
         described["scene_xml" if self.is_xml else "scene_dict"] = self.text
-        if self.instrument:
-            described["instrument"] = self.instrument
+        described |= {name: one for name in ("instrument", "sensor") if (one := getattr(self, name))}
         if self.files:
             rows = [
                 {"plugin": plugin, "name": name, "path": path, "sha256": digest}

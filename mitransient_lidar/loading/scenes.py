@@ -16,7 +16,7 @@ from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
 from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
@@ -48,7 +48,7 @@ def load_scene(
     return loaded.scene, loaded.name, loaded.parameters
 
 
-@alone
+@alone_with_scene
 def load(
     scene: Any,
     params: Mapping[str, Any] | None = None,

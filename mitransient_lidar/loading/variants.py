@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib
 import importlib.metadata
 import logging
@@ -9,6 +11,7 @@ import os
 import platform
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
@@ -24,31 +27,31 @@ OLDEST_USABLE_LLVM = 17
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
-#: Modules of the plugins, below ``mitransient_lidar.plugins``.
-PLUGIN_MODULES = (
-    "bases",  # first, with phase.tabulated: others derive from them
-    "phase.tabulated",
-    "phase.fournier_forand",
-    "phase.petzold",
-    "phase.sea_water",
-    "phase.measured_phase",
-    "phase.two_term_henyey_greenstein",
-    "layered_water",
-    "gram_charlier_dielectric",
-    "ocean_surface",
-    "seabed",
-    "retroreflector",
-    "sediment",
-    "lidar_transmitter",
-    "sun",
-    "sky",
-    "pixel_fov",
-    "multipixel_receiver",
-    "time_gated_film",
-    "lidar_volpath",
-    "lidar_merging",
-    "passive_volpath",
-)
+#: Modules of the plugins, below ``mitransient_lidar.plugins``, each with the kind of its plugin.
+PLUGIN_MODULES = {
+    "bases": None,  # first, with phase.tabulated: others derive from them
+    "phase.tabulated": None,
+    "phase.fournier_forand": "phase",
+    "phase.petzold": "phase",
+    "phase.sea_water": "phase",
+    "phase.measured_phase": "phase",
+    "phase.two_term_henyey_greenstein": "phase",
+    "layered_water": "medium",
+    "gram_charlier_dielectric": "bsdf",
+    "ocean_surface": "shape",
+    "seabed": "shape",
+    "retroreflector": "bsdf",
+    "sediment": "bsdf",
+    "lidar_transmitter": "emitter",
+    "sun": "emitter",
+    "sky": "emitter",
+    "pixel_fov": "sensor",
+    "multipixel_receiver": "sensor",
+    "time_gated_film": "film",
+    "lidar_volpath": "integrator",
+    "lidar_merging": "integrator",
+    "passive_volpath": "integrator",
+}
 
 _registered_for: str | None = None
 
@@ -174,8 +177,21 @@ def set_variant(name: str | None = None) -> str:
     return name
 
 
+@contextlib.contextmanager
+def kept() -> Iterator[None]:
+    """Leave the active variant as it is found."""
+    import mitsuba as mi
+
+    former = mi.variant()
+    try:
+        yield
+    finally:
+        if former not in (None, mi.variant()):
+            mi.set_variant(former)
+
+
 def leave_the_gpu(what: str) -> None:
-    """Go on with ``llvm_ad_mono``, and say so, where ``cuda_ad_mono`` is active.
+    """Go on with ``llvm_ad_mono``, and say so once, where ``cuda_ad_mono`` is active, or would be chosen.
 
     `what` is rendered through several Mitsuba scenes in one kernel. OptiX traces rays through the first of them only:
     the light of the others would be missing without a word.
@@ -185,21 +201,27 @@ def leave_the_gpu(what: str) -> None:
     UserError
         If there is no LLVM.
     """
-    import mitsuba as mi
-
-    if (mi.variant() if mi.variant() in SUPPORTED_VARIANTS else choose_variant()) == "cuda_ad_mono":
-        _LOG.warning("%s by llvm_ad_mono: a kernel of cuda_ad_mono can trace rays through one scene only", what)
+    if set_variant() == "cuda_ad_mono":
+        _tell_of_llvm(what)
         set_variant("llvm_ad_mono")
+
+
+@functools.cache
+def _tell_of_llvm(what: str) -> None:
+    _LOG.warning("%s by llvm_ad_mono: a kernel of cuda_ad_mono can trace rays through one scene only", what)
 
 
 def register_plugins(_old: str | None, new: str) -> None:
     """Register every plugin for the variant ``new``; Mitsuba calls this when the variant changes.
 
     Plugin classes derive from classes of the active variant, so that their modules are reloaded for each one.
-    Unsupported variants are ignored.
+    In unsupported variants the plugins refuse to be loaded.
     """
     global _registered_for
-    if new not in SUPPORTED_VARIANTS or new == _registered_for:
+    if new not in SUPPORTED_VARIANTS:
+        _register_refusals()
+        return
+    if new == _registered_for:
         return
     for name in PLUGIN_MODULES:
         module = f"mitransient_lidar.plugins.{name}"
@@ -208,6 +230,21 @@ def register_plugins(_old: str | None, new: str) -> None:
         else:
             importlib.import_module(module)
     _registered_for = new
+
+
+def _register_refusals() -> None:
+    """Register plugins that raise `UserError` in the active variant."""
+    import mitsuba as mi
+
+    def refuse(props: mi.Properties) -> None:
+        raise UserError(
+            f"{props.plugin_name()} needs the variant {' or '.join(reversed(SUPPORTED_VARIANTS))}, and {mi.variant()} "
+            "is active: call mitsuba.set_variant before the scene is loaded"
+        )
+
+    for name, kind in PLUGIN_MODULES.items():
+        if kind is not None:
+            getattr(mi, f"register_{kind}")(name.rpartition(".")[2], refuse)
 
 
 def versions() -> dict[str, str]:

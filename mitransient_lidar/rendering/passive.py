@@ -55,6 +55,7 @@ def render_passive(
     scene: str | Path | Mapping[str, Any] | mi.Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    sensor: str | None = None,
     integrator: str | Mapping[str, Any] | None = None,
     target_error: float | None = None,
     target_quantile: float | None = None,
@@ -73,6 +74,8 @@ def render_passive(
     ----------
     scene
         As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
+    sensor
+        Id of a receiver of the scene, by default the first one.
     integrator
         Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
@@ -117,7 +120,7 @@ def render_passive(
     start, lost = time.perf_counter(), 0.0
     for frame in range(frames):
         moved = _moved(scene, params, frame * step) if frames > 1 else (scene, params)
-        session = open_scene(*moved, variant)
+        session = open_scene(*moved, variant, sensor=sensor)
         chosen = choose_integrator(session.scene, integrator, passive=True)
         renderer = chosen.prepare(session.scene, session.sensor)
         if frame == 0:

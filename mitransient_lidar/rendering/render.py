@@ -45,6 +45,7 @@ def render(
     *,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
+    sensor: str | None = None,
     integrator: str | Mapping[str, Any] | mi.Integrator | None = None,
     target_error: float | None = None,
     target_quantile: float | None = None,
@@ -74,6 +75,8 @@ def render(
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene, as `loading.instruments` lists
         them.
+    sensor
+        Id of a receiver of the scene, by default the first one.
     integrator
         Name or dict of an integrator plugin, or an integrator; by default that of the scene.
     target_error
@@ -114,7 +117,8 @@ def render(
         Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
         whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
     variant
-        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
+        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. What was active
+        before is active afterwards.
     progress
         Called with a `passes.Progress` after every pass.
     **others
@@ -152,10 +156,10 @@ def render(
         raise UserError("reweight: a result is rendered again with its own parameters; give its scene")
     if again.is_result(scene):
         result: Any = scene
-        scene_options = {"params": params, "instrument": instrument, "integrator": integrator, "progress": progress}
-        return render_again(result, **scene_options, **options, **others)
+        given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
+        return render_again(result, **given, progress=progress, **options, **others)
     chosen = RenderOptions(**options, **others)
-    session = open_scene(scene, params, chosen.variant, instrument)
+    session = open_scene(scene, params, chosen.variant, instrument, sensor=sensor)
     return _render(session, integrator, chosen, reweight or [], progress)
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.checks import check_dict
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.loading.scenes import as_user_error, load
 from mitransient_lidar.rendering.passes import PassLog
@@ -76,30 +76,34 @@ class Session:
             logger.info("%s%s", text, end)
 
 
-@alone
+@alone_with_scene
 def open_scene(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     variant: str | None = None,
     instrument: str | None = None,
     model: mi.Scene | None = None,
+    sensor: str | None = None,
 ) -> Session:
     """Load a scene as `loading.scenes.load`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
-    A session without `params` is returned as it is.
+    `sensor` is the id of a receiver, by default that of a record, or the first one. A session without `params` and
+    `sensor` is returned as it is.
 
     Raises
     ------
     UserError
-        If the scene cannot be loaded, or has no sensor.
+        If the scene cannot be loaded, or has no receiver, or none of that id.
     """
-    if isinstance(scene, Session) and not params:
+    if isinstance(scene, Session) and not params and not sensor:
         return scene
     variants.set_variant(variant)
     from mitransient_lidar.transport.scene_parts import lidar_sensor
 
     loaded = load(scene, params, instrument, model)
-    return Session(loaded.scene, lidar_sensor(loaded.scene), loaded.name, loaded.parameters, loaded.record)
+    record = loaded.record if loaded.record is None or not sensor else replace(loaded.record, sensor=sensor)
+    chosen = lidar_sensor(loaded.scene, sensor or (record.sensor if record else ""))
+    return Session(loaded.scene, chosen, loaded.name, loaded.parameters, record)
 
 
 @overload

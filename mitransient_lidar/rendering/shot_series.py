@@ -8,6 +8,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
@@ -82,6 +85,7 @@ def render_shots(
     components: bool | None = None,
     derivatives: Sequence[str] | str | None = None,
     instrument: str | None = None,
+    sensor: str | None = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -126,6 +130,8 @@ def render_shots(
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
     instrument
         Name of the instrument whose laser and receiver replace those of the scene.
+    sensor
+        Id of a receiver of the scene, by default the first one.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     progress
@@ -165,6 +171,10 @@ def render_shots(
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")
+    if sensor and isinstance(scene, (str, os.PathLike)):
+        scene, instrument = read_record(scene, params, instrument), None
+    if sensor and isinstance(scene, SceneRecord):
+        scene = replace(scene, sensor=sensor)
     session = open_scene(scene, params, instrument=instrument) if given is None or move_target else None
     target = _target_offset(session) if session is not None and move_target else None
     places = given

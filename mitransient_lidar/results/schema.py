@@ -52,7 +52,7 @@ _LISTS: dict[str, int | None] = {
 #: Those that are empty where there are none: views of hexagons and of separate pixels have no sides.
 _MAY_BE_EMPTY = ("field_of_view_sides_mrad", "error_inflation_bins", "error_inflation")
 
-_TEXTS = ("scene", "beam_profile", "field_of_view_shape", "layout", "variant", "integrator", "instrument")
+_TEXTS = ("scene", "beam_profile", "field_of_view_shape", "layout", "variant", "integrator", "instrument", "sensor")
 
 #: Attributes that are texts of JSON: lists of outlines, each a list of lines x, y, x, y, ...; or with a name.
 _OUTLINES, _LISTED = ("pixel_outlines",), {"beam_outlines": ("share", "lines"), "target_outlines": ("id", "z", "line")}

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
@@ -34,6 +35,9 @@ _UNKNOWN_SLOPE_VARIANCE = 0.04
 
 #: Difference of wavelengths that no water tells apart [nm].
 _SAME_NM = 1.0
+
+#: Relative difference of refractive indices that does not matter, more than the index of air.
+_SAME_INDEX = 1e-3
 
 #: Vertical component of an axis under water above which it looks up.
 _SMALLEST_RISE = 0.1
@@ -82,23 +86,29 @@ def find_lidar_scene(
     return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
 
 
-def lidar_sensor(scene: mi.Scene) -> mi.Sensor:
+def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
     """Return the receiver among the sensors of a scene, wherever cameras stand beside it; of several, the first.
+
+    `wanted` is the id of the receiver instead.
 
     Raises
     ------
     UserError
-        If the scene has none.
+        If the scene has none, or none of that id.
     """
     sensors = scene.sensors()
     receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
     if not receivers:
         found = f"has only {', '.join(sensor.class_name() for sensor in sensors)}" if sensors else "has none"
         raise UserError(f"sensor: the scene {found}; add a multipixel_receiver or pixel_fov")
-    if len(receivers) > 1:
-        names = ", ".join(repr(sensor.id()) for sensor in sensors if sensor in receivers)
-        logger.warning("the scene has %d receivers, %s: the first one is used", len(receivers), names)
-    return receivers[0]
+    ids = [sensor.id() for sensor in sensors if sensor in receivers]
+    names = ", ".join(map(repr, ids))
+    if wanted and wanted not in ids:
+        raise UserError(f"sensor = {shown(wanted)} is no receiver of the scene: it has {names}")
+    if len(receivers) > 1 and not wanted:
+        text = "the scene has %d receivers, %s: the first one is used, unless sensor names one"
+        logger.warning(text, len(receivers), names)
+    return receivers[ids.index(wanted) if wanted else 0]
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
@@ -188,9 +198,26 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
     if len(waters) > 1:
         raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
     for water in waters:
+        _check_index(surfaces, water)
         _check_layers(scene, surfaces, water)
     variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
+    """Refuse surfaces that bend light by another index than that of the water, in which paths are timed."""
+    index = float(water.refractive_index)
+    for surface in surfaces:
+        bsdf = surface.bsdf()
+        own = getattr(bsdf, "parameters", {})
+        values = [own["int_ior"] / own["ext_ior"]] if "int_ior" in own else []
+        values += [np.array(value).item() for name, value in mi.traverse(bsdf) if name.split(".")[-1] == "eta"]
+        for value in values:
+            if abs(value - index) > _SAME_INDEX * index:
+                raise UserError(
+                    f"shape {surface.id()!r}: its bsdf has the index eta = {value:.6g}, and the water below it "
+                    f"refractive_index = {index:.6g}: give both the same (int_ior of the bsdf over ext_ior)"
+                )
 
 
 def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:

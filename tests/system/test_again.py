@@ -143,6 +143,31 @@ def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("function", [mitransient_lidar.render, render_passive, render_shots])
+def test_a_result_of_another_receiver_gives_the_same_bits(function, tmp_path):
+    """The first one was rendered, whatever was asked for."""
+    poses = '<float name="aim_x" value="$aim_x"/><float name="aim_y" value="$aim_y"/>'
+    receivers = "".join(
+        f'<sensor type="multipixel_receiver" id="{name}"><string name="layout" value="1x{number}"/>{poses}'
+        '<film type="time_gated_film"><integer name="bin_count" value="80"/></film></sensor>'
+        for number, name in enumerate(("single", "pair"), start=1)
+    )
+    (tmp_path / "two.xml").write_text(
+        '<scene version="3.0.0"><default name="aim_x" value="0"/><default name="aim_y" value="0"/><emitter type="sky"/>'
+        f'<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>{receivers}'
+        f'<emitter type="lidar_transmitter">{poses}</emitter><shape type="ocean_surface"><string name="spectrum" '
+        'value="flat"/><medium type="layered_water" name="interior"/></shape></scene>'
+    )
+    options = {"passes": 2, **({"positions": [(0, 0), (1, 1)]} if function is render_shots else {})}
+    for name, number in (("", 1), ("pair", 2)):
+        result = function(tmp_path / "two.xml", sensor=name, **options)
+        assert result.sizes["pixel"] == number
+    assert_same_bits(render_again(result), result)
+    with pytest.raises(UserError, match="sensor = 'sky' is no receiver of the scene: it has 'single', 'pair'"):
+        function(tmp_path / "two.xml", sensor="sky", **options)
+
+
+@pytest.mark.slow
 def test_textures_give_the_same_bits(tmp_path):
     """A bitmap on the seabed and a turned pattern on a target, from the file of the result."""
     picture = tmp_path / "grey.png"

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
 from mitransient_lidar.core.validation import positive
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
 from mitransient_lidar.plots.publication import waves as wave_drawings
@@ -67,6 +68,7 @@ class Publication:
     interrupted: bool = False
 
 
+@alone
 def figures(
     names: Sequence[str] | None = None,
     output: str | os.PathLike[str] = "output/figures",

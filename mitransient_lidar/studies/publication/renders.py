@@ -15,7 +15,7 @@ import xarray as xr
 from mitransient_lidar.core.validation import integer, relative_error
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_parameters
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.exclusive import alone, alone_with_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
@@ -106,13 +106,13 @@ class Renders:
                 found[number].append(as_series(result.isel(shot=slice(edges[number], edges[number + 1]))))
         return [joined(parts) for parts in found]
 
-    @alone
+    @alone_with_scene
     def session(self, scene: str, sea: int = 0) -> Session:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
+        # Series of its shots are rendered later.
+        variants.leave_the_gpu("figures are rendered")
         if key not in self._sessions:
-            # Series of its shots are rendered later.
-            variants.leave_the_gpu("figures are rendered")
             self._sessions[key] = open_scene(scene, {"surface_seed": sea} if sea else None)
         return self._sessions[key]
 

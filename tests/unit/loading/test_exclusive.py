@@ -93,7 +93,8 @@ end.set()
 
 
 def is_alone(function):
-    return any(isinstance(one, ast.Name) and one.id == "alone" for one in getattr(function, "decorator_list", []))
+    decorators = [one.id for one in getattr(function, "decorator_list", []) if isinstance(one, ast.Name)]
+    return not {"alone", "alone_with_scene"}.isdisjoint(decorators)
 
 
 def uses(tree, outer=()):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,8 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import variants
+from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.studies.find_shots import find_shots
 
 
 def test_the_wheels_llvm_is_found_through_its_metadata():
@@ -52,19 +55,21 @@ def test_cuda_without_a_gpu_is_refused():
             variants.set_variant("cuda_ad_mono")
 
 
-def test_shots_leave_the_gpu(monkeypatch, caplog):
+def test_shots_leave_the_gpu_and_come_back(monkeypatch, caplog):
     """A kernel of OptiX traces rays through one Mitsuba scene: the bottom of a series had no light, without a word."""
-    active, set_variant = ["cuda_ad_mono"], variants.set_variant
+    active = ["cuda_ad_mono"]
 
     def change(name=None):
-        active[0] = name or active[0]
-        return set_variant("llvm_ad_mono")
+        active.append(name or active[-1])
+        return active[-1]
 
-    monkeypatch.setattr(mi, "variant", lambda: active[0])
+    monkeypatch.setattr(mi, "variant", lambda: active[-1])
+    monkeypatch.setattr(mi, "set_variant", change)
     monkeypatch.setattr(variants, "set_variant", change)
+    variants._tell_of_llvm.cache_clear()
     with pytest.raises(UserError, match="parameter"):
         mitransient_lidar.render_shots("table1", {"nonsense": 1}, positions=[(0, 0), (1, 1)])
-    assert active == ["llvm_ad_mono"]
+    assert [active[number] for number in (1, 2, -1)] == ["cuda_ad_mono", "llvm_ad_mono", "cuda_ad_mono"]
     assert caplog.text.count("shots are rendered by llvm_ad_mono: a kernel of cuda_ad_mono") == 1
 
 
@@ -100,17 +105,36 @@ def test_the_users_own_llvm_wins():
     assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip() == own
 
 
-@pytest.mark.slow
-def test_plugins_follow_the_variant():
-    """Another variant registers none of ours; coming back they work again."""
+@pytest.fixture
+def rgb():
+    """Another variant, which the plugins do not support."""
     ours = mi.variant()
     mi.set_variant("scalar_rgb")
-    try:
-        with pytest.raises(RuntimeError, match="not found"):
-            mi.load_dict({"type": "petzold"})
-    finally:
-        mi.set_variant(ours)
+    yield "scalar_rgb"
+    mi.set_variant(ours)
+
+
+def test_plugins_name_the_variants_that_they_need(rgb):
+    """In place of ``Plugin "petzold" not found!`` each refuses by a sentence; coming back they work again."""
+    sources = "".join(path.read_text() for path in Path(variants.__file__).parents[2].glob("plugins/**/*.py"))
+    names = {name.rpartition(".")[2]: kind for name, kind in variants.PLUGIN_MODULES.items() if kind}
+    for name, kind in names.items():
+        assert f'mi.register_{kind}("{name}"' in sources
+        with pytest.raises(RuntimeError, match=f"UserError: {name} needs the variant llvm_ad_mono or .* scalar_rgb is"):
+            mi.load_dict({"type": name})
+    mi.set_variant(variants.set_variant())
     assert mi.load_dict({"type": "petzold"}).backscatter_ratio > 0
+
+
+def test_functions_leave_the_variant_as_they_found_it(rgb):
+    """Also by an error; only what loads a scene for later leaves that of the scene."""
+    with pytest.raises(UserError, match="nonsense"):
+        mitransient_lidar.render("table1", params={"nonsense": 1})
+    assert mi.variant() == rgb
+    assert find_shots("fig09_2x2", {"surface_cell_size": 1}, count=1)
+    assert mi.variant() == rgb
+    open_scene("table1", {"spectrum": "flat"})
+    assert mi.variant() in variants.SUPPORTED_VARIANTS
 
 
 def test_description_names_versions_and_llvm():

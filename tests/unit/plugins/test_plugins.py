@@ -109,6 +109,8 @@ REFUSED = [
     ({"type": "multipixel_receiver", "response_time_ns": -1.0}, "response_time_ns = -1 must not be negative"),
     ({"type": "multipixel_receiver", "layout": "2x2", "a": CIRCLE}, "nested pixel_fov sensors or layout"),
     ({"type": "multipixel_receiver", "a": {"type": "perspective"}}, "nested sensors must be pixel_fov"),
+    ({"type": "multipixel_receiver", "a": {"type": "layered_water"}}, "multipixel_receiver: a medium inside it would"),
+    ({"type": "sky", "a": {"type": "homogeneous"}}, "sky: a medium inside it would have no effect"),
     ({"type": "multipixel_receiver", "fill_factor": 0.5, "a": CIRCLE}, "nested pixel_fov sensors or fill_factor"),
     ({"type": "multipixel_receiver", "layout": "hex8"}, "layout = 'hex8' must have 1, 7, 19, 37, 61, ... hexagons"),
     ({"type": "multipixel_receiver", "layout": "hex0"}, "layout = 'hex0' must have"),
