@@ -121,7 +121,9 @@ class LayeredWater(mi.Medium):
         for name in list(phases)[1:]:
             del props[name]
         #: The water (`mitransient_lidar.transport.medium.water.Water`).
-        self.water = read_water(props, phases, bubbles, partial(TabulatedPhaseFunction, mi.Properties()))
+        self.water = read_water(props, phases, bubbles, partial(TabulatedPhaseFunction, mi.Properties())).moved(
+            props.frame_origin
+        )
         if not phases:
             # For Mitsuba's own integrators, whose default is an isotropic function.
             props["phase_0"] = self.water.phases.phases[0]

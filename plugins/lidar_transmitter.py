@@ -94,7 +94,7 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.pose = KernelPose.from_properties(props)
+        self.pose = KernelPose.from_properties(props).in_frame(props.frame_origin)
         self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)

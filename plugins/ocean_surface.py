@@ -158,6 +158,7 @@ class OceanSurface(mi.Mesh):
         #: Footprints for which automatic values are chosen; None before `fit`.
         self.footprints: Sequence[Footprint] | None = None
         waits = bool(props.take(WAITS, False))
+        self._frame_origin = props.frame_origin
 
         def get(name: str, default: Any) -> Any:
             self._values[name] = props.get(name, default)
@@ -175,7 +176,7 @@ class OceanSurface(mi.Mesh):
             raise UserError("slope_distribution = 'gram_charlier' is one of ripples, which a nested bsdf replaces")
         # Facet normals, not interpolated ones, have the slope variance of the mesh and conserve energy.
         props["face_normals"] = True
-        mesh = self.sea.mesh()
+        mesh = self.sea.mesh(self._frame_origin)
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
 
@@ -190,7 +191,7 @@ class OceanSurface(mi.Mesh):
         if self._resolution == former:
             return False
         self._use(SeaSurface.read(get, footprints))
-        fill_mesh(self, self.sea.mesh())
+        fill_mesh(self, self.sea.mesh(self._frame_origin))
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)
         elif self.has_ripples:

@@ -60,7 +60,8 @@ def read_places(path: str | os.PathLike[str]) -> FloatArray:
 
 def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
     """Return random places on a sea [m], shape (count, 2)."""
-    return np.random.default_rng(seed).uniform(sea.x[0], sea.x[-1], (count, 2))
+    low, high = zip(*((lines[0], lines[-1]) for lines in (sea.x, sea.y)), strict=True)
+    return np.random.default_rng(seed).uniform(low, high, (count, 2))
 
 
 @alone
