@@ -18,7 +18,6 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
-
 #: Parameter of the loader: place of the frame's origin in the scene [m], x, y, z, of plugins that know places.
 FRAME_ORIGIN = "_frame_origin"
 

@@ -33,7 +33,7 @@ class LidarTransmitter(EmitterWithoutExtent):
                                        to -0.1. Default: 200
     off_nadir_deg           float      Angle of the axis from nadir, towards +x [deg], 0 to 89.9; under water up to 180,
                                        which is straight up. Default: 20
-    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e6 to 1e6; under water the
+    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the
                                        point of the mean sea level above the lidar. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], 1e-9 to 1e6. Default: 5

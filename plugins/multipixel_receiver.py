@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.plugins.bases import RecordedProperties, ReceiverSensor, recorded
+from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, recorded
 from mitransient_lidar.transport.plugin_types import PixelSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels

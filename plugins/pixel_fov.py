@@ -8,7 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, finite_array, in_range
-from mitransient_lidar.plugins.bases import RecordedProperties, ReceiverSensor, recorded
+from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, recorded
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 

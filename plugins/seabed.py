@@ -244,7 +244,7 @@ class Seabed(mi.Mesh):
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
-    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e6 to 1e6. Default: 0, or the map's
+    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e7 to 1e7. Default: 0, or the map's
                                       centre; 0 if ``refined_size`` of a map in map coordinates is given
     refined_size              float   Its side [m], or ``auto``: 20 m, or the map's longer side, or more for the
                                       patches. Default: ``auto``

@@ -32,6 +32,9 @@ _PLACED = (
 )
 _POINTS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 
+#: Textures of Mitsuba by texture coordinates.
+_BY_COORDINATES = ("bitmap", "checkerboard")
+
 #: Plugins of Mitsuba without a place of their own, of kinds that have one.
 _WITHOUT_PLACE = (
     *("area", "batch", "constant", "constvolume", "directional", "directionalarea", "envmap", "heterogeneous"),
@@ -42,7 +45,8 @@ _WITHOUT_PLACE = (
 def move_to_aim(parsed: Any) -> None:
     """Place the objects of a parsed scene in a frame about its lidar's aim, if that is far from the scene's origin.
 
-    A scene with loaded objects, or with plugins whose places are unknown, stays where it is.
+    A scene with loaded objects, with plugins whose places are unknown, or with a texture on an ``ocean_surface``, or on
+    a seabed and another shape, stays where it is.
     """
     import mitsuba as mi
 
@@ -52,15 +56,24 @@ def move_to_aim(parsed: Any) -> None:
     aim = _aim(nodes)
     if aim is None or not _NEAR < math.hypot(*aim) < math.inf or not all(map(_is_movable, nodes)):
         return
+    on_seabeds = {index for node in nodes if _name(node) == "seabed" for index in _textures(nodes, node)}
+    others = (node for node in nodes if node.type == mi.ObjectType.Shape and _name(node) != "seabed")
+    if any(
+        _name(node) == "ocean_surface" or index in on_seabeds for node in others for index in _textures(nodes, node)
+    ):
+        return
     origin = round(aim[0]), round(aim[1]), 0
-    to_frame = mi.ScalarAffineTransform4d().translate([-origin[0], -origin[1], 0])
+    to_scene = mi.ScalarAffineTransform4d().translate(list(origin))
     # Members of a group lie about their instances.
     grouped = {index for node in nodes if _name(node) == "shapegroup" for index in _children(node)}
     for number, node in enumerate(nodes):
         if _name(node) in _OWN:
             node.props[FRAME_ORIGIN] = origin
         elif _name(node) in _PLACED and number not in grouped:
-            node.props["to_world"] = to_frame @ _placement(node)
+            node.props["to_world"] = to_scene.inverse() @ _placement(node)
+        elif number in on_seabeds:
+            # Texture coordinates of a seabed are its x and y.
+            node.props["to_uv"] = _wrapped(_transform(node, "to_uv") @ to_scene, node)
         # Mitsuba refuses parameters that no plugin has read.
         for name in list(node.props.keys()):
             node.props.mark_queried(name, False)
@@ -102,10 +115,10 @@ def _is_movable(node: Any) -> bool:
     if node.type in kinds and _name(node) not in (*_OWN, *_PLACED, *_WITHOUT_PLACE):
         return False
     props, given = node.props, mi.Properties.Type
-    loaded = (mi.Shape, mi.Sensor, mi.Emitter, mi.Medium, mi.Volume)
+    loaded = (mi.Shape, mi.Sensor, mi.Emitter, mi.Medium, mi.Volume, mi.BSDF, mi.Texture)
     if any(isinstance(one, loaded) for _, one in props.objects(False)):
         return False
-    return _name(node) not in _PLACED or "to_world" not in props or props.type("to_world") == given.Transform
+    return all(name not in props or props.type(name) == given.Transform for name in ("to_world", "to_uv"))
 
 
 def _placement(node: Any) -> Any:
@@ -113,15 +126,42 @@ def _placement(node: Any) -> Any:
     import drjit.scalar as ds
     import mitsuba as mi
 
-    props, given = node.props, mi.ScalarAffineTransform4d()
-    placement = props["to_world"] if "to_world" in props else given
+    props, placement = node.props, _transform(node, "to_world")
     points = _POINTS.get(_name(node), ())
     if not points or any(name not in props or props.type(name) != mi.Properties.Type.Vector for name in points):
         return placement
     first = np.array(props[points[0]], dtype=np.float64)
     for name in points:
         props[name] = ds.Array3f64(np.array(props[name], dtype=np.float64) - first)
-    return placement @ given.translate(first.tolist())
+    return placement @ mi.ScalarAffineTransform4d().translate(first.tolist())
+
+
+def _transform(node: Any, name: str) -> Any:
+    """Return a transform of a node, by default the identity."""
+    import mitsuba as mi
+
+    return node.props[name] if name in node.props else mi.ScalarAffineTransform4d()
+
+
+def _wrapped(to_uv: Any, node: Any) -> Any:
+    """Return the transform of a texture's coordinates by less than 2, the period of those that repeat or mirror."""
+    if _name(node) == "bitmap" and node.props.get("wrap_mode", "repeat") == "clamp":
+        return to_uv
+    matrix = np.array(to_uv.matrix, dtype=np.float64)
+    matrix[:2, 3] %= 2
+    return type(to_uv)(matrix)
+
+
+def _textures(nodes: list[Any], node: Any) -> set[int]:
+    """Return the numbers of the textures by texture coordinates in a node."""
+    found: set[int] = set()
+    waiting = set(_children(node))
+    while waiting:
+        number = waiting.pop()
+        if _name(nodes[number]) in _BY_COORDINATES:
+            found.add(number)
+        waiting |= set(_children(nodes[number]))
+    return found
 
 
 def _children(node: Any) -> Iterator[int]:
@@ -129,6 +169,6 @@ def _children(node: Any) -> Iterator[int]:
     import mitsuba as mi
 
     props = node.props
-    for name in props.keys():
+    for name in props:
         if props.type(name) == mi.Properties.Type.ResolvedReference:
             yield props[name].index()

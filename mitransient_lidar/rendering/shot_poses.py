@@ -105,7 +105,7 @@ class ShotPoses:
         return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
 
     def water(self, water: Water | None, place: FloatArray, aim: FloatArray) -> Water | None:
-        """Return the water of a lidar at `aim` as the first shot meets it at a place of the lidar's frame (x, y) [m]."""
+        """Return the water of a lidar at `aim` as a shot at a place meets it, both x, y in the lidar's frame [m]."""
         if water is None or not isinstance(water.plume, BubblePlume):
             return water
         turn = 1 + 0j if self.turns is None else complex(*self.turns[0])

@@ -17,8 +17,9 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.ranges import RANGES
 from mitransient_lidar.core.text_tables import read_two_columns
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.options import RenderOptions
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Farthest place [m]: single precision resolves a millimetre there.
+#: Farthest place from the middle of a series along x and y [m]: single precision resolves 2 mm between the ends.
 FARTHEST = 1e4
 
 _METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
@@ -96,7 +97,8 @@ def render_shots(
         Number of random shots, 2 to 100 000; the scene needs an ``ocean_surface`` with waves. Not used with
         `positions`.
     positions
-        Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), up to 10 km from the origin.
+        Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
+        apart along x and y.
     move_target
         Whether the target keeps its place relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
@@ -281,8 +283,9 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
         raise UserError(f"positions of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
-    if np.abs(pairs).max() > FARTHEST:
-        raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {FARTHEST:g} m")
+    in_range("positions", float(pairs.flat[np.abs(pairs).argmax()]), *RANGES["aim_x"])
+    if (apart := float(np.ptp(pairs, axis=0).max())) > 2 * FARTHEST:
+        raise UserError(f"positions are {apart:g} m apart along x or y: at most {2 * FARTHEST:g} m may be")
     return pairs
 
 
