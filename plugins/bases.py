@@ -19,6 +19,9 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
+#: Parameter of the loader: place of the frame's origin in the scene [m], x, y, z, of plugins that know places.
+FRAME_ORIGIN = "_frame_origin"
+
 
 class RecordedProperties(mi.Properties):
     """Copy of a plugin's parameters that keeps each value that is read, the default where none is given."""
@@ -27,6 +30,9 @@ class RecordedProperties(mi.Properties):
         super().__init__(props)
         #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
         self.values: dict[str, Any] = {}
+        #: Place of the frame's origin in the scene [m]: parameters are places in the scene, loaded objects lie in the
+        #: frame, in which single precision is exact.
+        self.frame_origin = np.array(self.take(FRAME_ORIGIN, (0.0, 0.0, 0.0)), dtype=np.float64)
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a parameter, or the default."""
@@ -181,10 +187,11 @@ class PassIntegrator(mi.CppADIntegrator):
 class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
-    def __init__(self, props: mi.Properties, pixels: PixelArray) -> None:
+    def __init__(self, props: RecordedProperties, pixels: PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
-        pose, optics = KernelPose.from_properties(props), ReceiverOptics.from_properties(props)
+        pose = KernelPose.from_properties(props).in_frame(props.frame_origin)
+        optics = ReceiverOptics.from_properties(props)
         self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None

@@ -56,7 +56,7 @@ class LayeredWater(mi.Medium):
     group_index              string  Group index, 1 to 2, of each layer or all. Default: 1.364 (sea water at 532 nm)
     plume_scattering         float   Scattering of bubbles behind a ship, added to b [1/m], 0 to 1000. Default: 0, no
                                      bubbles
-    plume_x, plume_y         float   Start of the bubbles, at the stern [m], -1e6 to 1e6. Default: 0
+    plume_x, plume_y         float   Start of the bubbles, at the stern [m], -1e7 to 1e7. Default: 0
     plume_bearing_deg        float   Heading of the ship, from +x to +y [deg]. Default: 0
     plume_length             float   Length of the plume [m], 0.001 to 1e6. Default: 200
     plume_width              float   Width of the plume [m], 0.001 to 1e6. Default: 8
@@ -121,7 +121,9 @@ class LayeredWater(mi.Medium):
         for name in list(phases)[1:]:
             del props[name]
         #: The water (`mitransient_lidar.transport.medium.water.Water`).
-        self.water = read_water(props, phases, bubbles, partial(TabulatedPhaseFunction, mi.Properties()))
+        self.water = read_water(props, phases, bubbles, partial(TabulatedPhaseFunction, mi.Properties())).moved(
+            props.frame_origin
+        )
         if not phases:
             # For Mitsuba's own integrators, whose default is an isotropic function.
             props["phase_0"] = self.water.phases.phases[0]

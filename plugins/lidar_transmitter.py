@@ -33,7 +33,7 @@ class LidarTransmitter(EmitterWithoutExtent):
                                        to -0.1. Default: 200
     off_nadir_deg           float      Angle of the axis from nadir, towards +x [deg], 0 to 89.9; under water up to 180,
                                        which is straight up. Default: 20
-    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e6 to 1e6; under water the
+    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the
                                        point of the mean sea level above the lidar. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], 1e-9 to 1e6. Default: 5
@@ -94,7 +94,7 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.pose = KernelPose.from_properties(props)
+        self.pose = KernelPose.from_properties(props).in_frame(props.frame_origin)
         self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)

@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor, recorded
+from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, recorded
 from mitransient_lidar.transport.plugin_types import PixelSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
@@ -90,7 +90,7 @@ class MultipixelReceiver(ReceiverSensor):
          'film': {'type': 'time_gated_film'}}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         nested = [child for _, child in props.objects() if isinstance(child, mi.Sensor)]
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 

@@ -166,6 +166,7 @@ class OceanSurface(mi.Mesh):
         #: Buffers of the mesh that have been edited before `fit`.
         self._edited: set[str] = set()
         waits = bool(props.take(WAITS, False))
+        self._frame_origin = props.frame_origin
 
         def get(name: str, default: Any) -> Any:
             self._values[name] = props.get(name, default)
@@ -183,7 +184,7 @@ class OceanSurface(mi.Mesh):
             raise UserError("slope_distribution = 'gram_charlier' is one of ripples, which a nested bsdf replaces")
         # Facet normals, not interpolated ones, have the slope variance of the mesh and conserve energy.
         props["face_normals"] = True
-        mesh = self.sea.mesh()
+        mesh = self.sea.mesh(self._frame_origin)
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
         self._edited.clear()
@@ -214,7 +215,7 @@ class OceanSurface(mi.Mesh):
             return False
         unfitted = self._roughness()
         self._use(SeaSurface.read(get, footprints))
-        fill_mesh(self, self.sea.mesh())
+        fill_mesh(self, self.sea.mesh(self._frame_origin))
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)
         elif self.has_ripples:

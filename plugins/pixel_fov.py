@@ -8,7 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, finite_array, in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor, recorded
+from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, recorded
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 
@@ -58,7 +58,7 @@ class PixelFov(ReceiverSensor):
          'film': {'type': 'time_gated_film'}}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         self.field = _field(props)
         self.pixel_name = str(props.get("pixel_name", ""))
         level = mi.log_level()

@@ -15,7 +15,7 @@ from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
-from mitransient_lidar.plugins.bases import fill_mesh, recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Steepest tilt [deg] and steepest ripples, height over length, so that facets are at most at 45 degrees with either.
@@ -244,7 +244,7 @@ class Seabed(mi.Mesh):
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
-    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e6 to 1e6. Default: 0, or the map's
+    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e7 to 1e7. Default: 0, or the map's
                                       centre; 0 if ``refined_size`` of a map in map coordinates is given
     refined_size              float   Its side [m], or ``auto``: 20 m, or the map's longer side, or more for the
                                       patches. Default: ``auto``
@@ -287,7 +287,7 @@ class Seabed(mi.Mesh):
         {'type': 'seabed', 'depth': 8.0, 'ripple_height': 0.03, 'ripple_length': 0.2}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         self.bottom = Bottom(props.get)
         if not any(isinstance(child, mi.BSDF) for _, child in props.objects()):
             props["reflection"] = create_object(
@@ -295,7 +295,8 @@ class Seabed(mi.Mesh):
             )
         props["face_normals"] = True
         x, y = self.bottom.lines()
-        mesh = triangulate(self.bottom.heights(x, y), x, y, 0.0)
+        at_x, at_y = props.frame_origin[:2]
+        mesh = triangulate(self.bottom.heights(x, y), x - at_x, y - at_y, 0.0)
         super().__init__("seabed", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         self.add_attribute(REFLECTANCE, 1, self.bottom.reflectances(x, y).ravel().tolist())
         fill_mesh(self, mesh)

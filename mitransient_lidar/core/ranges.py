@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from mitransient_lidar.core.validation import finite, in_range, non_negative, positive
 
-_PLACE = (-1e6, 1e6)  # 32-bit coordinates are accurate to 6 cm at the ends
+#: Largest coordinate of a place [m], for maps in metres: the loader makes places relative to the lidar's aim.
+LARGEST_COORDINATE = 1e7
+
+_PLACE = (-LARGEST_COORDINATE, LARGEST_COORDINATE)
 _LENGTH = (1e-3, 1e6)
 _VIEW_MRAD = (1e-3, 3000.0)  # full angles, short of half the sphere
 _BEAM_MRAD = (1e-3, 2000.0)

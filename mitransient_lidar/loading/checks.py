@@ -12,12 +12,9 @@ from xml.dom import minidom
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import limits
+from mitransient_lidar.core.ranges import LARGEST_COORDINATE, limits
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, is_number, shown
 from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
-
-#: Largest coordinate [m] and scale of a transform: 32-bit coordinates are accurate to 6 cm there.
-LARGEST_COORDINATE = 1e6
 
 #: Name of a plugin, and endings of the libraries of plugins.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
@@ -259,6 +256,7 @@ def _check_matrix(label: str, matrix: Any) -> None:
         raise UserError(f"{label} holds {matrix[~np.isfinite(matrix)][0]}: every number of a transform must be finite")
     if np.abs(matrix).max() > LARGEST_COORDINATE:
         largest = matrix.flat[np.abs(matrix).argmax()]
-        raise UserError(f"{label} holds {largest:g} but must lie between {-LARGEST_COORDINATE:g} and 1e+06")
+        limit = f"lie between {-LARGEST_COORDINATE:g} and {LARGEST_COORDINATE:g}"
+        raise UserError(f"{label} holds {largest:g} but must {limit}")
     if matrix.shape == (4, 4) and np.linalg.det(matrix[:3, :3]) == 0:
         raise UserError(f"{label} has a scale of 0: the object would have no extent")

@@ -36,9 +36,10 @@ import numpy as np
 from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import check_regular, is_file_name, is_there, open_file
-from mitransient_lidar.core.validation import shown
+from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
+from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.mesh_files import PLY_PLUGINS, check_ply
 from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 
@@ -47,6 +48,9 @@ if TYPE_CHECKING:
 
 #: Parameters that name files.
 FILE_PARAMETERS = ("filename", "pixel_map", "blur_file", "profile_file", "pulse_file", "profile", "gate_profile")
+
+#: Origin of a frame that is that of the scene.
+_ORIGIN = np.zeros(3)
 
 #: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
 _MOST_VALUES = 16
@@ -213,18 +217,19 @@ def plugin_values(scene: mi.Scene, integrator: Any = None, used: Mapping[str, fl
 
     own = scene.integrator()
     integrator = own if integrator is None else integrator
+    origin = frame_origin(scene)
     described = {} if integrator is None else {"integrator": object_values(integrator)}
     if used:
         described["integrator"]["used"] = dict(used)
     objects = [(name, part) for name, part in exposed(scene)[1] if part is not own]
-    return json.dumps({**described, **_named(objects)})
+    return json.dumps({**described, **_named(objects, origin)})
 
 
-def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
+def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray) -> dict[str, Any]:
     """Return the parameters of objects by their ids or names, else by the names of their plugins."""
     described: dict[str, Any] = {}
     for given, part in objects:
-        values = object_values(part)
+        values = object_values(part, origin)
         name = str(part.id() or given)
         # Mitsuba numbers objects without a name: _arg_0, object_1398.
         name = str(values.get("type", values.get("class"))) if re.match(r"_|object_\d", name) else name
@@ -233,8 +238,11 @@ def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
     return described
 
 
-def object_values(part: mi.Object) -> dict[str, Any]:
-    """Return the parameters of an object, and its nested objects, in types of JSON."""
+def object_values(part: mi.Object, origin: FloatArray = _ORIGIN) -> dict[str, Any]:
+    """Return the parameters of an object, and its nested objects, in types of JSON.
+
+    `origin` is the place of the frame's origin in the scene [m]: places are in the scene.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -244,13 +252,28 @@ def object_values(part: mi.Object) -> dict[str, Any]:
     if not isinstance(part, Recorded):
         values, objects = exposed(part)
         small = {name: _plain(value) for name, value in values.items() if dr.width(value) <= _MOST_VALUES}
-        return {"class": part.class_name(), **small, **_named(objects)}
+        if isinstance(part, (mi.Shape, mi.Sensor)):
+            small = {name: _in_scene(name, value, origin) for name, value in small.items()}
+        # Members of a group lie about their instances.
+        inner = _ORIGIN if part.class_name() == "ShapeGroup" else origin
+        return {"class": part.class_name(), **small, **_named(objects, inner)}
     own = part.parameters
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known: list[str] = ["type", *plugin_parameters(str(own["type"]))]
     used = {"used": part.used_values} if isinstance(part, Automatic) and part.used_values else {}
-    return {**dict.fromkeys(known), **plain, **used, **_named(objects)}
+    return {**dict.fromkeys(known), **plain, **used, **_named(objects, origin)}
+
+
+def _in_scene(name: str, value: Any, origin: FloatArray) -> Any:
+    """Return a value of a shape or a sensor of Mitsuba with its places in the scene, not in a frame there."""
+    if not origin.any():
+        return value
+    if name == "to_world":
+        moved = np.array(value)
+        moved[:3, 3] += origin
+        return moved.tolist()
+    return (np.reshape(value, (-1, 3)) + origin).ravel().tolist() if name == "vertex_positions" else value
 
 
 def _plain(value: Any) -> Any:

@@ -17,6 +17,7 @@ from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
 from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
 from mitransient_lidar.loading.exclusive import alone_with_scene
+from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
@@ -212,6 +213,7 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
         if node.props.plugin_name() == "ocean_surface":
             node.props[WAITS] = True
     mi.parser.transform_all(config, parsed)
+    move_to_aim(parsed)
     return mi.parser.instantiate(config, parsed)
 
 

@@ -149,7 +149,7 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     if receiver.pixels.grid is None and receiver.pixels.count <= _MOST_PIXELS:
         texts["pixel_outlines"] = [[_flat(1e3 * line) for line in lines] for lines in pixel_outlines(receiver.pixels)]
     described: dict[str, Any] = {
-        f"{name}_pose": [*pose.origin.tolist(), *pose.frame.ravel().tolist()]
+        f"{name}_pose": [*pose.in_scene(pose.origin).tolist(), *pose.frame.ravel().tolist()]
         for name, pose in (("transmitter", transmitter.pose), ("receiver", receiver.pose))
     }
     if bottom is not None:
@@ -190,17 +190,18 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), pos
     shifts
         Horizontal displacements of the lidar, x and y [m], shape (places, 2).
     poses
-        Poses of the receiver instead, with arrays of shape (places, 3).
+        Poses of the receiver in the scene instead, with arrays of shape (places, 3).
 
     Returns
     -------
     ndarray
-        Points x, y, z [m], shape (places, 3); NaN where the axis meets no bottom.
+        Points x, y, z in the scene [m], shape (places, 3); NaN where the axis meets no bottom.
     """
     own, sea, bottoms = scene.receiver.pose, scene.level_sea, scene.bottoms
+    at = scene.frame_origin
     origins, axes = own.origin + np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), own.axis
     if poses is not None:
-        origins, axes = poses.origin, poses.axis
+        origins, axes = poses.origin - at, poses.axis
     found = np.full((len(origins), 3), np.nan)
     if not bottoms or np.any(axes[..., 2] >= 0):
         return found
@@ -228,24 +229,24 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), pos
             if not dr.any(on_leg):
                 break
             ray = hit.spawn_ray(ray.d)
-    return found
+    return found + at
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
     """Return name, heights and outlines of a target."""
-    sea, points = scene.level_sea, _surface_points(target)
+    sea, points, at = scene.level_sea, _surface_points(target), scene.frame_origin[:2]
     seen = sea.crossing(scene.receiver.pose.origin, points)
     found = {
         "id": target.id(),
         "z": [round(float(z), 4) for z in (target.bbox().min.z, target.bbox().max.z)],
-        "line": _outline(points[:, :2]),
-        "seen": _outline(seen),
+        "line": _outline(points[:, :2] + at),
+        "seen": _outline(seen + at),
     }
     if bottom is not None and (points[:, 2] > bottom[2]).any():
         laser = scene.transmitter.pose.origin
         above = points[points[:, 2] > bottom[2]]
         entries = np.pad(sea.crossing(laser, above), ((0, 0), (0, 1)))
-        found["shadow"] = _outline(sea.at_height(laser, entries - laser, bottom[2]))
+        found["shadow"] = _outline(sea.at_height(laser, entries - laser, bottom[2]) + at)
     return found
 
 

@@ -54,9 +54,10 @@ class EchoProbe:
         Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo of the first solid under
         water [ns], shape (pixels, 2) each; NaN without one.
     missed_beam
-        Share of the beam inside the field of view that passes outside the surface mesh.
+        Share of the beam inside the field of view that passes outside the surface mesh, without what solids in the air
+        intercept.
     pierced
-        Solids visible both in the air and through the sea.
+        Solids visible in the air that reach below the crests of the sea; bottoms if also visible through the sea.
     solids
         Echoes of the solids that rays of beam and view meet, in the air and under water.
     """
@@ -95,6 +96,8 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
 
     pixel, weight = np.array(start.pixel), np.array(beam, dtype=np.float64)
     surface, pixels = np.array(at_sea), scene.receiver.pixels.count
+    # Solids visible outside a small surface mesh lie lower.
+    in_air = first.is_valid() & ~at_sea & (first.p.z > min(_heights(scene, "min"), default=0.0))
     count = pixels if pixels <= _MOST_PIXELS else 1
     pixel = pixel if count > 1 else np.zeros_like(pixel)
 
@@ -105,14 +108,14 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
         _quantiles(time_ns(air), weight * surface, pixel, count, (_TAIL, None)),
         _quantiles(time_ns(air + water), weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
     )
-    outside = ~surface if scene.surfaces and not scene.submerged else np.zeros_like(surface)
+    outside = ~surface & ~np.array(in_air) if scene.surfaces and not scene.submerged else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
     surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
     met = dr.select(solid, below.shape, first.shape)
     length = air + dr.select(solid, water, 0)
     of_solid = solid | (first.is_valid() & ~at_sea)
     solids = _solid_echoes(scene, met, time_ns(length), weight * np.array(of_solid))
-    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, at_sea, solid), solids)
+    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, in_air, solid), solids)
 
 
 def _solid_echoes(
@@ -132,21 +135,26 @@ def _pierced(
     scene: LidarScene,
     first: mi.SurfaceInteraction3f,
     below: mi.SurfaceInteraction3f,
-    at_sea: mi.Bool,
+    in_air: mi.Bool,
     under_water: mi.Bool,
 ) -> list[mi.Shape]:
     """Return the solids that rise through the sea in the field of view."""
-    if not dr.any(at_sea):
-        return []
-    # Solids visible outside a small surface mesh lie lower.
-    lowest = min((float(surface.bbox().min.z) for surface in scene.surfaces), default=0.0)
-    in_air = first.is_valid() & (first.p.z > lowest)
+    crest, bottoms = max(_heights(scene, "max"), default=-np.inf), scene.bottoms
     return [
         solid
         for solid in scene.solids
-        if dr.any(in_air & (first.shape == mi.ShapePtr(solid)))
-        and dr.any(under_water & (below.shape == mi.ShapePtr(solid)))
+        if float(solid.bbox().min.z) <= crest
+        and dr.any(in_air & (first.shape == mi.ShapePtr(solid)))
+        # A receiver may look at the land alone.
+        and (
+            not any(solid is bottom for bottom in bottoms) or dr.any(under_water & (below.shape == mi.ShapePtr(solid)))
+        )
     ]
+
+
+def _heights(scene: LidarScene, end: str) -> list[float]:
+    """Return the lowest (``min``) or highest (``max``) points of the surfaces of a scene [m]."""
+    return [float(getattr(surface.bbox(), end).z) for surface in scene.surfaces]
 
 
 def _quantiles(

@@ -161,8 +161,10 @@ def _gaps(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(*outside.T))
 
 
-def _place(point: FloatArray) -> str:
-    return f"({point[0]:.1f}, {point[1]:.1f})"
+def _place(scene: LidarScene, point: FloatArray) -> str:
+    """Return a point as x, y in the scene [m]."""
+    x, y = scene.receiver.pose.in_scene(point[:2])
+    return f"({x:.1f}, {y:.1f})"
 
 
 def _check_record(scene: LidarScene, view: _Rays, probe: EchoProbe) -> None:
@@ -202,8 +204,10 @@ def _check_rays(rays: _Rays, subject: str) -> None:
     where = "where no shape is"
     if surfaces:
         lows, highs = zip(*map(_box, surfaces), strict=True)
-        where = f"outside the sea from {_place(np.min(lows, axis=0))} to {_place(np.max(highs, axis=0))} m"
-    extent = f"from {_place(places.min(axis=0))} to {_place(places.max(axis=0))} m"
+        first, last = (_place(rays.scene, corner) for corner in (np.min(lows, axis=0), np.max(highs, axis=0)))
+        where = f"outside the sea from {first} to {last} m"
+    first, last = (_place(rays.scene, corner) for corner in (places.min(axis=0), places.max(axis=0)))
+    extent = f"from {first} to {last} m"
     raise UserError(f"{subject} looks at the sea level {extent}, {where}; change aim_x and aim_y")
 
 
@@ -318,7 +322,7 @@ def _warn_of_place(solid: mi.Shape, view: _Rays, beam: _Rays) -> None:
             problem,
             float(_gaps(axis[None], low, high)[0]),
             name,
-            *axis,
+            *rays.scene.receiver.pose.in_scene(axis),
             z,
         )
         return

@@ -71,8 +71,10 @@ class SeaMap:
         grid = None if isinstance(sea.waves, HeightMap) else sea.waves
         cell, cells = (sea.cell_size, int(sea.size / sea.cell_size)) if grid is None else (grid.cell_size, grid.cells)
         count = min(cells, int(_LARGEST_SEARCH / cell)) // 2
-        lines = np.asarray(np.arange(-count, count) * cell, dtype=np.float64)
-        heights = sea.heights(lines, lines)
+        # About the origin of the scene, or about the frame of a lidar that is far from it.
+        middle = [round(float(place) / cell) for place in transmitter.pose.frame_origin[:2]]
+        x, y = (np.asarray((np.arange(-count, count) + place) * cell, dtype=np.float64) for place in middle)
+        heights = sea.heights(x, y)
         azimuth, spread_along, spread_across = footprint(transmitter)
         # A circle of the same area replaces the elliptical footprint.
         sigma = math.sqrt(spread_along * spread_across) / cell
@@ -80,12 +82,13 @@ class SeaMap:
         smooth = gaussian_filter(heights, sigma, mode="wrap" if sea.spectrum != "height_map" else "nearest")
         up, right = np.gradient(smooth, cell)
         cos, sin = math.cos(azimuth), math.sin(azimuth)
-        return cls(lines, lines, heights, cos * right + sin * up, cos * up - sin * right)
+        return cls(x, y, heights, cos * right + sin * up, cos * up - sin * right)
 
     def slope_at(self, x: float, y: float) -> tuple[float, float]:
         """Return the mean slopes (along, across) [1] over a footprint at a place [m] of the periodic sea."""
         spacing = self.x[1] - self.x[0]
-        i, j = (round((value - self.x[0]) / spacing) % len(self.x) for value in (x, y))
+        pairs = ((x, self.x), (y, self.y))
+        i, j = (round((value - lines[0]) / spacing) % len(lines) for value, lines in pairs)
         return float(self.along[j, i]), float(self.across[j, i])
 
     def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:

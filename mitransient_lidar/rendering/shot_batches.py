@@ -91,7 +91,7 @@ class ShotBatches:
     renderer
         Renderer of the shot at the place of the scene.
     aim
-        Place (x, y) of the scene's own shot [m].
+        Place (x, y) of the scene's own shot in the scene [m].
     passes
         Passes of each shot, the most with a `goal`.
     share
@@ -113,7 +113,9 @@ class ShotBatches:
     ) -> None:
         lidar = renderer.scene
         has_plume = lidar.water is not None and isinstance(lidar.water.plume, BubblePlume)
-        self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
+        self._renderer, self.passes, self.share = renderer.scaled(share), passes, share
+        self._frame_origin = lidar.frame_origin[:2]
+        self._aim = np.array(aim) - self._frame_origin
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
         response = lidar.receiver.optics.response_time_ns
@@ -139,9 +141,10 @@ class ShotBatches:
         for sea in self._seas:
             positions = sea.move(shots.places)
             parts.append((sea.shapes, positions))
-        parts += [] if self._fixed is None else [(self._fixed, shots.places)]
+        places = shots.places - self._frame_origin
+        parts += [] if self._fixed is None else [(self._fixed, places)]
         lidar = self._renderer.scene
-        water = shots.water(lidar.water, self._aim)
+        water = shots.water(lidar.water, places[0], self._aim)
         surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
 
         def scene_of(copies: int) -> LidarScene:

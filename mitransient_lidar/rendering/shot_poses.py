@@ -28,7 +28,7 @@ class ShotPoses:
     Attributes
     ----------
     places
-        Points (x, y) where the receiver's axes meet the mean sea level [m], shape (shots, 2).
+        Points (x, y) in the scene where the receiver's axes meet the mean sea level [m], shape (shots, 2).
     turns
         Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
     receiver, transmitter
@@ -45,7 +45,7 @@ class ShotPoses:
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
-        """Return the poses of shots of a lidar whose receiver has given ones, with arrays of shape (shots, 3).
+        """Return the poses of shots of a lidar whose receiver has given ones in the scene, arrays of shape (shots, 3).
 
         The transmitter is fixed to the receiver. All axes must go down.
         """
@@ -93,7 +93,7 @@ class ShotPoses:
         positions
             Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
         aim
-            Place (x, y) of the lidar [m], shape (2,).
+            Place (x, y) of the lidar in its frame [m], shape (2,).
         """
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))
@@ -104,12 +104,12 @@ class ShotPoses:
         cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
         return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
 
-    def water(self, water: Water | None, aim: FloatArray) -> Water | None:
-        """Return the water of a lidar at a place (x, y) [m] as the shots meet it; a plume of bubbles, as the first."""
+    def water(self, water: Water | None, place: FloatArray, aim: FloatArray) -> Water | None:
+        """Return the water of a lidar at `aim` as a shot at a place meets it, both x, y in the lidar's frame [m]."""
         if water is None or not isinstance(water.plume, BubblePlume):
             return water
         turn = 1 + 0j if self.turns is None else complex(*self.turns[0])
-        return replace(water, plume=water.plume.displaced(self.places[0], aim, turn))
+        return replace(water, plume=water.plume.displaced(place, aim, turn))
 
     def extra_range(self, lidar: LidarScene) -> FloatArray:
         """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).

@@ -18,8 +18,9 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.ranges import RANGES
 from mitransient_lidar.core.text_tables import read_two_columns
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Farthest place [m]: single precision resolves a millimetre there.
+#: Farthest place from the middle of a series along x and y [m]: single precision resolves 2 mm between the ends.
 FARTHEST = 1e4
 
 _METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
@@ -63,7 +64,8 @@ def read_places(path: str | os.PathLike[str]) -> FloatArray:
 
 def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
     """Return random places on a sea [m], shape (count, 2)."""
-    return np.random.default_rng(seed).uniform(sea.x[0], sea.x[-1], (count, 2))
+    low, high = zip(*((lines[0], lines[-1]) for lines in (sea.x, sea.y)), strict=True)
+    return np.random.default_rng(seed).uniform(low, high, (count, 2))
 
 
 @alone
@@ -99,7 +101,8 @@ def render_shots(
         Number of random shots, 2 to 100 000; the scene needs an ``ocean_surface`` with waves. Not used with
         `positions`.
     positions
-        Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), up to 10 km from the origin.
+        Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
+        apart along x and y.
     move_target
         Whether the target keeps its place relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
@@ -290,8 +293,9 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
         raise UserError(f"positions of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
-    if np.abs(pairs).max() > FARTHEST:
-        raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {FARTHEST:g} m")
+    in_range("positions", float(pairs.flat[np.abs(pairs).argmax()]), *RANGES["aim_x"])
+    if (apart := float(np.ptp(pairs, axis=0).max())) > 2 * FARTHEST:
+        raise UserError(f"positions are {apart:g} m apart along x or y: at most {2 * FARTHEST:g} m may be")
     return pairs
 
 

@@ -58,7 +58,8 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
         turns = shots.in_scene.azimuth - lidar.receiver.pose.azimuth
     rows = zip(places, turns, strict=True)
     along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y, turn) for (x, y), turn in rows]).T
-    found = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2], shots.in_scene)[:, 2]
+    own = lidar.receiver.pose
+    found = -axis_on_bottom(lidar, places - own.in_scene(own.ground_point())[:2], shots.in_scene)[:, 2]
     # Rays in single precision are known to a tenth of a millimetre.
     depth = np.round(found, 4)
     values = {
@@ -111,7 +112,7 @@ def solids_below(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the height of the highest solid, or bottom, at places [m], NaN without one, and whether it is a target.
 
-    Places have the shape (n,); targets are `WaterScene.targets`.
+    Places in the scene have the shape (n,); targets are `WaterScene.targets`.
     """
     import mitsuba as mi
 
@@ -122,7 +123,8 @@ def solids_below(
     if solids is None:
         return np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
     top = opaque(float(solids.bbox().max.z) + 1.0)
-    place = mi.Point3f(*(aligned(mi.Float, values.astype(np.float32)) for values in (x, y)), top)
+    at = zip((x, y), lidar.frame_origin[:2], strict=True)
+    place = mi.Point3f(*(aligned(mi.Float, (values - origin).astype(np.float32)) for values, origin in at), top)
     si = solids.ray_intersect(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
     valid, target = np.array(si.is_valid()), np.array(is_one_of(si.shape, lidar.targets) & mi.Bool(si.is_valid()))
     return np.where(valid, np.array(si.p.z, dtype=np.float64), np.nan), target

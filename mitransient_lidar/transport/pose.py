@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -30,10 +31,13 @@ class KernelPose(Pose):
         Length that is added to relative lengths [m], of each shot.
     lanes
         Lanes of the paths that have the pose of their shot; none for one pose of all paths.
+    frame_origin
+        Place of the frame's origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
     """
 
     delay: float | FloatArray = 0.0
     lanes: Lanes | None = None
+    frame_origin: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> KernelPose:
@@ -49,6 +53,14 @@ class KernelPose(Pose):
             props.get("aim_x", 0.0),
             props.get("aim_y", 0.0),
         )
+
+    def in_frame(self, frame_origin: FloatArray) -> Self:
+        """Return a pose in the scene relative to a place there [m], shape (3,)."""
+        return replace(self, origin=self.origin - frame_origin, frame_origin=frame_origin)
+
+    def in_scene(self, points: FloatArray) -> FloatArray:
+        """Return where points of the frame are in the scene [m], x, y or x, y, z along the last axis."""
+        return np.asarray(points + self.frame_origin[: points.shape[-1]])
 
     def of(self, lanes: Lanes) -> KernelPose:
         """Return the poses with the lanes of paths."""

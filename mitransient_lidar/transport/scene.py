@@ -119,6 +119,11 @@ class WaterScene:
         return self.receiver_poses or self.receiver.pose
 
     @property
+    def frame_origin(self) -> FloatArray:
+        """Place of the origin of the scene's coordinates, as rays have them, in the scene as it is given [m], (3,)."""
+        return self.receiver.pose.frame_origin
+
+    @property
     def solids(self) -> list[mi.Shape]:
         """All shapes that do not bound the water: bottoms and targets."""
         return solids_of(self.mitsuba_scene, self.surfaces)

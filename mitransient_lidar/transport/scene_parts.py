@@ -11,7 +11,6 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
@@ -24,6 +23,7 @@ from mitransient_lidar.transport.plugin_types import (
     Transmitter,
     WaterMedium,
 )
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -142,7 +142,7 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
         scene.parameters_changed([])
 
 
-def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
+def _seen_sea(pose: KernelPose) -> tuple[tuple[float, float], float, float] | None:
     """Return where the axis meets the mean sea level [m], the height above or below it [m], and its slope [rad].
 
     The slope is the angle from the vertical. None for a pose under water that does not look up.
@@ -154,12 +154,14 @@ def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
         spot, off_vertical = pose.origin + pose.axis * (height / float(pose.axis[2])), 180.0 - off_vertical
     else:
         return None
+    spot = pose.in_scene(spot)
     return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
 
 
-def _without_sea(pose: Pose) -> Footprint:
+def _without_sea(pose: KernelPose) -> Footprint:
     """Return a footprint that needs no waves: those above it when it looks down under water."""
-    place = float(pose.origin[0]), float(pose.origin[1])
+    x, y, _ = pose.in_scene(pose.origin)
+    place = float(x), float(y)
     return Footprint(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 

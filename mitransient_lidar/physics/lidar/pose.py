@@ -56,7 +56,7 @@ class Pose:
         off_nadir_deg
             Angle of the axis from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water.
         aim_x, aim_y
-            Point where the axis meets the mean sea level [m], -1e6 to 1e6; under water the point above the pose.
+            Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the point above the pose.
 
         Values out of range raise UserError.
         """

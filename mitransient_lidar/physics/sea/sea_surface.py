@@ -194,18 +194,19 @@ class SeaSurface:
         """Total slope variance of waves and ripples, both axes [1]."""
         return sum(self.resolved_variance) + sum(self.ripple_variance)
 
-    def mesh(self) -> SeaMesh:
-        """Return the triangle mesh: the fine patch, surrounded by cells that grow out to the size."""
+    def mesh(self, origin: Sequence[float] | FloatArray = (0.0, 0.0)) -> SeaMesh:
+        """Return the triangle mesh relative to a place [m]: the fine patch, and cells that grow out to the size."""
+        at_x, at_y = origin[:2]
         if not math.isfinite(self.cell_size):
             # No edge is near the centre: rays pass between triangles of a kilometre in a gap of micrometres.
             x, y = (np.array(ends) * self.size + at for ends, at in zip(_LEVEL_LINES, self.centre, strict=True))
-            return triangulate(np.zeros((len(y), len(x))), x, y, self.wind_direction)
+            return triangulate(np.zeros((len(y), len(x))), x - at_x, y - at_y, self.wind_direction)
         cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
         indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
         # Integer cells: the sea does not depend on the position of the patch.
         first = [round(centre / self.cell_size) for centre in self.centre]
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
-        return triangulate(self.heights_about(self.centre, x, y), x, y, self.wind_direction)
+        return triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
 
     def patches(self, places: FloatArray, refined_size: float) -> tuple[SeaMesh, FloatArray]:
         """Return the mesh of fine patches about places, and the position of each place in it.

@@ -25,7 +25,7 @@ class BubblePlume:
     scattering
         Scattering coefficient of the bubbles [1/m], 0 to 1000, added to that of the water.
     x, y
-        Start of the plume, at the stern [m], -1e6 to 1e6.
+        Start of the plume, at the stern [m], -1e7 to 1e7.
     bearing
         Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
     length, width, depth

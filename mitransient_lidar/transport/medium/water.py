@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -63,6 +64,12 @@ class Water:
         }
         for name, of in flights.items():
             object.__setattr__(self, name, LayeredFlight(of))
+
+    def moved(self, place: FloatArray) -> Water:
+        """Return the water relative to a place (x, y, z) [m]: a plume of bubbles has one."""
+        if not (isinstance(self.plume, BubblePlume) and place[:2].any()):
+            return self
+        return replace(self, plume=self.plume.displaced(place[:2], np.zeros(2), 1 + 0j))
 
     @property
     def refractive_index(self) -> float:

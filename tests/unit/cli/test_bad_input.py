@@ -71,7 +71,7 @@ TABLE1 = {
     ("95", "must lie between 0 and 89.9"): "off_nadir_deg",
     ("200", "must lie between 300 and 1100"): "wavelength_nm",
     ("31", "must lie between 0 and 30"): "wind_speed",
-    ("4e6", "must lie between -1e+06 and 1e+06"): "aim_x aim_y",
+    ("4e7", "must lie between -1e+07 and 1e+07"): "aim_x aim_y",
     ("2by2", "must be rows x columns"): "layout",
     ("0x2", "layout"): "layout",
     ("9999x9999", "at most 1048576"): "layout",

@@ -49,6 +49,21 @@ def test_echo_after_the_record_is_told_with_its_arrival(lidar_scene, caplog):
     assert check(lidar_scene(bottom=30.0, film={"bin_count": int(bins)}), caplog) == []
 
 
+@pytest.mark.parametrize(
+    ("centre", "told"),
+    [(0.0, "rises through the sea surface"), (-0.45, "rises through the sea surface"), (1.5, "lies above the sea")],
+)
+def test_solid_in_the_air_is_told_as_that(lidar_scene, caplog, centre, told):
+    """A cube of 1 m hides its own foot from a lidar at nadir, and the sea below it: the sea is not too small."""
+    nadir, cube = {"off_nadir_deg": 0.0}, TO_WORLD.translate([0, 0, centre]).scale(0.5)
+    box = {"type": "cube", "to_world": cube, "bsdf": {"type": "diffuse"}}
+    scene = lidar_scene(tx=nadir, rx=nadir, film={"time_start_ns": 1300.0}, extra={"box": box})
+    (message,) = check(scene, caplog)
+    assert told in message
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    assert probe_echoes(renderer.scene, renderer.sampler).missed_beam == 0
+
+
 @pytest.mark.slow
 def test_record_of_the_surface_echo_alone_is_no_mistake(lidar_scene, caplog):
     surface = surface_time_ns(200, THETA)
