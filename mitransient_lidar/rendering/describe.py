@@ -22,6 +22,7 @@ from mitransient_lidar.transport.opaque import aligned, is_one_of
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
+from mitransient_lidar.transport.solids import met_shape
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
@@ -221,7 +222,7 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), pos
         for _ in range(_MOST_HITS):
             hit = scene.ray_intersect(ray, on_leg)
             on_leg &= hit.is_valid() & (dr.norm(hit.p - mi.Point3f(origin)) <= length)
-            ends = on_leg & is_one_of(hit.shape, bottoms)
+            ends = on_leg & is_one_of(met_shape(hit), bottoms)
             dr.eval(hit, ends)
             at_end = np.array(ends)
             found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]

@@ -20,6 +20,7 @@ from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
+from mitransient_lidar.transport.solids import met_shape
 
 #: Number of rays, and share of the beam excluded at either end of an echo.
 _RAYS = 2**16
@@ -111,7 +112,7 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     outside = ~surface & ~np.array(in_air) if scene.surfaces and not scene.submerged else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
     surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
-    met = dr.select(solid, below.shape, first.shape)
+    met = dr.select(solid, met_shape(below), met_shape(first))
     length = air + dr.select(solid, water, 0)
     of_solid = solid | (first.is_valid() & ~at_sea)
     solids = _solid_echoes(scene, met, time_ns(length), weight * np.array(of_solid))
@@ -144,10 +145,11 @@ def _pierced(
         solid
         for solid in scene.solids
         if float(solid.bbox().min.z) <= crest
-        and dr.any(in_air & (first.shape == mi.ShapePtr(solid)))
+        and dr.any(in_air & (met_shape(first) == mi.ShapePtr(solid)))
         # A receiver may look at the land alone.
         and (
-            not any(solid is bottom for bottom in bottoms) or dr.any(under_water & (below.shape == mi.ShapePtr(solid)))
+            not any(solid is bottom for bottom in bottoms)
+            or dr.any(under_water & (met_shape(below) == mi.ShapePtr(solid)))
         )
     ]
 

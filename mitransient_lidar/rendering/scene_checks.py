@@ -21,6 +21,7 @@ from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
+from mitransient_lidar.transport.solids import met_shape
 
 logger = logging.getLogger(__name__)
 
@@ -251,7 +252,7 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
         _, weight = hit.bsdf().sample(mi.BSDFContext(), hit, random.x, random, active)
         if dr.any(active & (weight[0] > 0)):
             return
-        found += [solid for solid in scene.solids if dr.any(active & is_one_of(hit.shape, [solid]))]
+        found += [solid for solid in scene.solids if dr.any(active & is_one_of(met_shape(hit), [solid]))]
     if any(view.meets(solid) and not any(solid is other for other in found) for solid in scene.solids):
         return
     names = ", ".join(repr(solid.id()) for solid in dict.fromkeys(found)) or "no shape"

@@ -21,6 +21,7 @@ from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.solids import scene_of_shapes
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
@@ -125,7 +126,9 @@ class ShotBatches:
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
         self._seas = [SeaPatches(shape) for shape in waves]
-        self._going, self._fixed = scene_of_shapes(going), scene_of_shapes(fixed)
+        self._going, self._fixed = (
+            scene_of_shapes(shapes, lidar.groups) if shapes else None for shapes in (going, fixed)
+        )
         paths = max(self._renderer.path_count // 2, 1)
         self._origins, self._perturbations = renderer.classes.count, lidar.perturbations.count
         bins = lidar.receiver.pixels.count * lidar.axis.bin_count * self._origins * (1 + self._perturbations)
@@ -270,16 +273,3 @@ def check_size(shots: int, pixels: int, bins: int, origins: int = 0, parameters:
     size = _BYTES_PER_BIN * shots * pixels * bins * (1 + origins + parameters)
     what = f"{shots} shots of {pixels} pixels x {bins} bins{components}"
     require_memory(what, size, "take fewer shots, or reduce the pixels or bin_count")
-
-
-def scene_of_shapes(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
-    """Return a scene of shapes, None without any."""
-    if not shapes:
-        return None
-    ids = [shape.id() for shape in shapes]
-    parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
-    scene = mi.load_dict({"type": "scene", **parts}, parallel=False)
-    # A scene renames its shapes.
-    for shape, own in zip(shapes, ids, strict=True):
-        shape.set_id(own)
-    return scene

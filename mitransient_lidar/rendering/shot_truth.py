@@ -116,17 +116,18 @@ def solids_below(
     """
     import mitsuba as mi
 
-    from mitransient_lidar.rendering.shot_batches import scene_of_shapes
     from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque
+    from mitransient_lidar.transport.solids import met_shape, scene_of_shapes
 
-    solids = scene_of_shapes(lidar.bottoms if bottoms else lidar.solids)
-    if solids is None:
+    shapes = lidar.bottoms if bottoms else lidar.solids
+    if not shapes:
         return np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
+    solids = scene_of_shapes(shapes, lidar.groups)
     top = opaque(float(solids.bbox().max.z) + 1.0)
     at = zip((x, y), lidar.frame_origin[:2], strict=True)
     place = mi.Point3f(*(aligned(mi.Float, (values - origin).astype(np.float32)) for values, origin in at), top)
     si = solids.ray_intersect(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
-    valid, target = np.array(si.is_valid()), np.array(is_one_of(si.shape, lidar.targets) & mi.Bool(si.is_valid()))
+    valid, target = np.array(si.is_valid()), np.array(is_one_of(met_shape(si), lidar.targets) & mi.Bool(si.is_valid()))
     return np.where(valid, np.array(si.p.z, dtype=np.float64), np.nan), target
 
 

@@ -20,6 +20,7 @@ from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 _HALF_GATE = 1.0
@@ -210,6 +211,7 @@ def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
     shapes, gone = list(scene.shapes()), find_target(scene, target_id)
     parts: dict[str, Any] = {"type": "scene", "integrator": scene.integrator()}
     parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
+    parts |= {f"group_{i}": group for i, group in enumerate(shape_groups(scene))}
     parts |= {f"emitter_{i}": emitter for i, emitter in enumerate(scene.emitters())}
     parts |= {f"shape_{i}": shape for i, shape in enumerate(shapes) if shape is not gone}
     return mi.load_dict(parts, parallel=False)

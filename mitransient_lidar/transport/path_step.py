@@ -8,10 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+from mitransient_lidar.transport.medium.index_layers import coinciding
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
 from mitransient_lidar.transport.path import Path, advance
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.solids import met_shape
 
 
 @dataclass
@@ -100,8 +102,10 @@ class PathStep:
         layers = scene.water.index_layers
         if layers.count > 1:
             to_boundary = layers.to_boundary(path.depth, path.downward, path.index_layer, wet)
-            at_boundary = to_boundary < reach
-            reach = dr.minimum(reach, to_boundary)
+            # A solid in the plane of the boundary is met first from both sides: what begins there stays in its layer.
+            same = (reach - to_boundary) * dr.abs(path.downward) < coinciding(reach)
+            at_boundary = (to_boundary < reach) & ~same
+            reach = dr.select(at_boundary, to_boundary, reach)
         scattered = wet & (distance < reach)
         length = dr.select(scattered, distance, reach)
         return Vertex(si, reach, length, scattered, at_boundary & ~scattered, no, in_water, no, no)
@@ -158,7 +162,7 @@ class PathStep:
     ) -> None:
         """Add what perturbations have at the last vertices of paths that continue in a direction."""
         path.sums = self._sums_at_event(path, vertex.scattered, event, direction)
-        path.sums = self.scene.perturbations.at_solid(path.sums, vertex.si.shape, vertex.on_solid & ~passes)
+        path.sums = self.scene.perturbations.at_solid(path.sums, met_shape(vertex.si), vertex.on_solid & ~passes)
         path.sums = self.scene.perturbations.at_sea(path.sums, vertex.si, vertex.si.to_local(direction), vertex.at_sea)
 
     def perturbed_connection(
@@ -166,7 +170,7 @@ class PathStep:
     ) -> Sums:
         """Return the sums of paths with the last vertex connected in a direction where active."""
         sums = self._sums_at_event(path, vertex.scattered & active, event, direction)
-        return self.scene.perturbations.at_solid(sums, vertex.si.shape, vertex.on_solid)
+        return self.scene.perturbations.at_solid(sums, met_shape(vertex.si), vertex.on_solid)
 
     def _sums_at_event(self, path: Path, active: mi.Bool, event: ScatteringEvent, direction: mi.Vector3f) -> Sums:
         if self.scene.water is not None and self.scene.perturbations.count:

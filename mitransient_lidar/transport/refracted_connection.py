@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.medium.index_layers import coinciding
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.perturbations import Sums
@@ -229,7 +230,8 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         here = active & (layer == number) & (traced.ray.d.z > 0)
         segment = mi.Ray3f(traced.ray.o, traced.ray.d)
         distance = dr.maximum((-segment.o.z - opaque(layers.boundaries[number - 1])) / segment.d.z, 0)
-        segment.maxt = distance
+        # A solid in the plane of the boundary counts.
+        segment.maxt = distance + coinciding(distance) / segment.d.z
         blocked = scene.ray_test(segment, here)
         optical_depth = water.optical_depth(segment.o, segment.d, distance)
         absorption = water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)

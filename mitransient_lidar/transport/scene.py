@@ -25,6 +25,7 @@ from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.solids import children
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -90,6 +91,8 @@ class WaterScene:
         Pose of the receiver in each shot, where they differ.
     perturbations
         Changes of water and solids whose effect on each path is summed.
+    groups
+        Groups of shapes that instances repeat.
     """
 
     mitsuba_scene: mi.Scene
@@ -100,6 +103,7 @@ class WaterScene:
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
+    groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)
 
     def of(self, lanes: Lanes) -> Self:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
@@ -175,7 +179,17 @@ class WaterScene:
         """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
         lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
         mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
-        return any(int(solid.bsdf().flags()) & mirror or float(solid.bbox().max.z) > lowest for solid in self.solids)
+        return self._have_solids(mirror) or any(float(solid.bbox().max.z) > lowest for solid in self.solids)
+
+    @property
+    def has_veils(self) -> bool:
+        """Whether a solid lets a part of the light pass unchanged, such as a mask."""
+        return self._have_solids(mi.BSDFFlags.Null.value)
+
+    def _have_solids(self, flags: int) -> bool:
+        """Return whether the BSDF of a solid has one of the flags."""
+        grouped = [shape for group in self.groups for shape in children(group)]
+        return any(int(shape.bsdf().flags()) & flags for shape in (*self.solids, *grouped))
 
     @property
     def facet_size(self) -> float:
@@ -252,7 +266,7 @@ class WaterScene:
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
         """Return the first intersections of rays."""
         if not self.parts:
-            return self.mitsuba_scene.ray_intersect(ray, active)
+            return self._without_instances(self.mitsuba_scene.ray_intersect(ray, active))
         nearest, shift = dr.zeros(mi.PreliminaryIntersection3f), mi.Vector3f(0)
         nearest.t = dr.inf
         turn = mi.Vector2f(1, 0)
@@ -276,6 +290,12 @@ class WaterScene:
             frame = si.sh_frame
             frame.s, frame.t, frame.n = (_turned(each, back) for each in (frame.s, frame.t, frame.n))
             si.sh_frame = frame
+        return self._without_instances(si)
+
+    def _without_instances(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        """Return intersections of a scene without instances with this known to kernels."""
+        if not self.groups:
+            si.instance = dr.zeros(mi.ShapePtr)
         return si
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:

@@ -13,6 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import (
@@ -27,6 +28,7 @@ from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.solids import shape_groups, without_unseen
 
 logger = logging.getLogger(__name__)
 
@@ -72,18 +74,17 @@ def find_lidar_scene(
             f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
             "allowed is exactly one lidar_transmitter, besides sun and sky"
         )
-    water, surfaces, variance = find_water(scene)
-    _check_wavelength(water, transmitters[0])
-    parts = WaterScene(scene, receiver, water, surfaces, variance)
+    parts = find_solids(scene, receiver)
+    _check_wavelength(parts.water, transmitters[0])
     submerged = _check_place(parts, transmitters[0])
     if not submerged:
-        _check_cells(surfaces, transmitters[0])
+        _check_cells(parts.surfaces, transmitters[0])
     if axis is None and not film.is_fixed:
         # The record is that of the sensor, whatever replaces its receiver; the scene may have been edited.
         own = replace(parts, receiver=find_receiver(sensor))
         found = (own, transmitters[0], film)
         film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
-    return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
+    return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis or film.axis, gates=film.gates)
 
 
 def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
@@ -168,6 +169,33 @@ def _without_sea(pose: KernelPose) -> Footprint:
 def seas_of(scene: mi.Scene) -> list[SeaShape]:
     """Return the ``ocean_surface`` shapes of a scene."""
     return [shape for shape in scene.shapes() if isinstance(shape, SeaShape)]
+
+
+def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
+    """Return the water, and the solids that have an effect on light, none of which coincide in a face.
+
+    Raises
+    ------
+    UserError
+        As `find_water`, `shape_groups` and `separate_contacts`.
+    """
+    # Mitsuba's own loader joins meshes of equal BSDFs, without a bounding box.
+    joined = [shape for shape in scene.shapes() if not shape.bbox().valid()]
+    for shape in joined:
+        shape.parameters_changed(["vertex_positions"])
+    if joined:
+        scene.parameters_changed([])
+    groups = shape_groups(scene)
+    seen = without_unseen(scene, groups)
+    found = WaterScene(seen, receiver, *find_water(seen), groups=groups)
+    moved = separate_contacts(found)
+    if not moved:
+        return found
+    # Other scenes of these shapes have taken notice of their changes.
+    for shape in moved:
+        shape.parameters_changed([])
+    scene.parameters_changed([])
+    return replace(found, mitsuba_scene=without_unseen(scene, groups))
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:

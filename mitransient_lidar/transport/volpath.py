@@ -33,6 +33,7 @@ from mitransient_lidar.transport.ripple_focusing import Echo
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.solids import met_shape
 
 #: Asymmetry of the Henyey-Greenstein lobe towards the emitter from which guided directions are drawn: the best from 0.7
 #: to 0.95 in clear and turbid water, with the default probability.
@@ -260,7 +261,7 @@ class PathTracer:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
         emitter = self.light.sampler.direction_from(path.point)
         met_first = vertex.on_solid & path.before_first_solid
-        path.solid = dr.select(met_first, self.light.solid(vertex.si.shape), path.solid)
+        path.solid = dr.select(met_first, self.light.solid(met_shape(vertex.si)), path.solid)
         if self.light.submerged:
             self._connect_straight(path, vertex, event, emitter, first)
         else:

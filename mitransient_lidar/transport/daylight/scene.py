@@ -10,7 +10,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.plugin_types import Daylight, SkyEmitter, SunEmitter, Transmitter
 from mitransient_lidar.transport.scene import WaterScene
-from mitransient_lidar.transport.scene_parts import find_receiver, find_water, fit_seas
+from mitransient_lidar.transport.scene_parts import find_receiver, find_solids, fit_seas
 
 #: Largest angle between the sun and the sun of a clear sky [deg].
 _SAME_DIRECTION_DEG = 0.05
@@ -55,7 +55,7 @@ class DaylightScene(WaterScene):
             _check_sun(sun, sky)
         if receiver.pose.origin[2] <= 0:
             raise UserError("altitude: the receiver must be above the mean sea level z = 0")
-        return cls(scene, receiver, *find_water(scene), sun, sky)
+        return cls(**vars(find_solids(scene, receiver)), sun=sun, sky=sky)
 
     def sky_radiance(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiance of the sky in a direction [W m^-2 sr^-1 nm^-1]; 0 below the horizon."""

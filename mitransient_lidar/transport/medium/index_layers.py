@@ -13,6 +13,9 @@ from mitransient_lidar.transport.snell import refract_level
 #: Largest number of index layers: connections are traced through each of them.
 MOST_INDEX_LAYERS = 16
 
+#: Vertical distance within which solids and boundaries coincide: absolute [m], and over the length of a ray.
+_SAME, _SAME_PER_LENGTH = 2e-5, 2.0**-20
+
 
 class IndexLayers:
     """Index layers of a water column, numbered from the top.
@@ -87,3 +90,8 @@ class IndexLayers:
             return direction, mi.Float(1)
         there, ratio, passes = self.refract(direction, layer, mi.UInt32(0))
         return there, dr.select(passes, dr.square(ratio) * dr.abs(direction.z / there.z), 0)
+
+
+def coinciding(length: mi.Float) -> mi.Float:
+    """Return the vertical distance [m] within which a solid lies in the plane of a boundary, for rays of a length."""
+    return dr.fma(length, _SAME_PER_LENGTH, _SAME)

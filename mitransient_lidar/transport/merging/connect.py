@@ -24,6 +24,7 @@ from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.solids import met_shape
 
 #: Points of the receiver's paths for each one that is connected.
 _POINTS_PER_CONNECTION = 4
@@ -176,11 +177,11 @@ class WaterConnections:
         scale = self.rates.on_solids * pairs.weight
         energy = scale * received.throughput * sent.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
-        solid, length = self.record.classes.solid(si.shape), point.length + photon.length
+        solid, length = self.record.classes.solid(met_shape(si)), point.length + photon.length
         depth, perturbed = -point.point.z, self.scene.perturbations
         sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
-        sums = perturbed.at_solid(sums, si.shape)
+        sums = perturbed.at_solid(sums, met_shape(si))
         self._receive(point, photon, solid, direction, 1, length, distance, energy, active, sums, on_solid=True)
 
     def _segment(self, point: SegmentPoints, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:

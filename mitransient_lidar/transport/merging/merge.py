@@ -21,6 +21,7 @@ from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
 from mitransient_lidar.transport.ripple_focusing import Echo
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.solids import met_shape
 
 
 def store_points(
@@ -135,11 +136,11 @@ def merge_on_solids(
             return
         patch, random = patches.locate(si), mi.PCG32(rng)
         first, end = photons.find(patch.bucket, active)
-        solid = record.classes.solid(si.shape)
-        sums = record.histogram.perturbations.at_solid(path.sums, si.shape)
+        shape = met_shape(si)
+        solid, sums = record.classes.solid(shape), record.histogram.perturbations.at_solid(path.sums, shape)
         events = path.scatterings, path.reversals
         subpath = SensorSubpath(pixel, *events, solid, path.direction, path.lost, path.surface_length)
-        covered = patches.inverse_share(patch, si.shape, random, active & (first < end))
+        covered = patches.inverse_share(patch, shape, random, active & (first < end))
         weight = path.throughput * covered / patch.area
         typical = patches.typical_area(si)
         connection = connections * inverse_density / dr.abs(dr.dot(si.n, path.direction))

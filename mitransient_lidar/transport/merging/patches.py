@@ -16,6 +16,7 @@ from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.solids import met_shape
 
 #: Logarithm to base 2 of the largest number of buckets of a shot along one side.
 MOST_SIDE_BITS = 9
@@ -89,7 +90,7 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
         si = scene.ray_intersect(ray, looking)
         looking &= si.is_valid()
         for i, solid in enumerate(scene.solids):
-            met[i] += dr.select(looking & (si.shape == mi.ShapePtr(solid)), mi.UInt32(1), 0)
+            met[i] += dr.select(looking & (met_shape(si) == mi.ShapePtr(solid)), mi.UInt32(1), 0)
         ray = si.spawn_ray(ray.d)
     return [solid for solid, count in zip(scene.solids, met, strict=True) if bool(dr.any(count > 1)[0])]
 
@@ -194,11 +195,11 @@ class SolidPatches:
         projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
         bits = self._side_bits
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        shape = dr.reinterpret_array(mi.UInt32, met_shape(si))
         # Solids with overhangs have several levels over one square. Sectors far from the beam are wide, and so high.
         height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self.width)
         start = dr.floor(w / height + self._shift.x)
-        level = dr.select(self._is_bounded(si.shape), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
+        level = dr.select(self._is_bounded(met_shape(si)), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
         return SolidPatch(
             bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
@@ -239,7 +240,9 @@ class SolidPatches:
         x, y = self._rings.slant
         below = -si.p.z - self._depth
         along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._rings.depth_at(-self._depth))
-        number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), opaque_index(dr.width(self._sizes) // 2 - 1))
+        number = dr.minimum(
+            dr.reinterpret_array(mi.UInt32, met_shape(si)), opaque_index(dr.width(self._sizes) // 2 - 1)
+        )
         return along, across, dr.gather(mi.Point2f, self._sizes, number)
 
     def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:

@@ -30,6 +30,7 @@ from mitransient_lidar.transport.refracted_connection import connect_laser, pert
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
+from mitransient_lidar.transport.solids import met_shape
 from mitransient_lidar.transport.volpath import VolpathOptions, trace_connected
 
 #: Numbers of the random streams within a pass; the path tracer has number 3.
@@ -457,8 +458,8 @@ class MergingRenderer(PassRenderer):
             path.rays += dr.select(active, mi.UInt32(1), 0)
             energy = path.throughput * radiance
             # No scattering event, and one reversal.
-            order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(si.shape)
-            sums, length = scene.perturbations.at_solid(path.sums, si.shape), path.length + length
+            order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(met_shape(si))
+            sums, length = scene.perturbations.at_solid(path.sums, met_shape(si)), path.length + length
             sums = perturbed_to_laser(scene, sums, si.p, si, active)
             record.receive(start.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 

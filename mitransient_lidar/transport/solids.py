@@ -1,0 +1,118 @@
+"""Solids as light meets them: without those of no effect, and instances in place of the shapes that they repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+
+#: BSDFs that have no effect where the indices of refraction on both sides are equal.
+_DIELECTRICS = ("SmoothDielectric", "ThinDielectric")
+
+#: Places of rays within the cells of a side, as shares of these, and distance before a box at which they begin [m].
+_PLACES, _BEFORE = (0.4142, 0.5858), 1e-3
+
+#: Thickness of a flat box over its coordinates, or 1 m: rays along it would meet edges alone.
+_FLAT = 1e-4
+
+
+def children(parent: mi.Object) -> list[mi.Object]:
+    """Return the objects within a Mitsuba object, in the order in which it shows them."""
+    found: list[mi.Object] = []
+
+    class Callback(mi.TraversalCallback):  # type: ignore[misc]
+        def put(self, name: str, value: object, *_: object) -> None:
+            if isinstance(value, mi.Object):
+                found.append(value)
+
+        put_object = put
+
+    parent.traverse(Callback())
+    return found
+
+
+def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
+    """Return the groups of shapes that instances of a scene repeat.
+
+    Raises
+    ------
+    UserError
+        If one of them bounds a medium.
+    """
+    groups = tuple(child for child in children(scene) if child.class_name().startswith("ShapeGroup"))
+    for group in groups:
+        for shape in children(group):
+            if shape.is_medium_transition():
+                raise UserError(
+                    f"shape {shape.id()!r} of the shapegroup {group.id()!r} has a medium: an instance has none"
+                )
+    return groups
+
+
+def scene_of_shapes(shapes: Sequence[mi.Shape], groups: Sequence[mi.Shape]) -> mi.Scene:
+    """Return a scene of shapes, and of the groups that instances among them repeat."""
+    parts = *shapes, *groups
+    ids = [shape.id() for shape in parts]
+    named = {f"shape{number}": shape for number, shape in enumerate(parts)}
+    scene = mi.load_dict({"type": "scene", **named}, parallel=False)
+    # A scene renames its shapes.
+    for shape, own in zip(parts, ids, strict=True):
+        shape.set_id(own)
+    return scene
+
+
+def without_unseen(scene: mi.Scene, groups: Sequence[mi.Shape]) -> mi.Scene:
+    """Return a scene of the shapes and groups that have an effect on light; the same one if all shapes have."""
+    shapes = scene.shapes()
+    seen = [shape for shape in shapes if shape.is_medium_transition() or not _is_unseen(shape)]
+    return scene if len(seen) == len(shapes) else scene_of_shapes(seen, groups)
+
+
+def _is_unseen(shape: mi.Shape) -> bool:
+    """Return whether all light passes a shape unchanged."""
+    bsdf = shape.bsdf()
+    if bsdf is None or shape.class_name() == "Instance":
+        return False
+    if int(bsdf.flags()) & mi.BSDFFlags.All.value == mi.BSDFFlags.Null.value:
+        return True
+    values = {name: np.array(value) for name, value in mi.traverse(bsdf) if name.endswith(("eta", "value", "data"))}
+    if bsdf.class_name() == "MaskBSDF":
+        opacity = [value for name, value in values.items() if name.startswith("opacity")]
+        return bool(opacity) and not any(value.any() for value in opacity)
+    if bsdf.class_name() not in _DIELECTRICS:
+        return False
+    through = (value for name, value in values.items() if name == "eta" or name.startswith("specular_transmittance"))
+    return all((value == 1).all() for value in through)
+
+
+def box_rays(low: FloatArray, high: FloatArray, ticks: int) -> tuple[FloatArray, FloatArray]:
+    """Return origins and directions, shape (n, 3), of rays from all sides through a box, `ticks` along each side.
+
+    They begin 1 mm or more before the box, between its corners (x, y, z) [m], and pass beside edges of most meshes.
+    """
+    low, high = np.array(low, np.float64), np.array(high, np.float64)
+    along, across = (grid.ravel() for grid in np.meshgrid(*((np.arange(ticks) + place) / ticks for place in _PLACES)))
+    origins, directions = [], []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        if min(high[u] - low[u], high[v] - low[v]) <= _FLAT * max(np.abs([low, high]).max(), 1.0):
+            continue
+        margin = _BEFORE + _BEFORE * np.abs([low[axis], high[axis]]).max()
+        for start, sign in ((low[axis] - margin, 1.0), (high[axis] + margin, -1.0)):
+            origin, direction = (np.zeros((ticks * ticks, 3)) for _ in range(2))
+            origin[:, axis], direction[:, axis] = start, sign
+            origin[:, u] = low[u] + along * (high[u] - low[u])
+            origin[:, v] = low[v] + across * (high[v] - low[v])
+            origins.append(origin)
+            directions.append(direction)
+    return np.reshape(origins, (-1, 3)), np.reshape(directions, (-1, 3))
+
+
+def met_shape(si: mi.SurfaceInteraction3f) -> mi.ShapePtr:
+    """Return the shapes of the scene at intersections: an instance in place of the shape that it repeats."""
+    return dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711
