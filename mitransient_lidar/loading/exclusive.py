@@ -57,16 +57,18 @@ _turn = _Turn()
 os.register_at_fork(after_in_child=_turn.renew)
 
 
-def alone(function: Callable[_P, _R]) -> Callable[_P, _R]:
+def alone(
+    function: Callable[_P, _R], within: Callable[[], contextlib.AbstractContextManager[None]] = kept
+) -> Callable[_P, _R]:
     """Return a function that runs in one thread at a time, alone among all of these functions.
 
-    It may call others of them. The first one leaves the active variant of Mitsuba as it found it. A Ctrl-C in the main
-    thread ends its waiting.
+    It may call others of them. The first one leaves the active variant of Mitsuba as it found it (`within`).
+    A Ctrl-C in the main thread ends its waiting.
     """
 
     @functools.wraps(function)
     def waiting(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with _turn as is_first, kept() if is_first else contextlib.nullcontext():
+        with _turn as is_first, within() if is_first else contextlib.nullcontext():
             return function(*args, **kwargs)
 
     return waiting
@@ -74,10 +76,4 @@ def alone(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def alone_with_scene(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function as `alone` does, that leaves the variant of the scene which it returns."""
-
-    @functools.wraps(function)
-    def waiting(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with _turn:
-            return function(*args, **kwargs)
-
-    return waiting
+    return alone(function, contextlib.nullcontext)

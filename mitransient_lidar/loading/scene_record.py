@@ -5,7 +5,7 @@ A result has these attributes:
 ``scene_xml``
     Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters.
 ``scene_dict``
-    Instead, a scene given as a dict, as JSON: a transform is {"matrix": 4x4, "inverse_transpose": 4x4}.
+    Instead, a scene given as a dict, as JSON (`scene_json`).
 ``instrument``
     Name of the instrument whose laser and receiver the XML holds in place of the scene's own.
 ``sensor``
@@ -26,6 +26,7 @@ import itertools
 import json
 import os
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,6 +43,7 @@ from mitransient_lidar.loading.document import SceneDocument, Setting, parse_doc
 from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.mesh_files import PLY_PLUGINS, check_ply
 from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
+from mitransient_lidar.loading.scene_json import from_json, to_json
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -107,13 +109,16 @@ class SceneRecord:
         """
         files = _found(_files_of_dict(scene), resource_folders(scene))
         try:
-            return cls("scene", json.dumps(_to_json(scene)), False, {}, files)
+            return cls("scene", json.dumps(to_json(scene)), False, {}, files)
         except (RuntimeError, TypeError, ValueError):
             return None
 
     @classmethod
-    def from_attributes(cls, attributes: Mapping[str, Any]) -> SceneRecord:
+    def from_attributes(cls, attributes: Mapping[str, Any], folder: Path | None = None) -> SceneRecord:
         """Return the record that `attributes` has written.
+
+        A file that is missing or has changed is looked for by its name and SHA-256 in the `folder` of the result, and
+        in the working folder.
 
         Raises
         ------
@@ -124,7 +129,8 @@ class SceneRecord:
         if not kinds:
             raise UserError(
                 "the result does not hold its scene (attribute scene_xml or scene_dict): it was rendered from loaded "
-                "objects, or by an older release; render the scene itself"
+                "objects, from images of more than 1 MiB that no file holds, or by an older release; render the scene "
+                "itself"
             )
         prefix, kind = "scene.", f"scene_{kinds[0]}"
         parameters = {name[len(prefix) :]: value for name, value in attributes.items() if name.startswith(prefix)}
@@ -134,9 +140,11 @@ class SceneRecord:
                 raise UserError(f"the attribute {name} = {shown(value)} of the result is damaged: it must be a text")
         rows = json_attribute(attributes, "scene_files") if "scene_files" in attributes else []
         try:
-            files = {(row["plugin"], row["name"]): (str(row["path"]), str(row["sha256"])) for row in rows}
+            found = {(row["plugin"], row["name"]): (str(row["path"]), str(row["sha256"])) for row in rows}
         except (KeyError, TypeError) as error:
             raise UserError("the attribute scene_files of the result is damaged: it must be a list of files") from error
+        folders = [Path()] if folder is None else [folder, Path()]
+        files = {key: (_copy_of(*file, folders), file[1]) for key, file in found.items()}
         name = attributes.get("scene", "scene")
         instrument, sensor = (str(attributes.get(one, "")) for one in ("instrument", "sensor"))
         # Names of outputs begin with it.
@@ -193,10 +201,10 @@ class SceneRecord:
             return found
 
         try:
-            restored: dict[str, Any] = _from_json(placed(parse_json(self.text, "the scene of the result")))
+            restored: dict[str, Any] = from_json(placed(parse_json(self.text, "the scene of the result")))
         except UserError:
             raise
-        except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, zlib.error) as error:
             raise UserError("the scene of the result is damaged: its text must be JSON of a scene") from error
         return restored
 
@@ -291,42 +299,6 @@ def _plain(value: Any) -> Any:
     return array.item() if array.size == 1 else array.ravel().tolist()
 
 
-def _to_json(value: Any) -> Any:
-    """Return a value of a dict scene in types of JSON; raise TypeError for an unknown one."""
-    if isinstance(value, Mapping):
-        return {key: _to_json(item) for key, item in value.items()}
-    if isinstance(value, (bool, int, float, str)):
-        return value
-    if isinstance(value, (np.bool_, np.integer, np.floating)):
-        return value.item()
-    if isinstance(value, os.PathLike):
-        return str(value)
-    if isinstance(value, (list, tuple)):
-        return [_to_json(item) for item in value]
-    if is_transform(value):
-        return {name: matrix_of(getattr(value, name)).tolist() for name in ("matrix", "inverse_transpose")}
-    array = np.array(value)
-    if array.shape == (3,) and array.dtype.kind in "fiu":
-        return array.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be stored")
-
-
-def _from_json(value: Any) -> Any:
-    """Return a value of a dict scene from `_to_json`."""
-    if isinstance(value, list):
-        return [tuple(item) if isinstance(item, list) else item for item in value]
-    if not isinstance(value, dict):
-        return value
-    if set(value) == {"matrix", "inverse_transpose"}:
-        import drjit.scalar as ds
-        import mitsuba as mi
-
-        of_texture = len(value["matrix"]) == 3
-        kind, matrix = (mi.ScalarTransform3d, ds.Matrix3f64) if of_texture else (mi.ScalarTransform4d, ds.Matrix4f64)
-        return kind(*(matrix(value[name]) for name in ("matrix", "inverse_transpose")))
-    return {key: _from_json(item) for key, item in value.items()}
-
-
 def _files_of(document: SceneDocument) -> Iterator[tuple[str, Setting]]:
     """Yield the plugin and the attribute that names a file."""
     types = {id(one.element): one.value for one in document.settings if one.attribute == "type"}
@@ -376,6 +348,13 @@ def _check_file(plugin: str, path: Path, _digest: str) -> None:
         raise UserError(f"cannot read {path}: its name must have no control characters")
     if plugin in PLY_PLUGINS:
         check_ply(path)
+
+
+def _copy_of(path: str, digest: str, folders: Sequence[Path]) -> str:
+    """Return the path of a file, or of its copy in one of some folders where it is missing or has another SHA-256."""
+    places = [Path(path), *(folder / Path(path).name for folder in folders)]
+    same = (place for place in places if place.is_file() and _sha256(place) == digest)
+    return str(next(same, places[0]).absolute())
 
 
 def _unchanged(plugin: str, path: str, digest: str) -> str:

@@ -84,7 +84,8 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     attributes = read_attributes(result)
     kind = result_kind(attributes)
     given = {name: value for name, value in options.items() if value is not None}
-    scene = SceneRecord.from_attributes(attributes)
+    folder = None if isinstance(result, xr.Dataset) else Path(result).parent
+    scene = SceneRecord.from_attributes(attributes, folder)
     held = {one.name: one.metadata["attribute"] for one in fields(RenderOptions)}
     own = {name: _held(attributes, held[name]) for name in _RECORDED[kind]}
     compare_versions(attributes)

@@ -56,8 +56,16 @@ SOLIDS = {
         "bsdf": {"type": "twosided", "bsdf": diffuse(0.4)},
     },
 }
+GREY = np.random.default_rng(1).random((6, 4, 1), np.float32)
+MARKED = {"type": "diffuse", "reflectance": {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(GREY)}}
+TILED = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(0.4 * GREY), "to_uv": mi.ScalarTransform3f().scale(0.2)}
 MATERIALS = {
-    "half_transparent": plate(0.4, 0.9, -4.0, 0.6, {"type": "mask", "opacity": 0.4, "nested": diffuse(0.5)}),
+    "bottom": {
+        "type": "seabed",
+        "size": 100.0,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", **TILED}},
+    },
+    "half_transparent": plate(0.4, 0.9, -4.0, 0.6, {"type": "mask", "opacity": 0.4, "nested": MARKED}),
     "rough_metal": plate(1.6, -0.9, -5.0, 0.7, {"type": "roughconductor", "alpha": 0.3}, tilt=10.0),
     "retroreflector": plate(
         *(2.6, 1.0, -5.5, 0.5), {"type": "retroreflector", "width_deg": 6.0, "diffuse_share": 0.2}, tilt=20.0
@@ -95,7 +103,7 @@ CASES = {
         0.02,
         None,
     ),
-    "materials": ({"sea": ROUGH, "extra": MATERIALS}, FROM_200_M, 5, 0.03, None),
+    "materials and bitmaps": ({"sea": ROUGH, "bottom": None, "extra": MATERIALS}, FROM_200_M, 5, 0.03, None),
     "mirror and sphere in strata": (
         {
             "sea": ROUGH,

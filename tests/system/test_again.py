@@ -169,14 +169,16 @@ def test_a_result_of_another_receiver_gives_the_same_bits(function, tmp_path):
 
 @pytest.mark.slow
 def test_textures_give_the_same_bits(tmp_path):
-    """A bitmap on the seabed and a turned pattern on a target, from the file of the result."""
-    picture = tmp_path / "grey.png"
+    """Bitmaps of a file and of Python, from the file of the result, also with its bitmap in another folder."""
+    picture, elsewhere = tmp_path / "grey.png", tmp_path / "elsewhere"
     mi.Bitmap(np.tile(np.uint8([[40, 200], [200, 40]]), (4, 4))[:, :, None]).write(str(picture))
     scene = scene_dict(tmp_path)
     turned = mi.ScalarTransform3d().rotate(30).scale([4, 6])
     scene["target"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": turned}}
     bitmap = {"type": "bitmap", "filename": str(picture)}
     scene["bottom"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap}
+    own = {"type": "bitmap", "bitmap": mi.Bitmap(np.linspace(0, 1, 64, dtype=np.float32).reshape(8, 8, 1)), "raw": True}
+    scene["target"]["bsdf"]["reflectance"]["color0"] = own
     result = mitransient_lidar.render(scene, passes=2)
     results.save(result, tmp_path / "result.nc")
     assert_same_bits(render_again(tmp_path / "result.nc"), result)
@@ -184,6 +186,9 @@ def test_textures_give_the_same_bits(tmp_path):
     picture.write_bytes(picture.read_bytes() + b" ")
     with pytest.raises(UserError, match=r"grey.png has changed"):
         render_again(tmp_path / "result.nc")
+    elsewhere.mkdir()
+    (elsewhere / "grey.png").write_bytes(picture.read_bytes()[:-1])
+    assert_same_bits(render_again((tmp_path / "result.nc").rename(elsewhere / "result.nc")), result)
 
 
 @pytest.mark.slow
