@@ -26,7 +26,7 @@ _OWN = (*_LIDAR, *_MESHES, "layered_water")
 
 #: Plugins of Mitsuba that ``to_world`` places, and the points that place some of them before it.
 _PLACED = (
-    *("bsplinecurve", "cube", "cylinder", "disk", "ellipsoids", "ellipsoidsmesh", "gridvolume", "instance"),
+    *("bsplinecurve", "cube", "cylinder", "disk", "gridvolume", "instance"),
     *("linearcurve", "obj", "orthographic", "perspective", "ply", "projector", "radiancemeter", "rectangle"),
     *("sdfgrid", "serialized", "sphere", "spot", "thinlens"),
 )
@@ -117,6 +117,8 @@ def _is_movable(node: Any) -> bool:
     props, given = node.props, mi.Properties.Type
     loaded = (mi.Shape, mi.Sensor, mi.Emitter, mi.Medium, mi.Volume, mi.BSDF, mi.Texture)
     if any(isinstance(one, loaded) for _, one in props.objects(False)):
+        return False
+    if _name(node) == "radiancemeter" and "origin" in props:
         return False
     return all(name not in props or props.type(name) == given.Transform for name in ("to_world", "to_uv"))
 

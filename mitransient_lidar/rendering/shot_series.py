@@ -98,8 +98,8 @@ def render_shots(
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
     count
-        Number of random shots, 2 to 100 000; the scene needs an ``ocean_surface`` with waves. Not used with
-        `positions`.
+        Number of random shots, 2 to 100 000, about the origin or, if it is more than 250 m from there, the aim of the
+        scene; it needs an ``ocean_surface`` with waves. Not used with `positions`.
     positions
         Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
         apart along x and y.

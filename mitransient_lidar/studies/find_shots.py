@@ -57,7 +57,9 @@ class RenderedShots:
 def find_shots(
     scene: Any, params: Mapping[str, Any] | None = None, *, slope_sigmas: float = 2.0, count: int = 1
 ) -> list[Shot]:
-    """Find places of each kind of slope on the sea of a scene.
+    """Find places of each kind of slope on the sea of a scene, within 256 m of its origin.
+
+    Where the lidar's aim is more than 250 m from the origin, they are about the aim.
 
     Parameters
     ----------

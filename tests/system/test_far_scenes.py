@@ -19,7 +19,7 @@ from mitransient_lidar.transport.scene_parts import find_receiver, lidar_sensor
 FAR, BETWEEN = (5e5, -9e5), (123456.789, -9876543.21)
 
 #: Plugins of Mitsuba that stay where they are given: such scenes have no frame.
-UNKNOWN = {"blender", "distant", "measured", "point"}
+UNKNOWN = {"blender", "distant", "ellipsoids", "ellipsoidsmesh", "point"}
 
 
 def moved(place, *more):
