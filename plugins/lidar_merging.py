@@ -25,8 +25,9 @@ class LidarMerging(PassIntegrator):
                                (``spp``) is given to ``mi.render``. Default: 32768, or 16 a pixel up to 2^21
     photons_per_pass  integer  Paths from the laser in one pass, 1024 to 2^28. Default: 32768, or 65536 from 4096 pixels
                                on
-    cell_size         float    Horizontal width of the cells on the beam's axis at the surface [m], at most 1e4; 0: from
-                               footprint, facets of the sea and field of view. Smaller cells have less bias and more
+    cell_size         float    Horizontal width of the cells on the beam's axis at the surface [m], at most 1e4, and
+                               within 2e-6 to 2 standard deviations of the beam there; 0: from footprint,
+                               facets of the sea, field of view and attenuation. Smaller cells have less bias and more
                                noise. Default: 0
     point_spacing     float    Distance between points along a path [m]; 0: a fourteenth of the distance to the bottom
                                or to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
@@ -84,7 +85,8 @@ class LidarMerging(PassIntegrator):
     from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below; at 75 degrees over waves of 3 m/s
     by -1.4 +- 0.6 and -0.5 +- 0.5 %. A beam of 1 mrad at 40 degrees over 10 m/s, which meets several facets, differs by
     -2 +- 1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``)
-    have more bias. Derivatives come from `mitransient_lidar.render`, not by Mitsuba.
+    have more bias. A beam may be 2000 attenuation lengths of the water wide. Derivatives come from
+    `mitransient_lidar.render`, not by Mitsuba.
 
     .. code-block:: xml
 

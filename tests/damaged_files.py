@@ -9,9 +9,9 @@ Run by hand, in the environment that the package is developed in::
 In place of a file, of one that it includes, or of one in its folder stand a named pipe, a device, a socket, a folder, a
 link to one of these or to itself, or nothing; an HDF5 file has its values in one of these, or a link to it.
 
-A file must be read, or refused with one sentence (`UserError`), within half a minute. Everything else is a finding:
-another exception, the end of the process by a signal, and a read that takes longer. Findings go to stderr, each with
-the number that makes it again, and a Markdown table to stdout.
+A file must be read, or refused with one sentence (`UserError`), within half a minute, or more on a busy machine.
+Everything else is a finding: another exception, the end of the process by a signal, and a read that takes longer.
+Findings go to stderr, each with the number that makes it again, and a Markdown table to stdout.
 """
 
 from __future__ import annotations
@@ -236,9 +236,11 @@ def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tupl
                 continue
             # A damaged file may end the process; its number is told before.
             yield number, "began", ""
-            signal.alarm(LIMIT_S)
+            # Other processes may take most of the time.
+            limit = round(LIMIT_S * max(os.getloadavg()[0] / len(os.sched_getaffinity(0)), 1))
+            signal.alarm(limit)
             # A read in a library may not come back to Python; the process ends then, and the next one goes on.
-            faulthandler.dump_traceback_later(2 * LIMIT_S, exit=True)
+            faulthandler.dump_traceback_later(2 * limit, exit=True)
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
                     kind.read(path)

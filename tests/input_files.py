@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -67,10 +68,12 @@ def analyse(path: Path) -> None:
     from mitransient_lidar.analysis.waveforms.echo_table import extract
     from mitransient_lidar.plots.waveforms import plot_waveforms
 
+    # Reading takes as long as each use.
+    opened = functools.cache(lambda: results.open(path))
     _each(
         lambda: extract(records.open_waveforms(path), ["gaussian", "leading_edge"]),
-        lambda: retrieve(results.open(path)),
-        lambda: plot_waveforms(results.open(path)),
+        lambda: retrieve(opened()),
+        lambda: plot_waveforms(opened()),
     )
 
 

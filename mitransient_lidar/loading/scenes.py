@@ -21,7 +21,7 @@ from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, SceneRecord
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:
@@ -210,6 +210,9 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     config.merge_equivalent = config.merge_meshes = config.parallel = False
     parsed = parse(config)
     for node in parsed.nodes:
+        for name in FILE_PARAMETERS:
+            if name in node.props and isinstance(node.props[name], (bool, int, float)):
+                raise UserError(f"{name} = {node.props[name]} must be a text, the name of a file")
         if node.props.plugin_name() == "ocean_surface":
             node.props[WAITS] = True
     mi.parser.transform_all(config, parsed)
@@ -268,6 +271,8 @@ def as_user_error(document: SceneDocument | None = None) -> Iterator[None]:
             raise UserError(message + _set_by(message, document)) from error
         if empty := re.search(r'failed to instantiate shape plugin of type "(\w+)": jit_var', text):
             raise UserError(f"a shape of type {empty[1]} has no faces: its mesh must have at least one") from error
+        if wrong := re.search(r'The property "(\w+)" has the wrong type \(expected ([\w ]+), got ([\w ]+)\)', text):
+            raise UserError(f"{wrong[1]} is of type {wrong[3]}: it must be of type {wrong[2]}") from error
         if "Traceback (most recent call last)" in text:
             raise
         text = re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text)

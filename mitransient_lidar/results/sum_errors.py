@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 
 #: Variable with the correlation of the errors of bins, and its dimensions.
@@ -101,10 +102,17 @@ class SumErrors:
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
-        """Return what a result states, None without a statement."""
+        """Return what a result states, None without a statement.
+
+        Raises
+        ------
+        UserError
+            If the result states a correlation of another kind.
+        """
         curve = _curve(dataset.attrs)
         if VARIABLE not in dataset:
             return cls(None, curve) if curve.size else None
+        _check(dataset)
         time, middles = (np.asarray(dataset[name].values, dtype=np.float64) for name in ("time", DIMS[0]))
         # All blocks but the last one are of one size.
         edges = middles[:-1] + 0.5 * (middles[1:2] - middles[:1])
@@ -201,6 +209,19 @@ def with_correlation(dataset: xr.Dataset, middles_ns: FloatArray, correlation: F
     mean, stderr = (dataset[name].values.reshape(-1, count) for name in ("waveform", "waveform_stderr"))
     bins, inflation = known.median_curve(mean, stderr)
     return dataset.assign_attrs(dict(zip(_CURVE, (bins, inflation), strict=True)))
+
+
+def _check(dataset: xr.Dataset) -> None:
+    """Raise `UserError` if a result has no correlation of every block of bins with every one, or none of its bins."""
+    sizes = [dataset[VARIABLE].sizes.get(name, 0) for name in DIMS]
+    if sizes[0] != sizes[1] or not sizes[0]:
+        raise UserError(
+            f"the result has {VARIABLE} over {dict(dataset[VARIABLE].sizes)}: it must be square over {DIMS}."
+        )
+    for name, dims in ((VARIABLE, None), (DIMS[0], DIMS[:1]), ("time", ("time",))):
+        values = dataset[name]
+        if values.dtype.kind not in "fiu" or (dims and values.dims != dims) or not np.isfinite(values.values).all():
+            raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them.")
 
 
 def _curve(attributes: Mapping[str, Any]) -> FloatArray:

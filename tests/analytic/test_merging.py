@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from significance import largest_chi2, largest_error, largest_z, mean_and_error
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
@@ -41,6 +42,24 @@ def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
         assert np.hypot(error, merged_error) < 0.0025 * level
     assert bias[0] < -0.012
     assert abs(bias[1]) < 0.006
+
+
+@pytest.mark.slow
+def test_cells_of_any_width_and_beam_give_finite_light(lidar_scene, passes):
+    """Areas of rings overflowed; and beams of kilometres had cells in which level light grew by factors of 1e8."""
+    few = {"paths_per_pass": 8192, "photons_per_pass": 8192}
+    for width in (1e-30, 1e4):
+        found = passes(lidar_scene(integrator={**MERGING, **few, "cell_size": width}), 2)
+        assert np.isfinite(found).all()
+        assert found.sum() > 0
+    high, film = {"altitude": 3e5}, {"time_start_ns": 2.12e6, "bin_width_ns": 1000.0, "bin_count": 20}
+    merged, reference = (
+        passes(lidar_scene(integrator=integrator, tx=high, rx=high, film=film, bottom=None), 4)
+        for integrator in ({**MERGING, **few}, {})
+    )
+    assert 0 < merged.sum() < 10 * reference.sum()
+    with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 2000"):
+        passes(lidar_scene(integrator=MERGING, tx={"altitude": 1e6, "divergence_mrad": 20.0}, rx={"altitude": 1e6}), 1)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import finite, in_range, positive
 from mitransient_lidar.physics.lidar.divergence import read_divergence
 
@@ -163,9 +164,9 @@ def _square(footprints: Sequence[Footprint]) -> tuple[float, float, float]:
 def _with_own_values(get: Get, footprints: Sequence[Footprint]) -> list[Footprint]:
     """Return the footprints with the values that the sea's own parameters give."""
     altitude, off_nadir, field = get("altitude", None), get("off_nadir_deg", None), get("field_of_view_mrad", None)
-    altitude = None if altitude is None else positive("altitude", altitude)
+    altitude = None if altitude is None else in_range("altitude", altitude, 0.1, RANGES["altitude"][1])
     off_nadir = None if off_nadir is None else math.radians(in_range("off_nadir_deg", off_nadir, 0.0, 89.9))
-    field = None if field is None else 1e-3 * positive("field_of_view_mrad", field)
+    field = None if field is None else 1e-3 * ranged("field_of_view_mrad", field)
     divergence = read_divergence(get)
     found = list(footprints)
     if altitude is not None and not found:
@@ -186,6 +187,6 @@ def _with_own_values(get: Get, footprints: Sequence[Footprint]) -> list[Footprin
 
 
 def read_length(get: Get, name: str) -> float | None:
-    """Return a positive length [m], or None for ``auto``."""
+    """Return a positive length of at most 1000 km [m], or None for ``auto``."""
     value = get(name, "auto")
-    return None if value == "auto" else positive(name, value)
+    return None if value == "auto" else in_range(name, positive(name, value), 0.0, RANGES["size"][1])

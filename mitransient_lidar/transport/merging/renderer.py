@@ -19,7 +19,7 @@ from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_s
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL, PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries, least_cell, least_patch
-from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
+from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings, cell_widths
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
 from mitransient_lidar.transport.opaque import opaque
@@ -238,9 +238,10 @@ class MergingLayout:
         segments = min(0.5 * np.ceil(3 * (1 + scattering * reach)) + 1, _MOST_SEGMENTS)
         pose = scene.transmitter.pose
         if scene.submerged:
-            width = options.cell_size or _CELL_PER_BEAM * scene.transmitter.angular_spread * nearest
+            spread = scene.transmitter.angular_spread * nearest
+            width = cell_widths(options.cell_size, spread, 0.0)[0] or _CELL_PER_BEAM * spread
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
-            rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0, 0.0)
+            rings = BeamRings(pose, spread, 1.0, 0.0)
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
             patches = _PATCH_PER_CELL * width, least_patch(scene)
             return cls(
@@ -253,8 +254,9 @@ class MergingLayout:
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
-        widest = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
-        width = options.cell_size or min(max(_CELL_PER_VIEW * view, least_cell(scene, reach)), widest)
+        given, longest = cell_widths(options.cell_size, footprint, attenuation)
+        widest = given or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
+        width = given or min(max(_CELL_PER_VIEW * view, least_cell(scene, reach)), widest)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
         depth = reach * -float(refract_level(pose.axis, scene.refractive_index)[2])
@@ -272,9 +274,9 @@ class MergingLayout:
         # The standard deviation of even light in the field of view is a quarter of its diameter.
         by_ripples = profile.growth(most=0.25 * view)
         grid = WaterGrid(
-            *(rings, heights, profile, width / core, growth, thickness, uppermost, reach),
+            *(rings, heights, profile, min(width, longest) / core, growth, thickness, uppermost, reach),
             view_growth=by_ripples,
-            widening=widest / width,
+            widening=min(widest, longest) / min(width, longest),
         )
         patches = _PATCH_PER_CELL * width, least_patch(scene)
         return cls(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import refract as refract_at_facet
@@ -28,6 +30,43 @@ _LARGEST_SLANT = 2.0
 
 #: Core radius at the surface over the beam's standard deviation there.
 CORE_PER_SPREAD = 2.0
+
+#: Least and largest width of cells on the axis, over the core radius: rings have different 32-bit numbers, and are not
+#: wider than the beam.
+_WIDTHS = 1e-6, 1.0
+
+#: Largest width of automatic cells at the surface, in attenuation lengths of the water, as level light of wider ones is
+#: wrong, and largest core radius: cells that narrow find no light in wider beams.
+_LONGEST, _WIDEST_BEAM = 0.3, 1000.0
+
+
+def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float, float]:
+    """Return the width of cells nearest to a given one that rings about a beam can have, and the largest one in water.
+
+    Parameters
+    ----------
+    given
+        Width on the axis at the surface [m]; 0 for an automatic one, which then is 0.
+    spread
+        Standard deviation of the beam there [m].
+    attenuation
+        Beam attenuation of the water [1/m].
+
+    Raises
+    ------
+    UserError
+        If the beam is too wide for automatic cells.
+    """
+    core = CORE_PER_SPREAD * spread
+    if given:
+        width = min(max(given, _WIDTHS[0] * core), _WIDTHS[1] * core)
+        return width, width
+    if core * attenuation > _WIDEST_BEAM:
+        raise UserError(
+            f"lidar_merging: the beam is {2 * core:.3g} m wide on the sea, more than {2 * _WIDEST_BEAM:g} attenuation "
+            "lengths of the water: use lidar_volpath"
+        )
+    return 0.0, _LONGEST / attenuation if attenuation > 0 else math.inf
 
 
 @dataclass(frozen=True)

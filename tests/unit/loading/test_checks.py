@@ -183,6 +183,11 @@ def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
     assert str(caught.value).isprintable()
 
 
+def test_names_of_files_are_texts():
+    with pytest.raises(UserError, match=r"profile_file = 1.0 must be a text, the name of a file"):
+        load_scene({"type": "scene", "laser": {"type": "lidar_transmitter", "profile_file": 1.0}}, None)
+
+
 def test_types_are_checked_with_parameters_in_place(tmp_path):
     text = '<default name="kind" value="lidar_merging"/><integrator type="$kind"/>'
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', text)

@@ -14,6 +14,7 @@ from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_fits import column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import ErrorCorrelation
 from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors, with_correlation
@@ -95,3 +96,18 @@ def test_joined_results_have_the_mean_of_their_correlations():
     one = with_correlation(record(np.ones(60), np.ones(60)), *correlation.over(time))
     joined = SumErrors.of(xr.concat([one, one], "shot"))
     np.testing.assert_allclose(joined.shared.correlation, SumErrors.of(one).shared.correlation)
+
+
+def test_correlations_of_another_kind_are_refused():
+    middles = 1385.0 + np.arange(20)
+    one = with_correlation(record(np.ones(60), np.ones(60)), middles, np.eye(20))
+    for damaged, message in (
+        (one.rename(other_error_time="other"), r"over \{'error_time': 20, 'other': 20\}: it must be square"),
+        (one.isel(error_time=slice(0)), "'error_time': 0.*it must be square"),
+        (one.isel(other_error_time=[0, 1]), "'other_error_time': 2.*it must be square"),
+        (one.assign(error_correlation=one["error_correlation"] * np.nan), "error_correlation that is not of finite"),
+        (one.assign_coords(error_time=["x"] * 20), "error_time that is not of finite numbers"),
+        (one.drop_vars("time").assign_coords(time=60 * ["x"]), "result has time that is not of finite numbers"),
+    ):
+        with pytest.raises(UserError, match=message):
+            SumErrors.of(damaged)
