@@ -60,6 +60,11 @@ class Vertex:
         """Whether the segment ends on the sea surface or on a solid."""
         return self.at_sea | self.on_solid
 
+    @property
+    def is_rough(self) -> mi.Bool:
+        """Whether its surface has no mirror-like part, so that any direction can be drawn and weighted."""
+        return ~mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Delta)
+
 
 @dataclass
 class ScatteringEvent:

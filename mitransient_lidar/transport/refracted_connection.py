@@ -160,6 +160,12 @@ class RefractedSunSampler(RefractedEmitterSampler):
         return self._direction
 
 
+def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Float:
+    """Return the transmittance of radiance through a level surface, with Fresnel's factor for normal incidence."""
+    index = opaque(scene.refractive_index)
+    return 4 * index / (1 + index) ** 2 * emitter.in_air.z / emitter.in_water.z
+
+
 @dataclass
 class ConnectedPath(Path):
     """A path whose vertices are connected to an emitter.
@@ -207,7 +213,7 @@ class TopLayerRay:
     optical_length, optical_depth, absorption_depth
         Optical length [m], optical depth and that of absorption alone below the top index layer.
     factor
-        Factor of the radiance: square of the ratio of the refractive indices; 0 where the ray is blocked.
+        Factor of the radiance: square of the ratio of the refractive indices, times the share that no shape blocks.
     sums
         Sums of the perturbations below the top index layer.
     """
@@ -232,7 +238,7 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         distance = dr.maximum((-segment.o.z - opaque(layers.boundaries[number - 1])) / segment.d.z, 0)
         # A solid in the plane of the boundary counts.
         segment.maxt = distance + coinciding(distance) / segment.d.z
-        blocked = scene.ray_test(segment, here)
+        share = scene.share_along(segment, here)
         optical_depth = water.optical_depth(segment.o, segment.d, distance)
         absorption = water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)
         above = mi.UInt32(number - 1)
@@ -241,7 +247,7 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         traced.optical_depth += dr.select(here, optical_depth, 0)
         traced.absorption_depth += dr.select(here, absorption, 0)
         traced.sums = scene.perturbations.along(traced.sums, -segment.o.z, -segment.d.z, distance, here)
-        traced.factor *= dr.select(here, dr.select(passes & ~blocked, ratio * ratio, 0), 1)
+        traced.factor *= dr.select(here, dr.select(passes, share * ratio * ratio, 0), 1)
         origin = dr.select(here, segment.o + segment.d * distance, segment.o)
         traced.ray = mi.Ray3f(origin, dr.select(here, direction, segment.d))
         layer = dr.select(here, above, layer)
@@ -303,14 +309,13 @@ def connect_event_to_laser(
 ) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
     """Connect scattering events to a laser under water.
 
-    Return unit direction, energy per area normal to it [J/m^2], 0 where the line is blocked, and relative length [m].
+    Return unit direction, energy per area normal to it [J/m^2] that no shape blocks, and relative length [m].
     """
     line = StraightConnection.to_laser(scene, point)
     ray = mi.Ray3f(point, line.direction)
     ray.maxt = line.distance
     lit = active & (line.irradiance > 0)
-    lit &= ~scene.ray_test(ray, lit)
-    return line.direction, dr.select(lit, line.irradiance, 0), line.length
+    return line.direction, dr.select(lit, scene.share_along(ray, lit) * line.irradiance, 0), line.length
 
 
 def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
@@ -320,15 +325,15 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
     -------
     radiance
         Energy per area and solid angle [J/(m^2 sr)] along ``si.wi``: intensity, BSDF with its cosine, and inverse
-        square of the distance; 0 where the line is blocked or meets the other side of the sea surface.
+        square of the distance, of the light that no shape blocks; 0 on the other side of the sea surface.
     length
         Length of the line [m], relative to the distance of the scene's reference point.
     """
     line = StraightConnection.to_laser(scene, si.p)
     radiance = _bsdf_towards(scene, si, line.direction, active, wet=scene.submerged) * line.irradiance
     active &= radiance > 0
-    active &= ~scene.ray_test(si.spawn_ray_to(scene.transmitter_pose.point), active)
-    return dr.select(active, radiance, 0), line.length
+    share = scene.share_along(si.spawn_ray_to(scene.transmitter_pose.point), active)
+    return dr.select(active, share * radiance, 0), line.length
 
 
 def connect_sun(
@@ -344,8 +349,7 @@ def connect_sun(
     """
     radiance = irradiance * _bsdf_towards(scene, si, direction, active)
     lit = active & (radiance > 0)
-    lit &= ~scene.ray_test(si.spawn_ray(direction), lit)
-    return dr.select(lit, radiance, 0)
+    return dr.select(lit, scene.share_along(si.spawn_ray(direction), lit) * radiance, 0)
 
 
 def _bsdf_towards(

@@ -307,6 +307,39 @@ class WaterScene:
             blocked |= part.shapes.ray_test(part.ray(ray), active & ~blocked)
         return blocked
 
+    def look_through(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Float]:
+        """Return the first intersections of rays behind veils, their distances [m], and the share that veils let pass.
+
+        Where nothing passes the intersection is that with a veil.
+        """
+        if not self.has_veils:
+            si = self.ray_intersect(ray, active)
+            return si, si.t, mi.Float(1)
+
+        def step(
+            ray: mi.Ray3f, si: mi.SurfaceInteraction3f, before: mi.Float, share: mi.Float, looking: mi.Bool
+        ) -> tuple[mi.Ray3f, mi.SurfaceInteraction3f, mi.Float, mi.Float, mi.Bool]:
+            si = dr.select(looking, self.ray_intersect(ray, looking), si)
+            passed = si.bsdf().eval_null_transmission(si, looking & si.is_valid())[0]
+            looking &= si.is_valid() & (passed > 0)
+            share = dr.select(looking, share * passed, share)
+            beyond = self.spawn_ray(si, ray.d).o
+            skipped = dr.dot(beyond - ray.o, ray.d)
+            before = dr.select(looking, before + skipped, before)
+            ray.o, ray.maxt = dr.select(looking, beyond, ray.o), dr.select(looking, ray.maxt - skipped, ray.maxt)
+            return ray, si, before, share, looking & (ray.maxt > 0)
+
+        state = mi.Ray3f(ray), dr.zeros(mi.SurfaceInteraction3f), mi.Float(0), mi.Float(1), mi.Bool(active)
+        _, si, before, share, _ = dr.while_loop(state, lambda *state: state[-1], step, label="veils")
+        return si, before + si.t, share
+
+    def share_along(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        """Return the share of the light along rays that no shape blocks."""
+        if not self.has_veils:
+            return dr.select(self.ray_test(ray, active), mi.Float(0), 1)
+        si, _, share = self.look_through(ray, active)
+        return dr.select(si.is_valid(), 0, share)
+
     def spawn_ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         """Return rays that leave surfaces, from points beside them so that they do not meet these again.
 

@@ -26,6 +26,7 @@ from mitransient_lidar.transport.refracted_connection import (
     SubmergedLaserSampler,
     connect_event_to_laser,
     connect_laser,
+    level_transmittance,
     perturbed_to_laser,
     trace_to_top_layer,
 )
@@ -202,12 +203,6 @@ class LaserLight(PathLight):
         path.active &= path.length + self._to_laser.distance(path.point) < self._path_end
 
 
-def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Float:
-    """Return the transmittance of radiance through a level surface, with Fresnel's factor for normal incidence."""
-    index = opaque(scene.refractive_index)
-    return 4 * index / (1 + index) ** 2 * emitter.in_air.z / emitter.in_water.z
-
-
 class PathTracer:
     """Traces paths from the receiver and connects their vertices to a light.
 
@@ -266,8 +261,9 @@ class PathTracer:
             self._connect_straight(path, vertex, event, emitter, first)
         else:
             self._connect(path, rng, vertex, event, emitter, transmittance, first)
-        self._redirect(path, rng, vertex, event, emitter)
-        path.emitter_ratio = dr.select(vertex.at_boundary, path.emitter_ratio / transmittance, path.emitter_ratio)
+        passes = self._redirect(path, rng, vertex, event, emitter)
+        crosses = vertex.at_boundary | passes
+        path.emitter_ratio = dr.select(crosses, path.emitter_ratio / transmittance, path.emitter_ratio)
         self._step.cross_boundary(path, vertex.at_boundary & path.active)
         self._roulette(path, rng, emitter)
         self.light.end_paths(path, rng)
@@ -291,19 +287,19 @@ class PathTracer:
         value, pdf = self._evaluate(emitter, vertex, event, sampled, up)
         ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), scene.spawn_ray(si, up))
         top = trace_to_top_layer(scene, ray, path.index_layer, sampled)
-        above = scene.ray_intersect(top.ray, sampled)
+        above, to_surface, share = scene.look_through(top.ray, sampled)
         arrives = sampled & (top.factor > 0)
         met = arrives & above.is_valid() & scene.is_surface(above.shape)
         # Beyond the end of the surface mesh a flat sea replaces it, to estimate the loss.
         lost = arrives & ~above.is_valid() & (top.ray.d.z > 0)
-        distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, above.t)
+        distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, to_surface)
         crossed = top.optical_depth + self._optical_depth(top.ray.o, top.ray.d, distance, met | lost)
-        clear = dr.exp(-crossed)
+        clear = share * dr.exp(-crossed)
         if self._absorption is None:
             own = pdf * clear
         else:
             sampled_depth = self._sampled_depth(top.ray.o, top.ray.d, distance, met | lost)
-            own = pdf * dr.exp(top.absorption_depth - top.optical_depth - sampled_depth)
+            own = pdf * share * dr.exp(top.absorption_depth - top.optical_depth - sampled_depth)
         combined = density + (own if self.options.connection == "mis" else 0)
         connected = value * clear / combined * top.factor
         factor = dr.select(met, connected, self._own_weight(path, transmittance))
@@ -311,7 +307,7 @@ class PathTracer:
         direct = vertex.at_sea | (vertex.on_solid & ~vertex.in_water)
         radiance, air_length = light.connect(crossing, emitter, met | direct)
         skipped = path.optical_length(dr.dot(ray.o - path.point, up), scene.index_layers)
-        in_water = skipped + top.optical_length + above.t * opaque(scene.group_index)
+        in_water = skipped + top.optical_length + to_surface * opaque(scene.group_index)
         water_length = dr.select(met, in_water, 0)
         energy = light.weight * path.throughput * factor * radiance
         if self.options.complement_only:
@@ -320,7 +316,7 @@ class PathTracer:
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(sampled, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         sums = joined(self._step.perturbed_connection(path, vertex, event, up, met), top.sums)
-        sums = scene.perturbations.along(sums, -top.ray.o.z, -top.ray.d.z, above.t, met)
+        sums = scene.perturbations.along(sums, -top.ray.o.z, -top.ray.d.z, to_surface, met)
         sums = light.perturbed(sums, crossing.p, crossing, met | direct)
         light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid, sums)
         light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
@@ -404,7 +400,7 @@ class PathTracer:
             pdf = dr.select(at_event, dr.lerp(phase_pdf, guided, probability), 0)
         on_solid = active & ~vertex.scattered
         solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), on_solid)
-        solid_pdf = dr.select(_is_rough(si), dr.lerp(solid_pdf, guided, probability), solid_pdf)
+        solid_pdf = dr.select(vertex.is_rough, dr.lerp(solid_pdf, guided, probability), solid_pdf)
         return dr.select(on_solid, solid_value[0], value), dr.select(on_solid, solid_pdf, pdf)
 
     def _own_weight(self, path: ConnectedPath, transmittance: mi.Float) -> mi.Float:
@@ -417,12 +413,15 @@ class PathTracer:
 
     def _redirect(
         self, path: ConnectedPath, rng: mi.PCG32, vertex: Vertex, event: ScatteringEvent, emitter: EmitterDirection
-    ) -> None:
-        """Draw the next direction; at scattering events and rough solids under water, some of them near the emitter."""
+    ) -> mi.Bool:
+        """Draw the next direction; at scattering events and rough solids under water, some of them near the emitter.
+
+        Return whether paths pass a solid unchanged.
+        """
         probability, si = self._guiding_probability(vertex, emitter), vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         submerged = self._submerged(vertex)
-        mixed = vertex.scattered | (submerged & vertex.on_surface & _is_rough(si))
+        mixed = vertex.scattered | (submerged & vertex.on_surface & vertex.is_rough)
         guided = pick < probability
         # The random number is rescaled and reused by the phase function and the BSDF.
         rest = dr.clip((pick - probability) / (1 - probability), 0, 1)
@@ -448,16 +447,18 @@ class PathTracer:
             path.active &= ~(path.before_first_solid & vertex.on_solid & ~passes & submerged & ~specular)
             if not self.scene.has_specular_or_dry_solids:
                 path.active &= ~(path.before_first_solid & vertex.scattered)
-        turned = vertex.on_surface | vertex.scattered
+        turned = (vertex.on_surface | vertex.scattered) & ~passes
         sampler_pdf = self.light.sampler.pdf_in_layer(emitter, direction, path.index_layer)
         ratio = dr.select(submerged & ~specular & (pdf > 0), sampler_pdf / pdf, 0)
-        path.emitter_ratio = dr.select(turned, ratio, path.emitter_ratio)
+        passed = path.emitter_ratio / dr.select(passes, bs.pdf, 1)
+        path.emitter_ratio = dr.select(turned, ratio, passed)
         self._step.perturb(path, vertex, event, direction, passes)
         self._step.redirect(path, vertex, direction, factor, bs, passes)
         path.solid = dr.select(path.before_first_solid, mi.UInt32(0), path.solid)
         path.specular = dr.select(turned, specular, path.specular)
         reflected = vertex.at_sea & ~vertex.in_water & ~path.in_water
         path.reflected_by_sea = dr.select(turned, reflected, path.reflected_by_sea)
+        return passes
 
     def _roulette(self, path: ConnectedPath, rng: mi.PCG32, emitter: EmitterDirection) -> None:
         """End paths that are expected to find little light at random, and compensate in the others."""
@@ -469,11 +470,6 @@ class PathTracer:
         survival = dr.minimum(expected / max(self.options.roulette_threshold, 1e-30), 1)
         path.active &= rng.next_float32() < survival
         path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
-
-
-def _is_rough(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Return whether a surface has no mirror-like part, so that any direction can be drawn and weighted."""
-    return ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
 
 
 def trace_connected(

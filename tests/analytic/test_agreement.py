@@ -72,6 +72,7 @@ MATERIALS = {
     ),
 }
 DRY = {
+    "veil_in_the_air": plate(-0.6, 0.2, 1.2, 0.6, {"type": "mask", "opacity": 0.5, "nested": diffuse(0.2)}),
     "in_the_air": plate(0.5, 0.8, 1.0, 0.5, diffuse(0.3)),
     "through_the_surface": plate(0.5, -0.6, 0.0, 0.7, diffuse(0.3), tilt=80.0),
 }

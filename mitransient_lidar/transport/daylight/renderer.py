@@ -17,6 +17,7 @@ from mitransient_lidar.transport.refracted_connection import (
     EmitterDirection,
     RefractedSunSampler,
     connect_sun,
+    level_transmittance,
 )
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.volpath import (
@@ -24,7 +25,6 @@ from mitransient_lidar.transport.volpath import (
     PathLight,
     PathTracer,
     VolpathOptions,
-    level_transmittance,
 )
 
 #: Number of the random streams within a pass.

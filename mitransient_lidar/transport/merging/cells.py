@@ -137,9 +137,10 @@ class WaterGrid:
     """Layout of cells that follow the sea surface and are arranged about the refracted beam.
 
     Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
-    above a solid ends there. They are sheared along the beam in still water, so that its light stays in one column of
-    cells. Within a layer, light is counted on a common plane, and looked up where the light at a point comes from if it
-    is that of the beam, refracted and spread: narrow beams do not blur, however they are refracted.
+    above a solid ends there, and the first one behind a veil begins there. They are sheared along the beam in still
+    water, so that its light stays in one column of cells. Within a layer, light is counted on a common plane, and
+    looked up where the light at a point comes from if it is that of the beam, refracted and spread: narrow beams do not
+    blur, however they are refracted.
 
     Parameters
     ----------
@@ -301,7 +302,11 @@ class WaterCells:
         line, looks_up = rings.refracted(slope), direction is None
         if not looks_up:
             line = dr.select(unscattered, direction, line)
-        end = dr.maximum(depth + point.z - self.heights.bed_at(point.x, point.y), 0)
+        end, veiled = dr.maximum(depth + point.z - self.heights.bed_at(point.x, point.y), 0), self.heights.has_veils
+        if veiled:
+            veil = dr.maximum(depth + point.z - self.heights.veil_at(point.x, point.y), 0)
+            behind = depth > veil
+            end = dr.select(behind, end, dr.minimum(end, veil))
         # Points above the approximate surface are just below it.
         depth = dr.maximum(depth, 0)
         # The uppermost layer ends here.
@@ -311,7 +316,14 @@ class WaterCells:
         lowest = dr.maximum(dr.floor(grid.layer_at(end) - top - 0.5) + 1, 0)
         is_lowest = (layer >= lowest) & (depth < end + 0.5 * grid.thickness)
         layer = dr.select(is_lowest, lowest, layer)
+        if veiled:
+            # Behind a veil cells begin there: the first one has a larger number than those that end there.
+            highest = dr.maximum(dr.floor(grid.layer_at(veil) - top + 0.5) + 1, 0)
+            is_highest = behind & (layer <= highest)
+            layer = dr.select(is_highest, highest, layer)
         above = dr.select(layer == 0, 0, grid.depth_of(top + (layer - 1)))
+        if veiled:
+            above = dr.select(is_highest, veil, above)
         below = dr.select(is_lowest, end, grid.depth_of(top + layer))
         place = dr.fma(_PLANE_STEP, layer, self._shift.w)
         plane = dr.lerp(above, below, place - dr.floor(place))

@@ -226,17 +226,27 @@ class SurfaceHeights:
         #: Number of successive shots that share a grid.
         self._copies = opaque_index(1)
         self._surface = self._look_down(scene, region, moves, solids=False)
-        self._bed = self._look_down(scene, region.below(scene, depth), moves, solids=True)
+        below = region.below(scene, depth)
+        self._bed = self._look_down(scene, below, moves, solids=True)
+        #: Whether there are heights of veils: solids that let a part of the light pass unchanged.
+        self.has_veils = scene.has_veils
+        self._veil = self._look_down(scene, below, moves, solids=True, veils=True) if self.has_veils else self._bed
 
     def repeated(self, copies: int) -> SurfaceHeights:
         """Return the heights of each shot several times in turn, which share them."""
         heights = copy.copy(self)
         heights._copies = opaque_index(copies)
-        heights._surface, heights._bed = (grid.repeated(copies) for grid in (self._surface, self._bed))
+        grids = (grid.repeated(copies) for grid in (self._surface, self._bed, self._veil))
+        heights._surface, heights._bed, heights._veil = grids
         return heights
 
-    def _look_down(self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool) -> _Grid:
-        """Return heights and slopes of the surface, or heights of solids under water, found with vertical rays."""
+    def _look_down(
+        self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool, veils: bool = False
+    ) -> _Grid:
+        """Return heights and slopes of the surface, or heights of solids under water, found with vertical rays.
+
+        Solids are those that let no light pass unchanged, or the `veils`, which let a part pass.
+        """
         shots = len(moves)
         n = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS
         corner = (moves + np.array(region.low)).astype(np.float32)
@@ -265,8 +275,13 @@ class SurfaceHeights:
             active &= si.is_valid()
             at_sea = scene.is_surface(si.shape)
             wanted = wet & ~at_sea if solids else at_sea
+            passes = mi.Bool(False)
+            if solids and scene.has_veils:
+                share = si.bsdf().eval_null_transmission(si, active & wanted)[0]
+                passes = wanted & (((share == 0) | (share == 1)) if veils else (share > 0))
+                wanted &= ~passes
             found = dr.select(active & wanted, mi.Vector4f(si.p.z, -si.n.x / si.n.z, -si.n.y / si.n.z, 0), found)
-            active &= ~wanted & (at_sea | ~wet)
+            active &= ~wanted & (at_sea | ~wet | passes)
             wet |= active & at_sea
             return dr.select(active, si.spawn_ray(ray.d), ray), found, wet, active
 
@@ -287,7 +302,8 @@ class SurfaceHeights:
         if lanes.shots == 1:
             return self
         heights = copy.copy(self)
-        heights._surface, heights._bed = (grid.of(lanes, self._copies) for grid in (self._surface, self._bed))
+        grids = (grid.of(lanes, self._copies) for grid in (self._surface, self._bed, self._veil))
+        heights._surface, heights._bed, heights._veil = grids
         return heights
 
     def surface_at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Vector2f]:
@@ -300,6 +316,11 @@ class SurfaceHeights:
     def bed_at(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Return the height of the first solid below the surface at (x, y) [m], -1e9 where there is none."""
         height, _, _ = self._bed.at(x, y)
+        return height
+
+    def veil_at(self, x: mi.Float, y: mi.Float) -> mi.Float:
+        """Return the height of the first veil below the surface at (x, y) [m], -1e9 where there is none."""
+        height, _, _ = self._veil.at(x, y)
         return height
 
 
