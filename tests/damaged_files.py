@@ -37,6 +37,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from input_files import KINDS
@@ -69,6 +70,8 @@ _ODD_VALUES: tuple[Any, ...] = (
     *(np.nan, np.inf, -1.0, 0.0, 0, 1e300, -1e-300, 2**62, "", "x", "nan", "{", "[1", '{"a": 1}', "null"),
     *([], [1.0], [1.0, 2.0, 3.0], ["a", "b"], [np.nan, np.nan], "[" * 5000),
 )
+
+_EXTREMES = (-1e6, -1.0, 0.0, 1e-30, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9, 1e30)
 
 
 def damage_bytes(path: Path, rng: random.Random) -> None:
@@ -155,6 +158,23 @@ def damage_attributes(path: Path, rng: random.Random) -> None:
     dataset.to_netcdf(path, engine="h5netcdf")
 
 
+def set_extreme(path: Path, rng: random.Random) -> None:
+    """Set one parameter of a plugin of a scene to an end of its range, or to an extreme."""
+    from mitransient_lidar.core.ranges import limits
+    from mitransient_lidar.loading.plugin_pages import plugin_parameters
+
+    tree = ElementTree.parse(path)
+    parts = [(part, name) for part in tree.iter() for name in plugin_parameters(part.get("type", ""))]
+    part, name = rng.choice(parts)
+    setting = next((one for one in part if one.get("name") == name and one.get("value") is not None), None)
+    if setting is None:
+        setting = ElementTree.SubElement(part, "float", name=name)
+    default = setting.get("value", "").removeprefix("$")
+    setting = next((one for one in tree.iter("default") if one.get("name") == default), setting)
+    setting.set("value", f"{rng.choice((*_EXTREMES, *(limits(name) or ()))):.15g}")
+    tree.write(path)
+
+
 def _one_of(folder: Path, rng: random.Random) -> Path:
     """Return a file of a folder."""
     return rng.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
@@ -210,7 +230,7 @@ def _refer(path: Path, other: Path, rng: random.Random) -> None:
                 file.create_virtual_dataset(name, layout)
 
 
-DAMAGE = {"bytes": damage_bytes, "text": damage_text, "attributes": damage_attributes}
+DAMAGE = {"bytes": damage_bytes, "text": damage_text, "attributes": damage_attributes, "extremes": set_extreme}
 
 
 def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tuple[int, str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from array_inputs import height_map, image, load_map, mesh, read_image
 class Kind(NamedTuple):
     """A kind of file: what writes a good one into a folder, what a user does with it, and how it is damaged.
 
-    `format` is ``bytes``, ``text`` or ``attributes`` (of a NetCDF file).
+    `format` is ``bytes``, ``text``, ``attributes`` (of a NetCDF file) or ``extremes`` (of parameters of a scene).
     """
 
     make: Callable[[Path], Path]
@@ -122,6 +123,28 @@ def load(path: Path) -> None:
 
     session = open_scene(path, None)
     find_lidar_scene(session.scene, session.sensor)
+
+
+def small_scene(folder: Path) -> Path:
+    """Write the default scene, with few paths a pass."""
+    from mitransient_lidar.loading.catalogue import copy_scene
+
+    path = copy_scene("table1", folder / "scene.xml")
+    counts = "".join(f'<integer name="{one}_per_pass" value="8192"/>' for one in ("paths", "photons"))
+    whole, text = '<integrator type="lidar_merging"/>', path.read_text()
+    assert whole in text
+    path.write_text(text.replace(whole, f"{whole[:-2]}>{counts}</integrator>"))
+    return path
+
+
+def render_small(path: Path) -> None:
+    """Render a scene within 3 GB, half of which large arrays may take, and check that its light is finite."""
+    import mitransient_lidar
+
+    resource.setrlimit(resource.RLIMIT_DATA, (3 * 10**9, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    result = mitransient_lidar.render(path, passes=2)
+    for name, array in result.data_vars.items():
+        assert np.isfinite(array.values).all(), f"{name} is not finite"
 
 
 def scene_parts(folder: Path) -> Path:
@@ -383,6 +406,7 @@ _PHASE = "angle (deg),phase function\n" + "".join(f"{i},{1 / (1 + i):.6f}\n" for
 KINDS = {
     "scene": Kind(scene, load, "text"),
     "scene_parts": Kind(scene_parts, lambda path: load(path / "scene.xml"), "text"),
+    "parameters": Kind(small_scene, render_small, "extremes"),
     "mesh.ply": Kind(mesh("a.ply"), load_part("ply", filename="FILE"), "text"),
     "mesh_binary.ply": Kind(mesh("a_binary.ply"), load_part("ply", filename="FILE")),
     "mesh.obj": Kind(mesh("a.obj"), load_part("obj", filename="FILE"), "text"),

@@ -32,8 +32,8 @@ KNOWN, FAINT = 0.05, 1e-3
 FINDING = 4.0, 0.02
 
 
-def draw(number):
-    """Return name and parameters of a scene."""
+def draw(number, narrow=False):
+    """Return name and parameters of a scene, with a view of 0.001 to 1 mrad if it is to be narrow."""
     rng = np.random.default_rng(number)
 
     def between(low, high, digits=4):
@@ -46,11 +46,13 @@ def draw(number):
     divergence = between(0.1, 20.0)
     view = min(divergence * between(1.0, 30.0), 100.0)
     waves = rng.random() < 0.7
+    if narrow:
+        view = between(0.001, 1.0)
     params = {
         "altitude": between(10.0, 1000.0),
         "off_nadir_deg": round(rng.uniform(0, 60), 1),
         "divergence_mrad": divergence,
-        "field_of_view_mrad": round(view, 4),
+        "field_of_view_mrad": round(view, 7),
         "layout": str(rng.choice(["1x1", "2x2", "1x4"])),
         "spectrum": "elfouhaily" if waves else "flat",
         "wind_speed": round(rng.uniform(2, 10), 1),
@@ -147,11 +149,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10, help="number of scenes")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")
+    parser.add_argument("--narrow", action="store_true", help="take views of 0.001 to 1 mrad")
     parser.add_argument("--no-shrink", action="store_true", help="leave findings as they are")
     options = parser.parse_args()
     scores, compared, found = [], 0, 0
     for number in range(options.first, options.first + options.count):
-        name, params = draw(number)
+        name, params = draw(number, options.narrow)
         try:
             rows = compare(name, params)
         except UserError as error:
