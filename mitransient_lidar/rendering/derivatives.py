@@ -196,6 +196,8 @@ def _uniform_reflectance(solid: mi.Shape) -> float | None:
 
     from mitransient_lidar.transport.plugin_types import SeabedShape
 
+    if solid.class_name() == "Instance":
+        return None
     kept = mi.traverse(solid.bsdf())
     if isinstance(solid, SeabedShape) and "reflectance.scale" in kept:
         return solid.uniform_reflectance

@@ -22,7 +22,7 @@ from mitransient_lidar.transport.opaque import aligned, is_one_of
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.solids import met_shape
+from mitransient_lidar.transport.solids import box_rays, met_shape, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
@@ -38,6 +38,9 @@ _MOST_SAMPLES = 1000
 
 #: Rays along each side of the view that tell which targets are near it.
 _VIEW_TICKS = 9
+
+#: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
+_SAMPLED, _TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
 
 #: Most shapes that the receiver's axis passes on its way to the bottom.
 _MOST_HITS = 64
@@ -235,7 +238,7 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), pos
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
     """Return name, heights and outlines of a target."""
-    sea, points, at = scene.level_sea, _surface_points(target), scene.frame_origin[:2]
+    sea, points, at = scene.level_sea, _surface_points(scene, target), scene.frame_origin[:2]
     seen = sea.crossing(scene.receiver.pose.origin, points)
     found = {
         "id": target.id(),
@@ -251,12 +254,19 @@ def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | N
     return found
 
 
-def _surface_points(solid: mi.Shape) -> FloatArray:
+def _surface_points(scene: LidarScene, solid: mi.Shape) -> FloatArray:
     """Return the corners of a mesh, or points all over another shape [m], shape (n, 3)."""
     known = mi.traverse(solid)
     if "vertex_positions" in known:
         return np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    ticks = np.linspace(0, 1, 65)
+    if solid.class_name() not in _SAMPLED:
+        box = solid.bbox()
+        origins, directions = box_rays(np.array(box.min), np.array(box.max), _TICKS)
+        ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
+        hit = scene_of_shapes([solid], scene.groups).ray_intersect(ray)
+        points: FloatArray = np.array(hit.p, dtype=np.float64).T[np.array(hit.is_valid())]
+        return points
+    ticks = np.linspace(0, 1, _TICKS + 1)
     u, v = (mi.Float(g.ravel()) for g in np.meshgrid(ticks, ticks))
     return np.array(solid.sample_position(0.0, mi.Point2f(u, v)).p, dtype=np.float64).T
 

@@ -330,25 +330,37 @@ def _warn_of_place(solid: mi.Shape, view: _Rays, beam: _Rays) -> None:
 
 
 def _warn_of_inside_out(solid: mi.Shape) -> None:
-    """Warn of a closed mesh that reflects on one side only, the inside."""
-    if not isinstance(solid, mi.Mesh) or int(solid.bsdf().flags()) & mi.BSDFFlags.BackSide.value:
+    """Warn of a sphere or a closed mesh that reflects on one side only, the inside."""
+    if int(solid.bsdf().flags()) & mi.BSDFFlags.BackSide.value or not _is_inside_out(solid):
         return
+    logger.warning(
+        "the faces of shape %r point inwards and its BSDF reflects on their front alone: it returns no light; turn the "
+        "faces, set flip_normals the other way, or nest the BSDF in a twosided",
+        solid.id(),
+    )
+
+
+def _is_inside_out(solid: mi.Shape) -> bool:
+    """Return whether the normals of a sphere or of a closed mesh point inwards."""
+    if solid.class_name() == "Sphere":
+        return bool(solid.has_flipped_normals())
+    if not isinstance(solid, mi.Mesh):
+        return False
     buffers = mi.traverse(solid)
     if "vertex_positions" not in buffers:
-        return
+        return False
     vertices, faces = (np.array(buffers[name]).reshape(-1, 3) for name in ("vertex_positions", "faces"))
     corners = (vertices[faces] - vertices.mean(axis=0)).astype(np.float64)
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # The areas of a closed surface cancel.
     if np.linalg.norm(areas.sum(axis=0)) > _CLOSED * np.linalg.norm(areas, axis=1).sum():
-        return
+        return False
     volume = float(np.einsum("ij,ij->", corners[:, 0], areas))
-    if (volume < 0) != solid.has_flipped_normals():
-        logger.warning(
-            "the faces of shape %r point inwards and its BSDF reflects on their front alone: it returns no light; turn "
-            "the faces, set flip_normals, or nest the BSDF in a twosided",
-            solid.id(),
-        )
+    if solid.has_vertex_normals() and not solid.has_face_normals():
+        # BSDFs are in the frame of these.
+        normals = np.array(buffers["vertex_normals"]).reshape(-1, 3)[faces[:, 0]]
+        volume *= float(np.einsum("ij,ij->", normals, areas))
+    return bool((volume < 0) != solid.has_flipped_normals())
 
 
 def _warn_of_time(scene: LidarScene, probe: EchoProbe, echo: SolidEcho) -> None:

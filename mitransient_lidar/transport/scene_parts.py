@@ -177,7 +177,7 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     Raises
     ------
     UserError
-        As `find_water`, `shape_groups` and `separate_contacts`.
+        As `find_water`, `shape_groups` and `separate_contacts`, and for mirrored spheres.
     """
     # Mitsuba's own loader joins meshes of equal BSDFs, without a bounding box.
     joined = [shape for shape in scene.shapes() if not shape.bbox().valid()]
@@ -188,6 +188,8 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     groups = shape_groups(scene)
     seen = without_unseen(scene, groups)
     found = WaterScene(seen, receiver, *find_water(seen), groups=groups)
+    for solid in found.solids:
+        _check_mirrored(solid)
     moved = separate_contacts(found)
     if not moved:
         return found
@@ -196,6 +198,18 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
         shape.parameters_changed([])
     scene.parameters_changed([])
     return replace(found, mitsuba_scene=without_unseen(scene, groups))
+
+
+def _check_mirrored(solid: mi.Shape) -> None:
+    """Refuse spheres that a mirror turns inside out, so that they reflect inside alone."""
+    if solid.class_name() != "Sphere" or int(solid.bsdf().flags()) & mi.BSDFFlags.BackSide.value:
+        return
+    matrix = np.array(mi.traverse(solid)["to_world"].matrix, np.float64).reshape(4, 4)
+    if solid.has_flipped_normals() and np.linalg.det(matrix[:3, :3]) < 0:
+        raise UserError(
+            f"to_world of sphere {solid.id()!r} mirrors it, which turns it inside out: it returns no light; leave the "
+            "negative scale out, or set flip_normals"
+        )
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:

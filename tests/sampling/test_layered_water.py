@@ -131,7 +131,7 @@ def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes, hom
         # Part of the blend.
         pytest.param({"type": "rayleigh"}, marks=pytest.mark.long),
         pytest.param(BLEND, marks=pytest.mark.slow),
-        pytest.param({"type": "isotropic"}, marks=pytest.mark.long),
+        pytest.param({"type": "isotropic"}, marks=pytest.mark.slow),
         pytest.param({"type": "two_term_henyey_greenstein"}, marks=pytest.mark.slow),
     ],
 )

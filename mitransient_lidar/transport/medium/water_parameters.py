@@ -19,7 +19,7 @@ from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.medium.water_phases import PHASE_FUNCTIONS, LayerPhases, ScattererPhases
+from mitransient_lidar.transport.medium.water_phases import PHASE_FUNCTIONS, LayerPhases, ScattererPhases, check_phases
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Attenuation, scattering and backscattering [1/m] unless they are given.
@@ -56,6 +56,7 @@ def read_water(
     UserError
         When a value is not allowed, or two parameters describe the same.
     """
+    check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
     kind = props.get("phase_function", "fournier_forand")
     column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
     indices = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Protocol, runtime_checkable
@@ -160,6 +160,16 @@ class LayerPhases:
         return table_of(alone.functions()[0])
 
 
+def check_phases(phases: Mapping[str, mi.PhaseFunction]) -> None:
+    """Raise `UserError` if a phase function depends on more than the scattering angle."""
+    for name, phase in phases.items():
+        if int(phase.flags()) & mi.PhaseFunctionFlags.Microflake.value:
+            raise UserError(
+                f"layered_water: its phase function {name!r}, {phase.class_name()}, depends on the orientation of "
+                "particles; allowed are those that depend on the scattering angle alone, such as hg or tabphase"
+            )
+
+
 def _fournier_forand(
     column: WaterColumn, water_scattering: np.ndarray, share: np.ndarray
 ) -> tuple[list[mi.PhaseFunction], np.ndarray]:
@@ -214,4 +224,5 @@ def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
     mei = dr.zeros(mi.MediumInteraction3f, len(s))
     mei.wi = mi.Vector3f(0, 0, -1)
     value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, deflect(mi.Frame3f(-mei.wi), mi.Float(s), mi.Float(0)))
-    return PowerLawTable.from_values(np.array(value[0], dtype=np.float64))
+    # The value of an isotropic function is one number.
+    return PowerLawTable.from_values(np.broadcast_to(np.array(value[0], dtype=np.float64), s.shape))

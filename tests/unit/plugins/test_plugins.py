@@ -17,6 +17,8 @@ from mitransient_lidar.transport.scene_parts import find_lidar_scene
 SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0, 0, 1]])
 CIRCLE = {"type": "pixel_fov", "field_of_view_mrad": 10.0}
 
+#: Particles with an orientation.
+FLAKES = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2, 6), np.float32))}}
 REFUSED = [
     ({"type": "lidar_transmitter", "altitude": -0.05}, "altitude = -0.05 must lie between 0.1 and 1e+06, or -1000 and"),
     ({"type": "lidar_transmitter", "altitude": -1.0, "off_nadir_deg": 181.0}, "must lie between 0 and 180"),
@@ -160,6 +162,10 @@ REFUSED = [
     ({"type": "layered_water", "phase_g": 1.0}, "phase_g = 1 must lie between"),
     ({"type": "layered_water", "refractive_index": 0.9}, "refractive_index = 0.9"),
     ({"type": "layered_water", "a": {"type": "petzold"}, "b": {"type": "petzold"}}, "nested phase functions"),
+    (
+        {"type": "layered_water", "flakes": FLAKES},
+        "its phase function 'flakes', SGGXPhaseFunction, depends on the orientation",
+    ),
     ({"type": "fournier_forand", "backscatter_ratio": 0.6}, "backscatter_ratio = 0.6 must lie between"),
     ({"type": "fournier_forand", "junge_slope": 3.5}, "both refractive_index and junge_slope"),
     ({"type": "two_term_henyey_greenstein", "weight": 1.5}, "weight = 1.5 must lie between 0 and 1"),

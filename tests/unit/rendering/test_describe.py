@@ -68,18 +68,29 @@ def test_beam_outlines_are_where_the_irradiance_says(lidar_scene):
     np.testing.assert_allclose(np.hypot(*np.reshape(edge["lines"][0], (-1, 2)).T), 5, rtol=1e-3)
 
 
-def test_targets_are_described_and_bottoms_are_not(lidar_scene):
+def test_targets_are_described_and_bottoms_are_not(lidar_scene, tmp_path):
     turn = mi.ScalarTransform4f().translate([0.5, 1, -5]).rotate([0, 0, 1], 45).scale(float(np.sqrt(0.5)))
     extra = {
         "ball": {"type": "sphere", "center": [-1, 2, -6], "radius": 0.5},
         "plate": {"type": "rectangle", "to_world": turn},
         "box": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([1, -1, -7]).scale([0.5, 1, 0.25])},
         "far_away": {"type": "sphere", "center": [50, 0, -6]},
+        "group": {"type": "shapegroup", "ball": {"type": "sphere"}},
+        "copy": {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": mi.ScalarTransform4f().translate([1, 2, -4]).scale(0.25),
+        },
+        "stalk": {"type": "linearcurve", "filename": str(tmp_path / "stalk.txt")},
     }
+    (tmp_path / "stalk.txt").write_text("0 -1 -3 0.1\n1 -1 -3 0.1\n")
     targets = json.loads(described(lidar_scene(extra=extra))["target_outlines"])
     by_depth = {round(target["z"][1], 2): np.reshape(target["line"], (-1, 2)) for target in targets}
-    assert sorted(by_depth) == [-6.75, -5.5, -5.0]
+    assert sorted(by_depth) == [-6.75, -5.5, -5.0, -3.75, -2.9]
     np.testing.assert_allclose(np.hypot(*(by_depth[-5.5] - [-1, 2]).T), 0.5, rtol=5e-3)
+    np.testing.assert_allclose(np.hypot(*(by_depth[-3.75] - [1, 2]).T), 0.25, rtol=5e-3)
+    ends = by_depth[-2.9].min(axis=0), by_depth[-2.9].max(axis=0)
+    np.testing.assert_allclose(ends, [[-0.1, -1.1], [1.1, -0.9]], atol=0.02)
     corners = {tuple(np.round(point, 2)) for point in by_depth[-5.0]}
     assert corners == {(1.5, 1.0), (-0.5, 1.0), (0.5, 2.0), (0.5, 0.0)}
     np.testing.assert_allclose([by_depth[-6.75].min(axis=0), by_depth[-6.75].max(axis=0)], [[0.5, -2], [1.5, 0]])

@@ -245,6 +245,24 @@ def test_closed_mesh_with_faces_inwards_is_told(lidar_scene, caplog, tmp_path, i
     assert check(lidar_scene(extra={"box": {**box, "bsdf": twosided}}), caplog) == []
 
 
+@pytest.mark.parametrize(
+    ("mirror", "flips", "outcome"), [(-1, False, UserError), (-1, True, 0), (1, True, 1), (1, False, 0)]
+)
+def test_sphere_inside_out_is_refused_or_told(lidar_scene, caplog, mirror, flips, outcome):
+    place = TO_WORLD.translate([on_axis(-5.0), 0, -5]).scale([mirror * 0.5, 0.5, 0.5])
+    scene = lidar_scene(extra={"ball": {"type": "sphere", "to_world": place, "flip_normals": flips}})
+    if outcome is UserError:
+        with pytest.raises(UserError, match="to_world of sphere 'ball' mirrors it"):
+            check(scene, caplog)
+        return
+    assert ["faces of shape 'ball' point inwards" in one for one in check(scene, caplog)] == [True] * outcome
+
+
+def test_mirrored_mesh_with_its_own_normals_is_not_told(lidar_scene, caplog):
+    place = TO_WORLD.translate([on_axis(-5.0), 0, -5]).scale([-0.5, 0.5, 0.5])
+    assert check(lidar_scene(extra={"box": {"type": "cube", "to_world": place}}), caplog) == []
+
+
 @pytest.mark.parametrize(("water", "laser", "fits"), [(532, 515, False), (515, 515, True), (532, 532.1, True)])
 def test_water_by_name_has_the_wavelength_of_the_laser(lidar_scene, water, laser, fits):
     of_water = {"chlorophyll": 0.5, "wavelength_nm": water}

@@ -61,6 +61,31 @@ def test_panes_that_reflect_nothing_change_no_light(lidar_scene, passes, integra
     significance.assert_same(veiled, plain, error=0.01, known=0.1)
 
 
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])
+def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
+    """Of two shapes of other BSDFs; the same random numbers."""
+    bright = {"type": "diffuse", "reflectance": 0.8}
+    parts = {"ball": {"type": "sphere", "radius": 0.5}, "top": {"type": "disk", "bsdf": bright}}
+    move = mi.ScalarTransform4f().translate([0.2, 0.1, -5])
+    parts["top"]["to_world"] = mi.ScalarTransform4f().translate([0, 0, 0.6]).scale(0.3)
+    alone = {
+        name: {**part, "to_world": move @ part.get("to_world", mi.ScalarTransform4f())} for name, part in parts.items()
+    }
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": move}
+    instanced = {"group": {"type": "shapegroup", **parts}, "reef": instance}
+    energies = []
+    for extra in (alone, instanced):
+        scene = lidar_scene(integrator={"type": integrator, "paths_per_pass": 2**12}, extra=extra)
+        renderer = scene.integrator().prepare(scene, scene.sensors()[0]).by_origin()
+        energy = renderer.render_pass(0).histogram.energy().reshape(-1, renderer.classes.count, 160).sum(axis=(0, 2))
+        energies.append(dict(zip(renderer.classes.names, energy, strict=True)))
+    shapes, copy = energies
+    shapes["reef"] = shapes.pop("ball") + shapes.pop("top")
+    assert shapes.keys() == copy.keys()
+    for name, energy in shapes.items():
+        assert copy[name] == pytest.approx(energy, rel=0.01), name
+
+
 def test_rays_meet_every_side_of_a_box():
     origins, directions = box_rays(np.array([0, 0, -1.0]), np.array([1.0, 2, 0]), 4)
     assert len(origins) == 6 * 4**2
