@@ -10,11 +10,14 @@ import base64
 import os
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitransient_lidar.loading.checks import is_transform, matrix_of
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Largest image, volume or tensor that is stored, compressed and in memory [bytes].
 _MOST_STORED, _MOST_IN_MEMORY = 2**20, 2**26
@@ -63,25 +66,29 @@ def from_json(value: Any) -> Any:
 
 
 def _stored(value: Any) -> dict[str, Any]:
-    """Return an image, a volume or a tensor; raise TypeError if it is too large to be stored."""
+    """Return an image, a volume or a tensor; raise TypeError if it is too large to be stored, or is not restored."""
     import mitsuba as mi
 
-    described: dict[str, Any] = {"stored": type(value).__name__}
-    if isinstance(value, mi.VolumeGrid):
-        stream = mi.MemoryStream()
-        value.write(stream)
-        raw = bytes(stream.raw_buffer())
-    else:
-        array = np.array(value)
-        raw = array.tobytes()
-        described |= {"shape": array.shape, "dtype": array.dtype.str}
+    array = np.array(value)
+    data = zlib.compress(array.tobytes())
+    if array.nbytes > _MOST_IN_MEMORY or len(data) > _MOST_STORED:
+        raise TypeError(f"{type(value).__name__} of {array.nbytes} bytes is too large to be stored")
+    described: dict[str, Any] = {"stored": type(value).__name__, "shape": array.shape, "dtype": array.dtype.str}
     if isinstance(value, mi.Bitmap):
         described |= {"pixel_format": value.pixel_format().name, "srgb_gamma": value.srgb_gamma()}
         described |= {"premultiplied_alpha": value.premultiplied_alpha()}
-    data = zlib.compress(raw)
-    if len(raw) > _MOST_IN_MEMORY or len(data) > _MOST_STORED:
-        raise TypeError(f"{described['stored']} of {len(raw)} bytes is too large to be stored")
+    elif isinstance(value, mi.VolumeGrid) and _file_of(value) != _file_of(mi.VolumeGrid(array)):
+        raise TypeError("a VolumeGrid with a box of its own cannot be stored")
     return {**described, "data": base64.b64encode(data).decode("ascii")}
+
+
+def _file_of(volume: mi.VolumeGrid) -> bytes:
+    """Return the bytes of the file of a volume."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    volume.write(stream)
+    return bytes(stream.raw_buffer())
 
 
 def _restored(value: Mapping[str, Any]) -> Any:
@@ -89,12 +96,9 @@ def _restored(value: Mapping[str, Any]) -> Any:
     import mitsuba as mi
 
     raw = zlib.decompressobj().decompress(base64.b64decode(value["data"], validate=True), _MOST_IN_MEMORY)
-    if value["stored"] == "VolumeGrid":
-        stream = mi.MemoryStream()
-        stream.write(raw)
-        stream.seek(0)
-        return mi.VolumeGrid(stream)
     array = np.frombuffer(raw, value["dtype"]).reshape(value["shape"])
+    if value["stored"] == "VolumeGrid":
+        return mi.VolumeGrid(array)
     if value["stored"] == "TensorXf":
         return mi.TensorXf(array)
     bitmap = mi.Bitmap(array.copy(), getattr(mi.Bitmap.PixelFormat, value["pixel_format"]))
