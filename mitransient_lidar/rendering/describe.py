@@ -18,11 +18,11 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
-from mitransient_lidar.transport.opaque import aligned, is_one_of
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.solids import box_rays, met_shape, scene_of_shapes
+from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
@@ -41,9 +41,6 @@ _VIEW_TICKS = 9
 
 #: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
 _SAMPLED, _TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
-
-#: Most shapes that the receiver's axis passes on its way to the bottom.
-_MOST_HITS = 64
 
 
 def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
@@ -217,22 +214,16 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), pos
         origins,
         *(np.column_stack([sea.at_height(origins, directions, z), np.full(len(origins), z)]) for z in heights),
     ]
-    active = aligned(mi.Bool, np.ones(len(origins), dtype=bool))
+    active, shapes = aligned(mi.Bool, np.ones(len(origins), dtype=bool)), scene_of_shapes(bottoms, scene.groups)
     for start, end in itertools.pairwise(corners):
         origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
         ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
-        length, on_leg = dr.norm(leg), mi.Bool(active)
-        for _ in range(_MOST_HITS):
-            hit = scene.ray_intersect(ray, on_leg)
-            on_leg &= hit.is_valid() & (dr.norm(hit.p - mi.Point3f(origin)) <= length)
-            ends = on_leg & is_one_of(met_shape(hit), bottoms)
-            dr.eval(hit, ends)
-            at_end = np.array(ends)
-            found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
-            active, on_leg = active & ~ends, on_leg & ~ends
-            if not dr.any(on_leg):
-                break
-            ray = hit.spawn_ray(ray.d)
+        ray.maxt = dr.norm(leg)
+        hit = shapes.ray_intersect(ray, active)
+        ends = active & hit.is_valid()
+        at_end = np.array(ends)
+        found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
+        active &= ~ends
     return found + at
 
 

@@ -62,10 +62,11 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
     moved: dict[int, mi.Shape] = {}
     for _ in range(_MOST_IN_A_STACK):
         found = [contact for larger, others in pending for contact in _contacts(larger, others, scene.groups)]
-        if not found:
+        separations = [_separation(contact, scene) for contact in found]
+        if not any(separations):
+            _refuse_visible(found, shapes, scene.groups)
             return list(moved.values())
-        for contact in found:
-            moving, direction = _separation(contact, scene)
+        for moving, direction in filter(None, separations):
             _move(moving, direction)
             moved[id(moving)] = moving
         pending = [
@@ -125,8 +126,8 @@ def _contacts(larger: mi.Shape, others: list[mi.Shape], groups: Sequence[mi.Shap
     return found
 
 
-def _separation(contact: _Contact, scene: WaterScene) -> tuple[mi.Shape, FloatArray]:
-    """Return the shape of a contact that is moved, and in which unit direction."""
+def _separation(contact: _Contact, scene: WaterScene) -> tuple[mi.Shape, FloatArray] | None:
+    """Return the shape of a contact that is moved, and in which unit direction; None where it is not defined."""
     pair = contact.shape, contact.larger
     if any(one is surface for one in pair for surface in scene.surfaces):
         raise _refusal(contact, "one of them is the surface of the water")
@@ -138,9 +139,17 @@ def _separation(contact: _Contact, scene: WaterScene) -> tuple[mi.Shape, FloatAr
         # Bodies leave each other, single faces pass each other; what goes up stays off all that lies below.
         direction = contact.normal_of_larger if _has_body(contact, scene.groups) else contact.normal
         return pair[int(direction[2] < -_LEVEL)], np.copysign(1.0, direction[2] + _LEVEL) * direction
-    if _lies_within(contact):
-        return contact.shape, contact.normal_of_larger
-    raise _refusal(contact, "it is not defined which one is seen")
+    return (contact.shape, contact.normal_of_larger) if _lies_within(contact) else None
+
+
+def _refuse_visible(contacts: Sequence[_Contact], shapes: Sequence[mi.Shape], groups: Sequence[mi.Shape]) -> None:
+    """Refuse contacts that nothing covers."""
+    for contact in contacts:
+        start = contact.point + 2 * _tolerance(np.abs(contact.point).max()) * contact.normal
+        ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(contact.normal))
+        ray.maxt = 4 * _step(contact.point)
+        if not scene_of_shapes(shapes, groups).ray_test(ray)[0]:
+            raise _refusal(contact, "it is not defined which one is seen")
 
 
 def _has_body(contact: _Contact, groups: Sequence[mi.Shape]) -> bool:
@@ -165,9 +174,8 @@ def _lies_within(contact: _Contact) -> bool:
 
 def _move(shape: mi.Shape, direction: FloatArray) -> None:
     """Move a shape off another one."""
-    box, values = shape.bbox(), mi.traverse(shape)
-    coordinate = np.abs([np.array(box.min), np.array(box.max)]).max()
-    by = (_APART + 2 * _ROUNDING * coordinate) * direction
+    values = mi.traverse(shape)
+    by = _step(np.array([shape.bbox().min, shape.bbox().max])) * direction
     if "to_world" in values:
         values["to_world"] = type(values["to_world"])().translate(by.tolist()) @ values["to_world"]
     elif "vertex_positions" in values:
@@ -176,6 +184,11 @@ def _move(shape: mi.Shape, direction: FloatArray) -> None:
     elif "control_points" in values:
         values["control_points"] += mi.Float(np.tile([*by, 0.0], dr.width(values["control_points"]) // 4))
     values.update()
+
+
+def _step(coordinates: FloatArray) -> float:
+    """Return the distance by which a shape of coordinates is moved [m]."""
+    return float(_APART + 2 * _ROUNDING * np.abs(coordinates).max())
 
 
 def _tolerance(coordinate: FloatArray | mi.Float) -> FloatArray | mi.Float:

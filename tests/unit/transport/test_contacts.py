@@ -53,6 +53,10 @@ CASES = {
         {"a": solid("rectangle", 0.5, 0, 0, -4), "b": solid("rectangle", 0.5, 0, 0, -4, turn=180.0)},
         {"a": (0, 0, 1)},
     ),
+    "one in the other, both on the bottom": (
+        {"a": solid("cube", 0.5, 0, 0, BOTTOM + 0.5), "b": solid("cube", 0.4, 0.2, 0, BOTTOM + 0.4)},
+        {"a": (0, 0, 1), "b": (0, 0, 1)},
+    ),
     "apart": ({"a": solid("rectangle", 0.4, 0, 0, BOTTOM + 1e-4), "b": solid("sphere", 1.0, 0, 3, BOTTOM + 1)}, {}),
 }
 
