@@ -49,7 +49,7 @@ def test_plane(along, across, wind):
 
 
 def test_lidars_just_above_waves_are_refused():
-    """The places at which waves may reflect the light of a beam of millimetres took tens of gigabytes."""
+    """The places at which waves may reflect the light of a narrow beam are millions for each shot."""
     with pytest.raises(UserError, match=r"altitude = 0.1: the light of a shot meets these waves at up to \d+ places"):
         sea_shots(lidar([SQUARE], height=0.1), 3.0, 0.0)
 
