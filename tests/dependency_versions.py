@@ -10,9 +10,12 @@ that they accept. Other options go to pytest. The last line states the versions;
 import argparse
 import json
 import re
+import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 from pathlib import Path
 
@@ -24,6 +27,10 @@ ROOT = Path(__file__).parents[1]
 
 #: Extras that quick tests need, or try where they are installed.
 EXTRAS = ("movie", "test")
+
+
+#: Beginning of the names of environments, and the age from which one is that of a killed run [s].
+PREFIX, FORGOTTEN_S = "dependency-versions-", 24 * 3600.0
 
 
 def requirements(*extras):
@@ -70,7 +77,11 @@ def main():
     parser.add_argument("which", choices=("lowest", "newest"))
     parser.add_argument("--python", default=sys.executable, help="Python of the environment")
     given, options = parser.parse_known_args()
-    with tempfile.TemporaryDirectory(prefix="dependency-versions-") as folder:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    for former in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        if time.time() - former.stat().st_mtime > FORGOTTEN_S:
+            shutil.rmtree(former, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
         python, versions = make_environment(Path(folder), given.python, given.which)
         about = subprocess.run([python, "-V"], stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
         tests = subprocess.run([python, "-m", "pytest", "-q", *options], cwd=ROOT, check=False)

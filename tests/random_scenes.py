@@ -26,8 +26,8 @@ SAMPLES = {"lidar_merging": (16, 2**15), "lidar_volpath": (32, 2**16)}
 CONFIRMING, CONFIRMING_SEED = 4, 1000
 #: Gates of each origin: parts of its light of the reference.
 GATES = 8
-#: Largest relative standard error of a comparison, and least share of the light of a pixel's scene.
-KNOWN, FAINT = 0.05, 1e-3
+#: Least and largest relative standard error of a comparison, beyond rounding, and least share of the light of a scene.
+EXACT, KNOWN, FAINT = 1e-4, 0.05, 1e-3
 #: Standard errors and relative difference of a finding.
 FINDING = 4.0, 0.02
 
@@ -109,7 +109,7 @@ def compare(name, params, confirming=False):
         for gate, (first, end) in enumerate([*pairwise(edges), (0, len(light))]):
             a, b = (samples[:, number, first:end].sum(axis=1) for samples in (merged, reference))
             ea, eb = (samples.std(ddof=1) / len(samples) ** 0.5 for samples in (a, b))
-            if not (b.mean() > 0 and np.hypot(ea, eb) < KNOWN * b.mean() and min(ea, eb) > 0):
+            if not (b.mean() > 0 and EXACT < np.hypot(ea, eb) / b.mean() < KNOWN and min(ea, eb) > 0):
                 continue
             # Welch (1947), as a standard normal number.
             freedom = (ea**2 + eb**2) ** 2 / (ea**4 / (len(a) - 1) + eb**4 / (len(b) - 1))

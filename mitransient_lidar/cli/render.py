@@ -85,12 +85,17 @@ def render(
 
 
 def _write(dataset: xr.Dataset, target: Path) -> None:
-    """Write a result or a figure of it, except the layout of pixels that do not see the sea."""
+    """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
     if target.suffix == ".exr":
-        results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
+        try:
+            results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
+        except WriteError:
+            raise
+        except UserError as error:
+            typer.echo(f"no EXR file: {error}", err=True)
     elif target.suffix == ".nc":
         (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
     elif target.stem.endswith("_components"):

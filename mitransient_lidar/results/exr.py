@@ -27,6 +27,7 @@ import OpenEXR
 from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result
 from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import require_memory
 
 _EXACT = "mitransientLidar"
 _CHECKSUM = "mitransientLidarSha256"
@@ -34,6 +35,7 @@ _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
 _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
 #: Channels of a part: OpenImageIO reads no more, and OpenEXR takes a time that grows with their square.
 _MOST_CHANNELS = 1024
+_BYTES_PER_CHANNEL = 2500  #: Memory of a channel besides its values.
 _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
@@ -70,6 +72,8 @@ def write(
 
     Raises
     ------
+    UserError
+        If so many channels do not fit into the memory.
     OSError
         If the file cannot be written.
     """
@@ -82,6 +86,8 @@ def write(
             for index, image in enumerate(images):
                 channels[f"{stack}{index:0{digits}d}.{component}"] = image
     names = sorted(channels)
+    advice = "take fewer or wider bins, or a .nc file"
+    require_memory(f"{len(names)} channels of an EXR file", _BYTES_PER_CHANNEL * len(names), advice)
     several = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
     shared = header(readable, exact)
     parts = [

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, increasing_array, positive
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
 
@@ -14,6 +15,7 @@ from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
 _CLEARANCE = 8.0
 
 _NODES_AT_ONCE = 1024  # limits each matrix of 4000 grid lines to 64 MB
+_MOST_NODES = 2**17  # take a minute
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -58,8 +60,8 @@ def kelvin_wake(
     Raises
     ------
     UserError
-        If a size or the speed is not positive, a number not finite, or the grid lines are fewer than 2 or not
-        increasing.
+        If a size or the speed is not positive, a number not finite, the grid lines are fewer than 2 or not increasing,
+        or the ship is too far away for its shortest waves on the grid.
 
     Notes
     -----
@@ -143,6 +145,11 @@ def _plane_waves(
 
     step = 2 * np.pi / period
     count = int(np.sqrt(upper * (upper - k0)) / step)
+    if count > _MOST_NODES:
+        raise UserError(
+            f"wake_x, wake_y: the wake spreads over {period:.3g} m before this sea, too far for waves of "
+            f"{2 * np.pi / upper:.2g} m"
+        )
     ky = step * np.arange(-count, count + 1, dtype=np.float64)
     k = (k0 + np.sqrt(k0**2 + 4 * ky**2)) / 2
     kx = np.sqrt(k0 * k)

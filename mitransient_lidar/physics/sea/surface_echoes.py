@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.refraction import fresnel
@@ -28,7 +29,8 @@ _CELLS = 512  # per side of a realisation
 _CELLS_PER_SPREAD, _LARGEST_CELL = 4.0, 0.5  # resolution, as of `sea_surface` [1, m]
 _POINTS = 2  # of light per side of a cell
 _BEAM_EDGE = 3.5  # radius of the beam in standard deviations
-_CHUNK = 32  # shots in memory at a time
+_CHUNK, _CHUNK_POINTS = 32, 2**22  # shots, and points of light, in memory at a time
+_MOST_POINTS = 2**20  # of light of a shot, which take three minutes
 _SMALLEST_RIPPLE_VARIANCE = 1e-5
 _PIXEL_CELLS = 128  # per side of the map of the pixels
 
@@ -179,7 +181,7 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
     Raises
     ------
     UserError
-        If the wind speed is out of range.
+        If the wind speed is out of range, or waves move the light by too many of the beam's widths.
 
     Notes
     -----
@@ -229,6 +231,14 @@ def _shots_of_one_sea(
     # Crests move light towards the lidar by height times tan(off_nadir).
     margin = 3 * math.sqrt(elevation + float(np.var(sea))) * math.tan(lidar.off_nadir)
     reach = (lidar.slant_range * lidar.half_angle / math.cos(lidar.off_nadir) + margin) / cell
+    # Waves move the light of a lidar close above them by many of its footprints.
+    count = math.ceil(math.pi * (reach + 1) ** 2) * _POINTS**2
+    if count > _MOST_POINTS:
+        raise UserError(
+            f"altitude = {lidar.height:g}: the light of a shot meets these waves at up to {count} places, and at most "
+            f"{_MOST_POINTS} are followed: give a slope_deviation of the sea"
+        )
+    chunk = min(max(_CHUNK_POINTS // count, 1), _CHUNK)
     steps = np.arange(-math.ceil(reach), math.ceil(reach))
     rows, columns = (one.ravel() for one in np.meshgrid(steps, steps, indexing="ij"))
     inside = np.hypot(rows + 0.5, columns + 0.5) < reach + 1
@@ -238,8 +248,8 @@ def _shots_of_one_sea(
     y, x = (cell * (one[:, np.newaxis] + part).ravel() for one, part in ((rows, dy), (columns, dx)))
     area = (cell / _POINTS) ** 2
     found = []
-    for start in range(0, _SHOTS, _CHUNK):
-        some = slice(start, start + _CHUNK)
+    for start in range(0, _SHOTS, chunk):
+        some = slice(start, start + chunk)
         i = (row[some, np.newaxis] + rows) % _CELLS, (column[some, np.newaxis] + columns) % _CELLS
         right, up = (one[i] for one in facets)
         z = _cell_heights(sea, i)[..., np.newaxis] + cell * (

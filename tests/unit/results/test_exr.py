@@ -7,7 +7,10 @@ import sys
 import numpy as np
 import OpenEXR
 import pytest
+from command_line import run
+from few_paths import few_paths
 
+from mitransient_lidar.core import validation
 from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results import exr
@@ -39,6 +42,22 @@ def test_more_than_ten_thousand_bins_have_five_digits(tmp_path):
     assert "bin00000.Y" in channels
     stacks, _ = exr.read(tmp_path / "a.exr")
     np.testing.assert_array_equal(stacks["bin"]["Y"], values)
+
+
+@pytest.mark.slow
+def test_channels_beyond_the_memory_leave_the_other_files(tmp_path, monkeypatch):
+    """A million bins took 10 GB of memory, after their render."""
+    monkeypatch.setattr(validation, "usable_memory", lambda: 1e6)
+    with pytest.raises(UserError, match=r"2000 channels of an EXR file take 0.005 GB of memory, and at most 0.001 GB"):
+        exr.write(tmp_path / "a.exr", {"bin": {"Y": np.zeros((1, 1, 2000))}}, {}, {})
+    monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
+    monkeypatch.setattr(exr, "_BYTES_PER_CHANNEL", 1e8)
+    few = {"bin_count": 40, "time_start_ns": 1400, "layout": "1x1"}
+    define = [part for name, value in few.items() for part in ("-D", f"{name}={value}")]
+    done = run("render", few_paths("table1", tmp_path), *define, "--passes", "2", "--no-plot", "-o", tmp_path / "out")
+    assert done.exit_code == 0
+    assert "no EXR file: 160 channels of an EXR file take 16 GB of memory" in done.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["small.nc"]
 
 
 def test_plain_attributes_are_readable_and_never_wrong(tmp_path):

@@ -233,6 +233,10 @@ def test_heights_grow_as_the_beam():
         ({"y": [[0, 1]]}, "y of shape (1, 2) must be a list of at least 2 numbers"),
         ({"y": [0, 2, 2]}, "y must increase strictly, but 2 is followed by 2"),
         ({"x": [0, np.nan]}, "x holds nan but every value must be finite"),
+        (
+            {"x": [0, 0.05], "y": [0, 0.05], "ship_x": 1e6},
+            "wake_x, wake_y: the wake spreads over 3.54e+05 m before this sea, too far for waves of 0.1 m",
+        ),
     ],
 )
 def test_errors(change, message):

@@ -20,8 +20,8 @@ LEFT, RIGHT = (SQUARE * np.array([1, 0.5]) + np.array([0, side * 5e-3]) for side
 REFLECTANCE = ((N - 1) / (N + 1)) ** 2
 
 
-def lidar(*outlines, beam=BEAM):
-    return SeaLidar(HEIGHT, THETA, N, N, beam=beam, pixels=PixelMap.of_outlines([list(one) for one in outlines]))
+def lidar(*outlines, beam=BEAM, height=HEIGHT):
+    return SeaLidar(height, THETA, N, N, beam=beam, pixels=PixelMap.of_outlines([list(one) for one in outlines]))
 
 
 @pytest.mark.parametrize(("along", "across", "wind"), [(0, 0, 0), (0.15, 0, 0), (-0.1, 0.2, 0), (0.1, -0.1, 0.7)])
@@ -46,6 +46,12 @@ def test_plane(along, across, wind):
     # The beam of 1 mrad averages the density, which falls with the angle: 2e-3 of the energy, and 0.02 ns.
     assert energy[0, 0] == pytest.approx(REFLECTANCE * density / (4 * cosine * distance**2), rel=4e-3)
     assert time[0, 0] == pytest.approx(2e9 * distance / C0, abs=0.03)
+
+
+def test_lidars_just_above_waves_are_refused():
+    """The places at which waves may reflect the light of a narrow beam are millions for each shot."""
+    with pytest.raises(UserError, match=r"altitude = 0.1: the light of a shot meets these waves at up to \d+ places"):
+        sea_shots(lidar([SQUARE], height=0.1), 3.0, 0.0)
 
 
 def test_pixels_share_the_light():
