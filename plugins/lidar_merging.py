@@ -79,6 +79,9 @@ class LidarMerging(PassIntegrator):
     ``complement_only`` adds all other paths, such as light that meets the sea twice without scattering, mirrors under
     water, and solids in the air seen by reflection.
 
+    Cells end above the first solid below the surface. At one that lets a share of the light pass, such as a mask or a
+    pane, others begin below; through a second one below it they blur the light by their thickness.
+
     Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
     follow the surface and are sheared along the beam; times and absorption are those of the receiver's point; patches
     cut by edges count by their covered share. Over waves of 6 m/s the water's signal in the published geometry differs

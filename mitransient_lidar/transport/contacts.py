@@ -66,7 +66,8 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
         if not any(separations):
             _refuse_visible(found, shapes, scene.groups)
             return list(moved.values())
-        for moving, direction in filter(None, separations):
+        # Once in a round, so that others on both sides of a shape do not push it to and fro.
+        for moving, direction in {id(one[0]): one for one in separations if one is not None}.values():
             _move(moving, direction)
             moved[id(moving)] = moving
         pending = [

@@ -266,7 +266,7 @@ class WaterScene:
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
         """Return the first intersections of rays."""
         if not self.parts:
-            return self._without_instances(self.mitsuba_scene.ray_intersect(ray, active))
+            return self.mitsuba_scene.ray_intersect(ray, active)
         nearest, shift = dr.zeros(mi.PreliminaryIntersection3f), mi.Vector3f(0)
         nearest.t = dr.inf
         turn = mi.Vector2f(1, 0)
@@ -290,12 +290,6 @@ class WaterScene:
             frame = si.sh_frame
             frame.s, frame.t, frame.n = (_turned(each, back) for each in (frame.s, frame.t, frame.n))
             si.sh_frame = frame
-        return self._without_instances(si)
-
-    def _without_instances(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        """Return intersections of a scene without instances with this known to kernels."""
-        if not self.groups:
-            si.instance = dr.zeros(mi.ShapePtr)
         return si
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:

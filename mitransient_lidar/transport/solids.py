@@ -21,19 +21,27 @@ _PLACES, _BEFORE = (0.4142, 0.5858), 1e-3
 _FLAT = 1e-4
 
 
+class _Children(mi.TraversalCallback):  # type: ignore[misc]
+    """Collects the objects within an object."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[mi.Object] = []
+
+    def put(self, name: str, value: object, *_: object) -> None:
+        """Collect an object."""
+        if isinstance(value, mi.Object):
+            self.found.append(value)
+
+    put_object = put
+
+
 def children(parent: mi.Object) -> list[mi.Object]:
     """Return the objects within a Mitsuba object, in the order in which it shows them."""
-    found: list[mi.Object] = []
-
-    class Callback(mi.TraversalCallback):  # type: ignore[misc]
-        def put(self, name: str, value: object, *_: object) -> None:
-            if isinstance(value, mi.Object):
-                found.append(value)
-
-        put_object = put
-
-    parent.traverse(Callback())
-    return found
+    # A class made here would keep them alive until Python collects it, and with them their share of kernels.
+    callback = _Children()
+    parent.traverse(callback)
+    return callback.found
 
 
 def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
