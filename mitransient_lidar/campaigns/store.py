@@ -53,8 +53,7 @@ BYTES_PER_BYTE = 2
 #: Most runs of a shard that is asked for, and of a chunk of an array of all runs.
 LARGEST_SHARD = 10**6
 
-#: Suffix of parameters of the scene that have the name of a variable.
-_INPUT = "_input"
+_INPUT = "_input"  # suffix of parameters of the scene that have the name of a variable
 
 #: Attributes that a store is read by, and that of their SHA-256.
 _SEALED, _SEAL = ("campaign", "flight", "scene", "record", "runs", "shard_size", "inputs", "variables"), "sha256"
@@ -62,14 +61,12 @@ _SEALED, _SEAL = ("campaign", "flight", "scene", "record", "runs", "shard_size",
 #: What zarr and its codecs raise for damaged files.
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, MemoryError)
 
-#: Options of a store's arrays when they are written.
-_WRITING = {"array.write_empty_chunks": True}
+_WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
 
 #: Attribute with the order of pixels in layouts, which stores of versions up to 0.1 lack: they have right before left.
 _ORDER = ("pixel_order", "far to near, left to right")
 
-#: Largest angle of pixels that are on the axis [mrad].
-_ON_AXIS = 1e-3
+_ON_AXIS = 1e-3  # largest angle of pixels that are on the axis [mrad]
 
 _STATUS = {
     "units": "1",

@@ -52,13 +52,14 @@ def test_cells_of_any_width_and_beam_give_finite_light(lidar_scene, passes):
         found = passes(lidar_scene(integrator={**MERGING, **few, "cell_size": width}), 2)
         assert np.isfinite(found).all()
         assert found.sum() > 0
-    high, film = {"altitude": 3e5}, {"time_start_ns": 2.12e6, "bin_width_ns": 1000.0, "bin_count": 20}
+    high, film = {"altitude": 1.2e5}, {"time_start_ns": 8.5e5, "bin_width_ns": 1000.0, "bin_count": 20}
     merged, reference = (
         passes(lidar_scene(integrator=integrator, tx=high, rx=high, film=film, bottom=None), 4)
-        for integrator in ({**MERGING, **few}, {})
+        for integrator in (MERGING, {})
     )
-    assert 0 < merged.sum() < 10 * reference.sum()
-    with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 2000"):
+    # The fast one has a standard error of a third.
+    assert 0 < merged.sum() < 3 * reference.sum()
+    with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 800"):
         passes(lidar_scene(integrator=MERGING, tx={"altitude": 1e6, "divergence_mrad": 20.0}, rx={"altitude": 1e6}), 1)
 
 

@@ -50,15 +50,13 @@ _PHOTONS, _PHOTONS_FOR_IMAGES = 2**15, 2**16
 #: that is seen.
 _CELL_PER_FOOTPRINT, _CELL_PER_FACET, _CELL_PER_VIEW = 0.025, 0.05, 0.02
 
-#: Width of the cells of a lidar under water, from which that of patches follows, over the beam's standard deviation.
-_CELL_PER_BEAM = 0.05
+_CELL_PER_BEAM = 0.05  # width of the cells of a lidar under water, over the beam's standard deviation
 
 #: Growth of the width with depth, over the width at the surface: per metre, for the blur of light patterns by ripples,
 #: and per scattering length, for that by scattering.
 _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 
-#: Width of the patches of solids, over the width of the cells at the surface.
-_PATCH_PER_CELL = 3.2
+_PATCH_PER_CELL = 3.2  # width of the patches of solids, over that of the cells at the surface
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
@@ -254,7 +252,7 @@ class MergingLayout:
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
-        given, longest = cell_widths(options.cell_size, footprint, attenuation)
+        given, longest = cell_widths(options.cell_size, footprint, attenuation * bool(pose.axis[2] < 0))
         widest = given or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
         width = given or min(max(_CELL_PER_VIEW * view, least_cell(scene, reach)), widest)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
