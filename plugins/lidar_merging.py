@@ -88,7 +88,7 @@ class LidarMerging(PassIntegrator):
     from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below; at 75 degrees over waves of 3 m/s
     by -1.4 +- 0.6 and -0.5 +- 0.5 %. A beam of 1 mrad at 40 degrees over 10 m/s, which meets several facets, differs by
     -2 +- 1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``)
-    have more bias. A beam may be 800 attenuation lengths of the water wide. Derivatives come from
+    have more bias. A beam may be 1000 attenuation lengths of the water wide. Derivatives come from
     `mitransient_lidar.render`, not by Mitsuba.
 
     .. code-block:: xml

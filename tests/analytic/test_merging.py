@@ -59,7 +59,7 @@ def test_cells_of_any_width_and_beam_give_finite_light(lidar_scene, passes):
     )
     # The fast one has a standard error of a third.
     assert 0 < merged.sum() < 3 * reference.sum()
-    with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 800"):
+    with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 1000"):
         passes(lidar_scene(integrator=MERGING, tx={"altitude": 1e6, "divergence_mrad": 20.0}, rx={"altitude": 1e6}), 1)
 
 

@@ -37,7 +37,7 @@ _WIDTHS = 1e-6, 1.0
 
 #: Largest width of automatic cells at the surface, in attenuation lengths of the water, as level light of wider ones is
 #: wrong, and largest core radius: cells that narrow find no light in wider beams.
-_LONGEST, _WIDEST_BEAM = 0.3, 400.0
+_LONGEST, _WIDEST_BEAM = 0.3, 500.0
 
 
 def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float, float]:

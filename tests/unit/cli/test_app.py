@@ -93,6 +93,7 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     assert options == {
         "params": {"wind_speed": "3", "file": "a=b"},
         "instrument": None,
+        "sensor": None,
         "integrator": None,
         "target_error": None,
         "target_quantile": None,
