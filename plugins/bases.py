@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -11,28 +12,43 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.declaration import Plugin
+from mitransient_lidar.core.parameters.lidar import ANGLES
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.sensor.image_sampling import read_image
 from mitransient_lidar.transport.sensor.pixels import PixelArray
-from mitransient_lidar.transport.sensor.point_spread import PointSpread
+from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread, PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
 #: Parameter of the loader: place of the frame's origin in the scene [m], x, y, z, of plugins that know places.
 FRAME_ORIGIN = "_frame_origin"
 
+#: Parameters of a receiver's optics, in the order of `ReceiverOptics`.
+_OPTICS = tuple(each.name for each in fields(ReceiverOptics))
+
 
 class RecordedProperties(mi.Properties):
-    """Copy of a plugin's parameters that keeps each value that is read, the default where none is given."""
+    """Copy of a plugin's parameters that keeps each value that is read, the default where none is given.
 
-    def __init__(self, props: mi.Properties) -> None:
+    Parameters whose value may be an empty text are removed where it is: they count as not given. `read` returns
+    values as the plugin declares them.
+    """
+
+    def __init__(self, props: mi.Properties, plugin: Plugin) -> None:
         super().__init__(props)
+        #: Reader of checked values (`core.parameters.declaration.Read`).
+        self.read = plugin.reader(self.get)
         #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
         self.values: dict[str, Any] = {}
         #: Place of the frame's origin in the scene [m]: parameters are places in the scene, loaded objects lie in the
         #: frame, in which single precision is exact.
         self.frame_origin = np.array(self.take(FRAME_ORIGIN, (0.0, 0.0, 0.0)), dtype=np.float64)
+        for parameter in plugin:
+            if parameter.may_be_empty and parameter.name in self and super().get(parameter.name) == "":
+                del self[parameter.name]
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a parameter, or the default."""
@@ -47,12 +63,6 @@ class RecordedProperties(mi.Properties):
             self.values.setdefault(name, None)
         return given
 
-    def drop_empty(self, *names: str) -> None:
-        """Remove parameters whose value is an empty text: it counts as not given."""
-        for name in names:
-            if name in self and self[name] == "":
-                del self[name]
-
     def take(self, name: str, default: Any) -> Any:
         """Remove a parameter that is not recorded, and return its value or the default."""
         value = super().get(name, default)
@@ -65,21 +75,31 @@ class RecordedProperties(mi.Properties):
         return value
 
 
-def recorded(plugin: Callable[[RecordedProperties], Any]) -> Callable[[mi.Properties], Any]:
-    """Return the constructor to register for a class of plugins, whose objects then have ``parameters``.
+def register(
+    kind: str, plugin: Plugin, make: Callable[[RecordedProperties], Any], described: type | None = None
+) -> None:
+    """Register a plugin of a kind of Mitsuba, made by its class or a function of the class that describes it.
 
-    These are the plugin's name as ``type``, the value of each parameter that the object has read, and nested objects.
+    The manual, the docstring of the class, gets the table of its parameters.
+
+    Its objects have ``parameters``: the plugin's name as ``type``, the value of each parameter that they have read, and
+    nested objects.
     """
+    manual = make if described is None else described
+    if manual.__doc__:
+        manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
 
     def construct(props: mi.Properties) -> Any:
-        own = RecordedProperties(props)
+        own = RecordedProperties(props, plugin)
         children = dict(props.objects(False))
-        made = plugin(own)
+        made = make(own)
         # Mitsuba refuses parameters of `props` that nobody has read: the class has read, or removed, those of the copy.
         given, left = list(props.keys()), set(own.keys())
         used = [name for name in given if name not in left or own.was_queried(name)]
         for name in used:
             props.mark_queried(name)
+        if not hasattr(made, "__dict__"):
+            return made  # an object of Mitsuba
         # Mitsuba's base classes read some themselves.
         others = [name for name in used if name in left and name not in own.values and name not in children]
         made.parameters = {
@@ -90,7 +110,7 @@ def recorded(plugin: Callable[[RecordedProperties], Any]) -> Callable[[mi.Proper
         }
         return made
 
-    return construct
+    getattr(mi, f"register_{kind}")(plugin.name, construct)
 
 
 def exposed(part: mi.Object) -> tuple[dict[str, Any], list[tuple[str, mi.Object]]]:
@@ -190,9 +210,7 @@ class ReceiverSensor(mi.Sensor):
     def __init__(self, props: RecordedProperties, pixels: PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
-        pose = KernelPose.from_properties(props).in_frame(props.frame_origin)
-        optics = ReceiverOptics.from_properties(props)
-        self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
+        self.receiver = Receiver(read_pose(props), ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props))
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None
 
@@ -208,6 +226,36 @@ class ReceiverSensor(mi.Sensor):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose no parameters: a changed receiver is loaded again."""
+
+
+def read_pose(props: RecordedProperties) -> KernelPose:
+    """Return the pose of a lidar in the frame: of ``to_world``, or of height, angle and aim."""
+    if "to_world" not in props:
+        pose = KernelPose.from_angles(*(props.get(each.name, each.default) for each in ANGLES))
+        return pose.in_frame(props.frame_origin)
+    name = props.plugin_name()
+    if "altitude" in props or "off_nadir_deg" in props:
+        raise UserError(f"{name}: give either to_world or altitude and off_nadir_deg, not both")
+    matrix = np.array(props["to_world"].matrix, dtype=np.float64)
+    return KernelPose.from_matrix(f"{name}: to_world", matrix).in_frame(props.frame_origin)
+
+
+def _blur(props: RecordedProperties) -> PointSpread | None:
+    """Return the point-spread function of a receiver; None for sharp optics."""
+    if "blur_file" not in props:
+        if "blur_file_mrad" in props:
+            raise UserError("blur_file_mrad is the size of blur_file, which is missing")
+        width = props.read("blur_mrad")
+        return GaussianPointSpread(1e-3 * width) if width > 0 else None
+    if "blur_mrad" in props:
+        raise UserError("blur_mrad and blur_file: give one of them, not both")
+    if "blur_file_mrad" not in props:
+        raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
+    path = str(props["blur_file"])
+    values = read_image("blur_file", path)
+    if values.min() < 0 or values.max() <= 0:
+        raise UserError(f"blur_file = {path!r} must hold values that are not negative and not all 0")
+    return MeasuredPointSpread(values, 1e-3 * props.read("blur_file_mrad"))
 
 
 def refuse_medium(props: mi.Properties) -> None:

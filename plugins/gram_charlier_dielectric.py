@@ -7,9 +7,9 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import finite, in_range
+from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
@@ -19,14 +19,7 @@ _TERMS = ("c21", "c03", "c40", "c22", "c04")
 class GramCharlierDielectric(mi.BSDF):
     r"""Rough dielectric whose slopes have a Gram-Charlier series (``gram_charlier_dielectric``).
 
-    =======================  =====  ====================================================================================
-    Parameter                Type   Meaning
-    =======================  =====  ====================================================================================
-    variance_u, variance_v   float  Slope variances along and across the texture coordinate u, 1e-6 to 1. Default: 0.01
-    c21, c03, c40, c22, c04  float  Terms of the series. Default: 0, Gaussian slopes
-    int_ior                  float  Refractive index inside, 1 to 3. Default: 1.34
-    ext_ior                  float  Refractive index outside, 1 to 3. Default: 1
-    =======================  =====  ====================================================================================
+    .. parameters::
 
     The ripples of an ``ocean_surface`` with ``slope_distribution`` ``gram_charlier``. The density of slopes over their
     standard deviations, *x* along v and *y* against u, is that of a Gaussian rough dielectric (Walter et al. 2007,
@@ -58,12 +51,11 @@ class GramCharlierDielectric(mi.BSDF):
         {'type': 'gram_charlier_dielectric', 'variance_u': 0.02, 'variance_v': 0.015, 'c03': -0.16}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        variances = [in_range(name, props.get(name, 0.01), 1e-6, 1.0) for name in ("variance_u", "variance_v")]
-        series = GramCharlierSeries(*(finite(name, props.get(name, 0.0)) for name in _TERMS))
-        inside = in_range("int_ior", props.get("int_ior", 1.34), 1.0, 3.0)
-        outside = in_range("ext_ior", props.get("ext_ior", 1.0), 1.0, 3.0)
+        variances = list(map(props.read, ("variance_u", "variance_v")))
+        series = GramCharlierSeries(*map(props.read, _TERMS))
+        inside, outside = props.read("int_ior"), props.read("ext_ior")
         roughness = {f"alpha_{axis}": math.sqrt(2 * one) for axis, one in zip("uv", variances, strict=True)}
         self._index = opaque(inside / outside)
         self._gaussian = create_object(
@@ -151,4 +143,4 @@ class GramCharlierDielectric(mi.BSDF):
         return f"GramCharlierDielectric[variances={self.variances}, {self.series}]"
 
 
-mi.register_bsdf("gram_charlier_dielectric", recorded(GramCharlierDielectric))
+register("bsdf", GRAM_CHARLIER_DIELECTRIC, GramCharlierDielectric)

@@ -2,76 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mitransient_lidar.plugins.bases import RecordedProperties, recorded
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.water import LAYERED_WATER
+from mitransient_lidar.core.validation import number_list
+from mitransient_lidar.physics.water.bubbles import WindBubbles
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.profiles import read_profile
+from mitransient_lidar.physics.water.water_types import WATER_KINDS, water_of
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
-from mitransient_lidar.transport.medium.water_parameters import MAY_BE_EMPTY, read_water
+from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
+from mitransient_lidar.transport.nested_objects import create_object
+
+#: Attenuation, scattering and backscattering.
+_COEFFICIENTS = ("attenuation", "scattering", "backscattering")
+
+#: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
+_PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
 
 
 class LayeredWater(mi.Medium):
     r"""Water in horizontal layers (``layered_water``).
 
-    =======================  ======  ===================================================================================
-    Parameter                Type    Meaning
-    =======================  ======  ===================================================================================
-    layer_tops               string  Depth of each layer's upper edge [m], first 0, increasing to at most 1e5: ``0, 3``.
-                                     Default: ``0``
-    attenuation              string  Beam attenuation c of each layer [1/m], 0 to 1000, or one value for all. Default:
-                                     0.3
-    scattering               string  Scattering b [1/m], at most c. Default: 0.15
-    backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
-    jerlov                   string  Instead of the three coefficients, the water's type: ``I``, ``IA``, ``IB``, ``II``,
-                                     ``III``, ``1C``, ``3C``, ``5C``, ``7C`` or ``9C``
-    chlorophyll              string  Or its chlorophyll, 0.01 to 30 mg/m^3 (Case 1 water)
-    kd                       string  Or its diffuse attenuation Kd, 0.0486 to 0.738 1/m
-    secchi                   string  Or its Secchi depth, 0.5 to 25 m
-    petzold                  string  Or Petzold's ``clear``, ``coastal``, ``turbid``, or a station of the phase
-                                     function ``petzold``
-    pure                     string  Or ``true``: sea water without particles, whose scattering is ``water_scattering``
-    wavelength_nm            float   Wavelength of these waters [nm]: 532, or 400 to 700 for ``chlorophyll`` and
-                                     ``pure``, 514 to 533 for ``petzold``; or of the columns of a profile that has
-                                     several, as ``a488, a532``. Default: 532, or that of the only columns
-    profile                  string  A file instead of the four above, with ``depth`` or ``z``, two of ``a``, ``b``,
-                                     ``c``, ``omega``, and ``bb`` or ``bb_ratio``: a table with units in its heading
-                                     (.csv, .txt, .dat, .tsv) or .nc (`physics.water.profiles`)
-    profile_tolerance        float   Largest relative error of the layers that approximate the profile, 1e-5 to 0.5.
-                                     Default: 0.01
-    phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
-                                     ``fournier_forand``
-    phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
-    water_scattering         string  Scattering by water molecules, a part of b [1/m], of each layer or all. Default: 0,
-                                     for phase functions that include it; 0.00196 at 532 nm in a water by ``jerlov``,
-                                     ``chlorophyll``, ``kd`` or ``secchi`` whose particles have Fournier-Forand
-                                     functions; all of b in ``pure``
-    chi_p                    string  bb/(2 pi p(180 deg) b) of the particles, 0.1 to 10, of each layer or all: less is
-                                     a brighter echo of the water. Default: empty, that of the phase function, 0.94 to
-                                     1.09 of ``fournier_forand``, 0.90 of ``petzold``
-    (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
-                                     ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
-    refractive_index         string  Phase index, 1.0001 to 2, of each layer or all. Default: 1.34
-    group_index              string  Group index, 1 to 2, of each layer or all. Default: 1.364 (sea water at 532 nm)
-    plume_scattering         float   Scattering of bubbles behind a ship, added to b [1/m], 0 to 1000. Default: 0, no
-                                     bubbles
-    plume_x, plume_y         float   Start of the bubbles, at the stern [m], -1e7 to 1e7. Default: 0
-    plume_bearing_deg        float   Heading of the ship, from +x to +y [deg]. Default: 0
-    plume_length             float   Length of the plume [m], 0.001 to 1e6. Default: 200
-    plume_width              float   Width of the plume [m], 0.001 to 1e6. Default: 8
-    plume_depth              float   Depth of the plume below the mean sea level [m], 0.01 to 100. Default: 2
-    plume_backscatter_ratio  float   bb/b of bubbles for a Fournier-Forand function, 0.0001 to 0.4. Default: 0.02,
-                                     between clean bubbles and coated ones (Zhang, Lewis and Johnson 1998,
-                                     doi:10.1364/AO.37.006525)
-    bubble_wind_speed        float   Wind speed 10 m above the sea whose bubbles lie below it [m/s], 0 to 20. Default:
-                                     0, no bubbles
-    bubble_void_fraction     string  Their void fraction at the surface, 0 to 0.001, instead of that of the wind
-    bubble_depth             string  Depth at which it has fallen to 1/e [m], 0.05 to 20, instead of that of the wind
-    bubble_backscatter       float   Volume scattering at 180 degrees over void fraction, 100 to 1445 1/(m sr). Default:
-                                     233, clean bubbles; 1445 is a thick coating (Churnside 2010,
-                                     doi:10.1364/OE.18.008294)
-    =======================  ======  ===================================================================================
+    .. parameters::
 
     Of coefficients, the six ways to give a water, and ``profile`` one is allowed; an empty text counts as not given. A
     water holds for all layers, or is a list with one value a layer: ``1C, 5C``. Sources and uncertainties are those of
@@ -112,7 +76,6 @@ class LayeredWater(mi.Medium):
     """
 
     def __init__(self, props: RecordedProperties) -> None:
-        props.drop_empty(*MAY_BE_EMPTY)
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         bubbles = phases.pop("plume_phase", None)
         if bubbles is not None:
@@ -121,9 +84,7 @@ class LayeredWater(mi.Medium):
         for name in list(phases)[1:]:
             del props[name]
         #: The water (`mitransient_lidar.transport.medium.water.Water`).
-        self.water = read_water(props, phases, bubbles, partial(TabulatedPhaseFunction, mi.Properties())).moved(
-            props.frame_origin
-        )
+        self.water = _read_water(props, phases, bubbles).moved(props.frame_origin)
         if not phases:
             # For Mitsuba's own integrators, whose default is an isotropic function.
             props["phase_0"] = self.water.phases.phases[0]
@@ -157,4 +118,142 @@ class LayeredWater(mi.Medium):
         return f"LayeredWater[{water.column}, {indices}]"
 
 
-mi.register_medium("layered_water", recorded(LayeredWater))
+def _read_water(
+    props: RecordedProperties,
+    nested: dict[str, mi.PhaseFunction],
+    bubbles: mi.PhaseFunction | None,
+) -> Water:
+    """Return the water of parameters.
+
+    Parameters
+    ----------
+    props
+        Parameters of the plugin, as its manual page describes them.
+    nested
+        Phase functions by name, one for all layers or one for each; may be empty.
+    bubbles
+        Phase function of the bubbles; None for that of ``plume_backscatter_ratio`` or ``bubble_backscatter``.
+
+    Raises
+    ------
+    UserError
+        When a value is not allowed, or two parameters describe the same.
+    """
+    check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
+    read = props.read
+    kind, phase_g = read("phase_function"), read("phase_g")
+    column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
+    indices = [LAYERED_WATER[name].per_layer(read(name), column.count) for name in ("refractive_index", "group_index")]
+    plume, ratio = _bubbles(props)
+    if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
+        molecules = np.zeros(1)
+    own = ", ".join(map(repr, molecules.tolist()))
+    molecules = LAYERED_WATER["water_scattering"].per_layer(read("water_scattering", own), column.count)
+    _check_water_scattering(molecules, column)
+    chi_p = LAYERED_WATER["chi_p"].per_layer(props["chi_p"], column.count) if "chi_p" in props else None
+    layers = LayerPhases(
+        column, nested, kind, phase_g, molecules, chi_p, partial(TabulatedPhaseFunction, mi.Properties())
+    )
+    of_layers = layers.functions()
+    column, kept = _joined(column, [*indices, np.array([id(phase) for phase in of_layers])])
+    phases = [of_layers[layer] for layer in kept]
+    if plume is not None:
+        phases.append(bubbles or create_object("fournier_forand", backscatter_ratio=ratio))
+    return Water(
+        column,
+        layers,
+        ScattererPhases(phases),
+        IndexLayers(column.layer_tops, *(values[kept] for values in indices)),
+        molecules[kept],
+        plume,
+        _is_given(props, "profile"),
+        wavelength,
+    )
+
+
+def _column(props: RecordedProperties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
+    """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
+
+    That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
+    wavelength [nm], None of coefficients as numbers. `is_of_phase` says that backscattering follows from a phase
+    function: the parameter then counts up to the scattering.
+    """
+    read = props.read
+    tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
+    ways = [name for name in (*WATER_KINDS, "profile") if _is_given(props, name)]
+    own = [name for name in ("layer_tops", *_COEFFICIENTS) if name in props]
+    if not ways:
+        values = {name: read(name) for name in _COEFFICIENTS}
+        if is_of_phase:
+            back = number_list("backscattering", values["backscattering"])
+            scattering = number_list("scattering", values["scattering"])
+            values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
+        return WaterColumn.from_text(layer_tops, **values), np.zeros(1), None
+    way = ways[0]
+    excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
+    if excluded:
+        raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
+    if way == "profile":
+        return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
+    tops = number_list("layer_tops", layer_tops)
+    wavelength = wavelength or read("wavelength_nm", 532.0)
+    texts = str(props[way]).replace(",", " ").split()
+    if len(texts) not in (1, tops.size):
+        raise UserError(f"{way} has {len(texts)} values but must have 1 or {tops.size}, one a layer")
+    try:
+        found = [water_of(way, None if way == "pure" else text, wavelength) for text in texts]
+    except UserError as error:
+        raise UserError(f"{way} = {props[way]!r}: {error}") from error
+    rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
+    *coefficients, molecules = np.transpose(rows)
+    return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
+
+
+def _bubbles(props: RecordedProperties) -> tuple[BubblePlume | BubbleLayer | None, float]:
+    """Return the bubbles, behind a ship or below a windy sea, and their bb/b."""
+    read = props.read
+    scattering, x, y, bearing, *extent = map(read, _PLUME)
+    plume = BubblePlume(scattering, x, y, np.deg2rad(bearing), *extent) if scattering > 0 else None
+    ratio, backscatter = read("plume_backscatter_ratio"), read("bubble_backscatter")
+    bubbles = WindBubbles.of_wind(read("bubble_wind_speed"))
+    if (fraction := read("bubble_void_fraction")) is not None:
+        bubbles = replace(bubbles, void_fraction=fraction)
+    if (depth := read("bubble_depth")) is not None:
+        bubbles = replace(bubbles, depth=depth)
+    if bubbles.void_fraction == 0:
+        return plume, ratio
+    if plume is not None:
+        raise UserError(
+            f"plume_scattering = {plume.scattering:g} must be 0 with bubbles of bubble_wind_speed or "
+            "bubble_void_fraction: water has one kind of bubbles"
+        )
+    return BubbleLayer(bubbles.scattering, bubbles.depth), bubbles.backscatter_ratio(backscatter)
+
+
+def _is_given(props: RecordedProperties, name: str) -> bool:
+    """Return whether a parameter has a value; ``false`` counts as not given for ``pure``."""
+    if name == "pure":
+        value = props.get(name, "false")
+        if str(value).lower() not in ("true", "false"):
+            raise UserError(f"pure = {value!r} must be true or false")
+        return str(value).lower() == "true"
+    return name in props
+
+
+def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:
+    """Return the column with neighbouring layers of equal properties joined, and the first layer of each."""
+    rows = np.array([column.attenuation, column.scattering, column.backscattering, *others])
+    kept = np.append(0, 1 + np.flatnonzero(np.any(np.diff(rows, axis=1) != 0, axis=0)))
+    return WaterColumn(column.layer_tops[kept], *rows[:3, kept]), kept
+
+
+def _check_water_scattering(molecules: np.ndarray, column: WaterColumn) -> None:
+    """Raise `UserError` unless the scattering by molecules [1/m] is a part of that of each layer."""
+    for layer in np.flatnonzero((molecules < 0) | (molecules > column.scattering))[:1]:
+        raise UserError(
+            f"water_scattering = {molecules[layer]:g} must be at least 0 and at most scattering = "
+            f"{column.scattering[layer]:g}, in layer {layer}"
+        )
+
+
+register("medium", LAYERED_WATER, LayeredWater)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import integer
-from mitransient_lidar.plugins.bases import PassIntegrator, recorded
+from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING
+from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -18,20 +17,7 @@ from mitransient_lidar.transport.volpath import VolpathOptions, VolpathRenderer
 class LidarMerging(PassIntegrator):
     r"""Bidirectional transient volumetric integrator (``lidar_merging``).
 
-    ================  =======  =========================================================================================
-    Parameter         Type     Meaning
-    ================  =======  =========================================================================================
-    paths_per_pass    integer  Paths from the receiver in one pass, 1024 to 2^28, unless the sample count per pixel
-                               (``spp``) is given to ``mi.render``. Default: 32768, or 16 a pixel up to 2^21
-    photons_per_pass  integer  Paths from the laser in one pass, 1024 to 2^28. Default: 32768, or 65536 from 4096 pixels
-                               on
-    cell_size         float    Horizontal width of the cells on the beam's axis at the surface [m], at most 1e4, and
-                               within 2e-6 to 2 standard deviations of the beam there; 0: from footprint,
-                               facets of the sea, field of view and attenuation. Smaller cells have less bias and more
-                               noise. Default: 0
-    point_spacing     float    Distance between points along a path [m]; 0: a fourteenth of the distance to the bottom
-                               or to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
-    ================  =======  =========================================================================================
+    .. parameters::
 
     Nearly every echo has one vertical reversal, and both parts of its path are easy to sample from their own ends.
     Light is traced from the laser and paths from the receiver, both through waves and ripples into the water, with
@@ -102,11 +88,11 @@ class LidarMerging(PassIntegrator):
 
     plugin = "lidar_merging"
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
         given = [name for name in ("paths_per_pass", "photons_per_pass") if name in props]
-        counts = {name: integer(name, props[name], 1024, 2**28) for name in given}
-        lengths = {name: ranged(name, props.get(name, 0.0)) for name in ("cell_size", "point_spacing")}
+        counts = {name: props.read(name) for name in given}
+        lengths = {name: props.read(name) for name in ("cell_size", "point_spacing")}
         self.options = MergingOptions(**counts, **lengths)
 
     def prepare(
@@ -146,4 +132,4 @@ class LidarMerging(PassIntegrator):
         return f"LidarMerging[{self.options}]"
 
 
-mi.register_integrator("lidar_merging", recorded(LidarMerging))
+register("integrator", LIDAR_MERGING, LidarMerging)

@@ -7,59 +7,19 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import finite, in_range
-from mitransient_lidar.physics.lidar.divergence import WIDTHS, given_divergences, read_divergence
+from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
+from mitransient_lidar.physics.lidar.divergence import WIDTHS, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, recorded
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, read_pose, register
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
-
-_PROFILES = ("gaussian", "top_hat", "image")
-
-#: Full angle of the beam unless it is given [mrad].
-_DIVERGENCE = 10.0
 
 
 class LidarTransmitter(EmitterWithoutExtent):
     r"""Pulsed laser transmitter (``lidar_transmitter``).
 
-    ======================  =========  =================================================================================
-    Parameter               Type       Meaning
-    ======================  =========  =================================================================================
-    altitude                float      Height above the mean sea level [m], 0.1 to 1e6, or, negative, under water, -1000
-                                       to -0.1. Default: 200
-    off_nadir_deg           float      Angle of the axis from nadir, towards +x [deg], 0 to 89.9; under water up to 180,
-                                       which is straight up. Default: 20
-    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the
-                                       point of the mean sea level above the lidar. Default: 0
-    to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
-    pulse_energy_mj         float      Energy of the emitted pulse [mJ], 1e-9 to 1e6. Default: 5
-    optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
-    beam_profile            string     ``gaussian``, ``top_hat`` or ``image``. Default: ``gaussian``
-    divergence_mrad         float      Full angle [mrad] between the points where the irradiance of a Gaussian beam has
-                                       fallen to e^-1/2 of its peak (its sigma is half of it); the full angle of a
-                                       top-hat beam. 0.001 to 2000. Default: 10
-    divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak; give
-    divergence_1e2_mrad                one of the three. Each is the full angle of a top-hat beam, whose irradiance
-                                       falls from its peak to 0 at the edge. An empty text counts as not given
-    divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along
-                                       angle_x, this the one along angle_y. 0.001 to 2000. Default:
-                                       ``divergence_mrad``
-    ellipse_deg             float      Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards
-                                       +angle_y [deg]. Default: 0
-    profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
-                                       image about the axis. Row 0 is the far edge (+angle_x), column 0 the left one
-                                       (+angle_y)
-    profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
-                                       0.001 to 2000; its cells are squares
-    wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532
-    pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], 1e-4 to 1e6. Default: 5
-    pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit), or in any
-                                       order and unit of time below a heading such as ``t [ps], V``
-    ======================  =========  =================================================================================
+    .. parameters::
 
     The beam leaves one point. Its energy per tangent-plane area is a Gaussian
 
@@ -94,13 +54,13 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.pose = KernelPose.from_properties(props).in_frame(props.frame_origin)
-        self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
-        self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
-        self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)
+        read = props.read
+        self.pose = read_pose(props)
+        self.pulse_energy = 1e-3 * read("pulse_energy_mj")
+        self.optical_efficiency, self.wavelength_nm = read("optical_efficiency"), read("wavelength_nm")
         #: Energy that leaves the optics [J].
         self.energy = self.pulse_energy * self.optical_efficiency
-        self.beam_profile = props.get("beam_profile", "gaussian")
+        self.beam_profile = read("beam_profile")
         self.profile = _profile(props, self.beam_profile)
         #: Full angle of the beam [rad] as in ``divergence_mrad``; of an image twice its widest rms angle.
         self.divergence = self.profile.divergence[0]
@@ -109,7 +69,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         if "pulse_file" in props:
             self.pulse = Pulse.from_file(props["pulse_file"])
         else:
-            self.pulse = Pulse.gaussian(ranged("pulse_fwhm_ns", props.get("pulse_fwhm_ns", 5.0)))
+            self.pulse = Pulse.gaussian(read("pulse_fwhm_ns"))
         self.m_needs_sample_2 = False
         self.m_flags = mi.EmitterFlags.DeltaPosition.value
 
@@ -177,31 +137,27 @@ class LidarTransmitter(EmitterWithoutExtent):
 
 def _profile(props: RecordedProperties, kind: str) -> BeamProfile:
     """Return the beam profile of the plugin's parameters."""
-    if kind not in _PROFILES:
-        raise UserError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
+    read = props.read
     image_names = ("profile_file", "profile_mrad")
     for name in (*WIDTHS, "divergence_across_mrad", "ellipse_deg") if kind == "image" else image_names:
-        if props.get(name, "") != "":
+        if name in props:
             raise UserError(f"{name} does not go with beam_profile = {kind!r}")
     if kind == "image":
         for name in image_names:
             if name not in props:
                 raise UserError(f"{name} is missing: beam_profile = 'image' needs it")
         image = read_image("profile_file", props["profile_file"])
-        return ImageBeam(image, 1e-3 * ranged("profile_mrad", props["profile_mrad"]))
-    divergence = read_divergence(props.get, kind == "top_hat")
-    if divergence is None:
-        props.drop_empty(*WIDTHS)
-        divergence = 1e-3 * float(props.get("divergence_mrad", _DIVERGENCE))
+        return ImageBeam(image, 1e-3 * read("profile_mrad"))
+    divergence = read_divergence(read, kind == "top_hat") or 1e-3 * read("divergence_mrad")
     along = across = 0.5 * divergence
     if "divergence_across_mrad" in props:
-        if any(name != "divergence_mrad" for name in given_divergences(props.get)):
+        if any(name != "divergence_mrad" for name in read.given(*WIDTHS)):
             raise UserError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
-        across = 0.5e-3 * ranged("divergence_across_mrad", props["divergence_across_mrad"])
+        across = 0.5e-3 * read("divergence_across_mrad")
     elif "ellipse_deg" in props:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
-    rotation = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
+    rotation = float(np.deg2rad(read("ellipse_deg")))
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
 
 
-mi.register_emitter("lidar_transmitter", recorded(LidarTransmitter))
+register("emitter", LIDAR_TRANSMITTER, LidarTransmitter)

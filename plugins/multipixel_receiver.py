@@ -5,9 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import RANGES, ranged
-from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, recorded
+from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER
+from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, register
 from mitransient_lidar.transport.plugin_types import PixelSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
@@ -17,49 +16,7 @@ from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, 
 class MultipixelReceiver(ReceiverSensor):
     r"""Receiver with any number of pixels up to 2^20 (``multipixel_receiver``).
 
-    =================================  =======  ========================================================================
-    Parameter                          Type     Meaning
-    =================================  =======  ========================================================================
-    layout                             string   ``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into R rows
-                                                along range (row 0 is the far edge) and C columns (column 0 is the left
-                                                edge). ``1x4`` is the published receiver of four strips across range,
-                                                the same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to 2^20: a
-                                                hexagon and complete rings of hexagons around it, in rows along angle_y.
-                                                Default: ``2x2``
-    fill_factor                        float    Share of each cell or hexagon of a layout that receives light, 0.01 to
-                                                1; the gaps receive none. Default: 1
-    imager                             boolean  Result of shape (row, column, time) instead of (pixel, time). Default:
-                                                true above 16 pixels of ``RxC``
-    pixel_map                          string   Instead of layout: image file (.png, .npy or .exr, one channel) of
-                                                labels over a square field of view, integers from 0 to 2^24. Row 0 is
-                                                the far edge, column 0 the left edge. Each label is a pixel, in
-                                                increasing order and named ``label1``, ...; 0 is no pixel
-    field_of_view_mrad                 float    Full angle of the field of view [mrad], 0.001 to 3000: diameter, side,
-                                                or diameter of the hexagons' circumscribed circle. Default: 30
-    field_of_view_shape                string   ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
-                                                ``square`` with a focal length
-    focal_length_mm, pixel_pitch_um    float    Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the lens
-                                                and distance of square pixels on the detector, 0.001 to 1e6. The field
-                                                of view is then R by C times pitch over focal length, a rectangle (or,
-                                                with ``circle`` and R = C, the inscribed circle)
-    (nested)                           sensor   ``pixel_fov`` sensors instead of layout and field of view
-    blur_mrad                          float    Optical blur: standard deviation along each axis of a Gaussian
-                                                point-spread function [mrad], 0 (sharp) to 1000. Default: 0
-    blur_file                          string   Instead: image file (as for ``pixel_map``) of a measured point-spread
-                                                function in any unit, not negative, about the focus of sharp optics.
-                                                Values are constant in each cell, and normalised
-    blur_file_mrad                     float    Width of that image along angle_y [mrad], above 0 to 1000; its cells are
-                                                squares
-    aperture_area                      float    Area of the aperture [m^2], 1e-12 to 1000. Default: 0.025
-    obscuration                        float    Share of that area which is blocked, as by a secondary mirror, 0 to
-                                                0.999. Default: 0
-    optical_efficiency                 float    Share of light that the optics pass, above 0 to 1. Default: 0.9
-    two_way_atmospheric_transmittance  float    Share of light that the air transmits, both ways. Default: 0.9
-    response_time_ns                   float    Time constant of the exponential response [ns], 0 to 1e6. Default: 0
-    altitude, off_nadir_deg, aim_x,             Pose, as for ``lidar_transmitter``
-    aim_y, to_world
-    (nested)                           film     ``time_gated_film``
-    =================================  =======  ========================================================================
+    .. parameters::
 
     Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is to
     the left of the line of sight, along +y. Rows, columns and image files are in the order of a picture taken from the
@@ -118,7 +75,7 @@ def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     return ShapedPixels([pixel.field for pixel in nested], names)
 
 
-def _own_pixels(props: mi.Properties) -> PixelArray:
+def _own_pixels(props: RecordedProperties) -> PixelArray:
     """Build the pixels from a layout or a map."""
 
     def only_for(kind: str, *names: str) -> None:
@@ -126,32 +83,32 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
             if name in props:
                 raise UserError(f"{name} = {props[name]!r} is for {kind}: leave it out")
 
-    field_of_view = 1e-3 * ranged("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+    field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
         only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager", *_LENS)
         return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
-    layout = str(props.get("layout", "2x2"))
-    fill_factor = in_range("fill_factor", props.get("fill_factor", 1.0), 0.01, 1.0)
+    layout, fill_factor, imager = str(props.read("layout")), props.read("fill_factor"), props.read("imager")
     if layout.startswith("hex"):
         only_for("layouts of rows x columns", "field_of_view_shape", "imager", *_LENS)
         return HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
         only_for("receivers without a focal length", "field_of_view_mrad")
-        shape = props.get("field_of_view_shape", "square")
-        return LayoutPixels(layout, _sides_of_lens(props, layout), shape, props.get("imager"), fill_factor)
-    shape = props.get("field_of_view_shape", "circle")
-    return LayoutPixels(layout, field_of_view, shape, props.get("imager"), fill_factor)
+        shape = props.read("field_of_view_shape", "square")
+        return LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
+    shape = props.read("field_of_view_shape", "circle")
+    return LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
 
 
-def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
+def _sides_of_lens(props: RecordedProperties, layout: str) -> tuple[float, float]:
     """Return the sides (angle_x, angle_y) [rad] of the field of view of a detector behind a lens."""
     for name in _LENS:
         if name not in props:
             raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
-    focal_length, pitch = (ranged(name, props[name]) for name in _LENS)
+    focal_length, pitch = map(props.read, _LENS)
     rows, columns = parse_layout(layout)
     sides = 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
-    if not RANGES["field_of_view_mrad"][0] <= 1e3 * min(sides) <= 1e3 * max(sides) <= RANGES["field_of_view_mrad"][1]:
+    allowed = MULTIPIXEL_RECEIVER["field_of_view_mrad"]
+    if not allowed.low <= 1e3 * min(sides) <= 1e3 * max(sides) <= allowed.high:
         raise UserError(
             f"focal_length_mm = {focal_length:g} and pixel_pitch_um = {pitch:g} give a field of view of "
             f"{1e3 * sides[0]:g} x {1e3 * sides[1]:g} mrad: its sides must lie between 0.001 and 3000"
@@ -159,4 +116,4 @@ def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
     return sides
 
 
-mi.register_sensor("multipixel_receiver", recorded(MultipixelReceiver))
+register("sensor", MULTIPIXEL_RECEIVER, MultipixelReceiver)

@@ -10,10 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
-from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
 
@@ -27,60 +28,7 @@ _BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
 class OceanSurface(mi.Mesh):
     r"""Sea surface with waves of wind and swell, or from a height map (``ocean_surface``).
 
-    ========================  =======  =================================================================================
-    Parameter                 Type     Meaning
-    ========================  =======  =================================================================================
-    spectrum                  string   ``elfouhaily`` (Elfouhaily et al. 1997), ``jonswap`` (needs ``fetch``),
-                                       ``pierson_moskowitz``, ``table`` (``filename``: .npz with ``kx``, ``ky`` [rad/m]
-                                       and ``density`` [m^4]), ``height_map`` (``filename``: formats of ``seabed``),
-                                       or ``flat``: no waves, all slopes are ripples. Default: ``elfouhaily``
-    wind_speed                float    Wind speed at 10 m [m/s], 0 to 30. Default: 3
-    wind_direction_deg        float    Direction the wind blows towards, from +x to +y [deg]. Default: 0
-    fetch, inverse_wave_age   float    Distance over which the wind has blown over water [m], or inverse wave age, 0.84
-                                       (fully developed) to 5. Default: 0.84
-    peak_enhancement          float    JONSWAP's gamma. Default: 3.3
-    swell_height              float    Significant height of an added swell [m], at most a fifteenth of its length; 0
-                                       for none. Default: 0
-    swell_wavelength          float    Its wavelength [m]. Default: 60
-    swell_direction_deg       float    Direction it travels towards [deg]. Default: 0
-    slope_variance            string   Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea,
-                                       1954; waves below 1 m are scaled to it), ``spectrum`` (the integral of the
-                                       spectrum) or a number, the total of an isotropic sea. Default: ``cox_munk``
-    slope_distribution        string   ``gaussian``, or ``gram_charlier``: skewed and peaked slopes, as measured by Cox
-                                       and Munk from 1 to 14 m/s, with ``slope_variance`` ``cox_munk``.
-                                       Default: ``gaussian``
-    ripple_focusing           string   Whether echoes from the water are enhanced by the mean focusing of ripples that
-                                       light crosses twice: ``true`` or ``false``. Default: ``true``
-    surface_seed              integer  Seed of the waves, 0 to 2^53: the same sea at any resolution and position of the
-                                       patch. Default: 1
-    time                      float    Time at which the waves are taken [s]. Default: 0
-    water_depth               float    Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et
-                                       al. 1985) [m]. Default: deep
-    current_speed             float    Current that carries the waves [m/s], 0 to 10. Default: 0
-    current_direction_deg     float    Direction the current flows towards [deg]. Default: 0
-    wake_speed                float    Speed of a ship whose Kelvin wake is added [m/s], 0 for none. Default: 0
-    wake_bearing_deg          float    Heading of the ship, from +x to +y [deg]. Default: 0
-    wake_length               float    Length of the ship [m], 1 to 500. Default: 20
-    wake_x, wake_y            float    Centre of the ship [m]. Default: 0
-    slope_x_deg, slope_y_deg  float    Mean slope under the lidar, -15 to 15 [deg]: positive where the sea rises towards
-                                       +x, +y, as on a wave far longer than the patch. Default: 0
-    refined_size              float    Side of the finely resolved patch [m], or ``auto``. Default: ``auto``
-    cell_size                 float    Side of its cells [m], or ``auto``. Default: ``auto``
-    shortest_wave             float    Length of the shortest waves of the mesh [m], at least two cells, or ``auto``;
-                                       shorter waves are ripples. Default: ``auto``
-    centre_x, centre_y        float    Centre of the patch [m], or ``auto``: where the lidar's axis meets the sea, or
-                                       the centre of a height map. Default: ``auto``
-    size                      float    Side of the surface [m], or ``auto``: 1000 or more. Cells grow outside the patch.
-                                       Default: ``auto``
-    period                    float    Period of the sea [m], or ``auto``: three peak wavelengths or more, in steps of
-                                       32 m, at most 512 m. Default: ``auto``
-    map_size                  float    Side of a height map that carries no positions [m]
-    altitude, off_nadir_deg,  float    Values for the choice of ``auto`` instead of those of ``lidar_transmitter`` and
-    field_of_view_mrad,                receiver in the scene; or instead of ``divergence_mrad`` one of
-    divergence_mrad                    ``divergence_fwhm_mrad`` and ``divergence_1e2_mrad``
-    (nested)                  bsdf     Any BSDF instead of the ripples
-    interior                  medium   The water: ``layered_water``
-    ========================  =======  =================================================================================
+    .. parameters::
 
     The automatic shortest wave is the beam's standard deviation on the sea or, if shorter, four pixels, 0.08 to 2 m; it
     does not depend on the cells. Automatic cells are a twelfth of that standard deviation and at most half of a pixel's
@@ -172,9 +120,10 @@ class OceanSurface(mi.Mesh):
             self._values[name] = props.get(name, default)
             return self._values[name]
 
-        self._use(SeaSurface.read(get, is_placeholder=waits))
+        read = OCEAN_SURFACE.reader(get)
+        self._use(SeaSurface.read(read, is_placeholder=waits))
         #: Resolution of the mesh; None for a level plane in its place.
-        self._resolution = None if waits else Resolution.read(get, ())
+        self._resolution = None if waits else Resolution.read(read, ())
         children = [child for _, child in props.objects()]
         water = next((child.water for child in children if isinstance(child, WaterMedium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
@@ -200,11 +149,8 @@ class OceanSurface(mi.Mesh):
 
         Edits of the ripples stay. Raises UserError if the mesh has been edited, and must change.
         """
-
-        def get(name: str, _: Any) -> Any:
-            return self._values[name]
-
-        resolution = Resolution.read(get, footprints)
+        read = OCEAN_SURFACE.reader(self._values.get)
+        resolution = Resolution.read(read, footprints)
         if self._edited and resolution != self._resolution:
             raise UserError(
                 f"ocean_surface {self.id()!r}: {sorted(self._edited)[0]} was changed before the mesh was fitted to the "
@@ -214,7 +160,7 @@ class OceanSurface(mi.Mesh):
         if resolution == former:
             return False
         unfitted = self._roughness()
-        self._use(SeaSurface.read(get, footprints))
+        self._use(SeaSurface.read(read, footprints))
         fill_mesh(self, self.sea.mesh(self._frame_origin))
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)
@@ -317,4 +263,4 @@ class SeaPatches:
         return positions
 
 
-mi.register_shape("ocean_surface", recorded(OceanSurface))
+register("shape", OCEAN_SURFACE, OceanSurface)

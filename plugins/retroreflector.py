@@ -7,25 +7,15 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.core.parameters.bottom import RETROREFLECTOR
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
-
-#: Narrowest lobe [deg]: 32-bit directions are accurate to a thousandth of it.
-_NARROWEST = 0.01
 
 
 class Retroreflector(mi.BSDF):
     r"""Retro-reflecting surface (``retroreflector``).
 
-    =============  =====  ==============================================================================================
-    Parameter      Type   Meaning
-    =============  =====  ==============================================================================================
-    reflectance    float  Reflected share of the light, 0 to 1. Default: 0.5
-    width_deg      float  Full angle between the directions where the lobe has fallen to e^-1/2 of its peak [deg], 0.01
-                          to 180. Default: 2
-    diffuse_share  float  Lambertian share of the reflected light, 0 to 1. Default: 0
-    =============  =====  ==============================================================================================
+    .. parameters::
 
     For reflective sheeting, beads and prisms on a target. Light that arrives from the direction :math:`\omega_i` leaves
     about the same direction,
@@ -57,11 +47,10 @@ class Retroreflector(mi.BSDF):
         {'type': 'retroreflector', 'reflectance': 0.6, 'width_deg': 2.0, 'diffuse_share': 0.1}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.reflectance = in_range("reflectance", props.get("reflectance", 0.5), 0.0, 1.0)
-        self.width = math.radians(in_range("width_deg", props.get("width_deg", 2.0), _NARROWEST, 180.0))
-        self.diffuse_share = in_range("diffuse_share", props.get("diffuse_share", 0.0), 0.0, 1.0)
+        self.reflectance, self.diffuse_share = props.read("reflectance"), props.read("diffuse_share")
+        self.width = math.radians(props.read("width_deg"))
         self._concentration = 0.25 / math.sin(0.25 * self.width) ** 2
         self._mass = -math.expm1(-2 * self._concentration)
         kinds = (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection)
@@ -134,4 +123,4 @@ class Retroreflector(mi.BSDF):
         )
 
 
-mi.register_bsdf("retroreflector", recorded(Retroreflector))
+register("bsdf", RETROREFLECTOR, Retroreflector)

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, non_negative, positive
+from mitransient_lidar.core.parameters.bottom import SEABED
+from mitransient_lidar.core.parameters.declaration import AUTO, Read
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
-from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, register
 from mitransient_lidar.transport.nested_objects import create_object
 
-#: Steepest tilt [deg] and steepest ripples, height over length, so that facets are at most at 45 degrees with either.
-_STEEPEST_TILT, _STEEPEST_RIPPLE = 45.0, 0.3
+#: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
+_STEEPEST_RIPPLE = 0.3
 
 #: Largest number of cells on a side of the fine square: 8 million triangles.
 _MOST_CELLS = 2048
@@ -35,8 +34,6 @@ _DEFAULT_SIZE = 20.0
 
 #: Mesh attribute of the reflectance.
 REFLECTANCE = "vertex_reflectance"
-
-Get = Callable[[str, Any], Any]
 
 
 @dataclass(frozen=True)
@@ -63,40 +60,37 @@ class Bottom:
         centre of the bottom lies above the sea.
     """
 
-    def __init__(self, get: Get) -> None:
-        self.terrain = _read_terrain(get)
-        depth = get("depth", 8.0 if self.terrain is None else 0.0)
-        self.depth = ranged("depth", (positive if self.terrain is None else non_negative)("depth", depth))
+    def __init__(self, read: Read) -> None:
+        self.terrain = _read_terrain(read)
+        depth = read("depth", 8.0 if self.terrain is None else 0.0)
+        self.depth = depth if self.terrain is not None else positive("depth", depth)
         #: Rise along x and y [m/m].
-        self.slope = tuple(
-            math.tan(math.radians(in_range(name, get(name, 0.0), -_STEEPEST_TILT, _STEEPEST_TILT)))
-            for name in ("slope_x_deg", "slope_y_deg")
-        )
-        self.ripple_height = non_negative("ripple_height", get("ripple_height", 0.0))
-        self.ripple_length = positive("ripple_length", get("ripple_length", 0.2))
+        self.slope = tuple(math.tan(math.radians(read(name))) for name in ("slope_x_deg", "slope_y_deg"))
+        self.ripple_height, self.ripple_length = read("ripple_height"), read("ripple_length")
         if self.ripple_height > _STEEPEST_RIPPLE * self.ripple_length:
             raise UserError(
                 f"ripple_height = {self.ripple_height:g} must be at most {_STEEPEST_RIPPLE:g} of ripple_length = "
                 f"{self.ripple_length:g}"
             )
-        self.patches = _read_patches(get("patches", ""))
+        self.patches = _read_patches(read("patches"))
         middle, widest = (0.0, 0.0), _DEFAULT_SIZE
         if self.terrain is not None:
             x, y = self.terrain.x, self.terrain.y
             widest = float(max(x[-1] - x[0], y[-1] - y[0]))
             # A part of a map in map coordinates lies about its origin.
-            if self.terrain.origin is None or get("refined_size", "auto") == "auto":
+            if self.terrain.origin is None or read("refined_size") == AUTO:
                 middle = float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2
-        self.centre = ranged("centre_x", get("centre_x", middle[0])), ranged("centre_y", get("centre_y", middle[1]))
+        self.centre = read("centre_x", middle[0]), read("centre_y", middle[1])
         widest = max([widest, *(2 * patch.reach(self.centre) for patch in self.patches)])
-        self.curvature = in_range("curvature", get("curvature", 0.0), -1.0, 1.0)
+        self.curvature = read("curvature")
         #: Side of the cells [m], infinite for a plane.
-        self.cell_size = _length(get, "cell_size", self._largest_cell())
-        self.refined_size = _length(get, "refined_size", widest)
+        cell, side = read("cell_size"), read("refined_size")
+        self.cell_size = self._largest_cell() if cell == AUTO else cell
+        self.refined_size = widest if side == AUTO else side
         #: Direction across the crests [rad].
-        self.ripple_bearing = math.radians(finite("ripple_bearing_deg", get("ripple_bearing_deg", 0.0)))
-        self.size = ranged("size", get("size", 1000.0))
-        self.reflectance = in_range("reflectance", get("reflectance", 0.1), 0.0, 1.0)
+        self.ripple_bearing = math.radians(read("ripple_bearing_deg"))
+        self.size = read("size")
+        self.reflectance = read("reflectance")
         self._check()
 
     def _largest_cell(self) -> float:
@@ -171,11 +165,11 @@ class Bottom:
         return values
 
 
-def _read_terrain(get: Get) -> HeightMap | None:
+def _read_terrain(read: Read) -> HeightMap | None:
     """Read the height map, if there is one."""
-    path = get("filename", "")
+    path = read("filename", "")
     names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data")
-    given = size, x, y, values, holes, cell, unit, no_data = tuple(get(name, None) for name in names)
+    given = size, x, y, values, holes, cell, unit, no_data = tuple(map(read, names))
     if not path:
         for name, value in zip(names, given, strict=True):
             if value is not None:
@@ -183,7 +177,7 @@ def _read_terrain(get: Get) -> HeightMap | None:
         return None
     if (x is None) != (y is None):
         raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
-    origin = None if x is None else (finite("origin_x", x), finite("origin_y", y))
+    origin = None if x is None else (x, y)
     return read_height_map(path, size, origin, values, holes or "refuse", cell, unit, no_data)
 
 
@@ -204,57 +198,10 @@ def _read_patches(text: str) -> tuple[Patch, ...]:
     return tuple(patches)
 
 
-def _length(get: Get, name: str, default: float) -> float:
-    """Return a positive length [m], or the default where it is ``auto``."""
-    value = get(name, "auto")
-    return default if value == "auto" else positive(name, value)
-
-
 class Seabed(mi.Mesh):
     r"""Bottom of the sea (``seabed``).
 
-    ========================  ======  ==================================================================================
-    Parameter                 Type    Meaning
-    ========================  ======  ==================================================================================
-    depth                     float   Depth at x = y = 0 [m], above 0 to 1e5; with a height map from 0, added to its
-                                      depths. Default: 8, or 0 with a height map
-    slope_x_deg, slope_y_deg  float   Tilt, -45 to 45 [deg]: positive where the bottom rises towards +x, +y. Default: 0
-    curvature                 float   Curvature of a bowl about the centre, -1 to 1 [1/m], negative for a mound; it ends
-                                      half of ``refined_size`` from the centre. Default: 0
-    ripple_height             float   Height of sand ripples, trough to crest [m], at most 0.3 of their length; 0 for
-                                      none. Default: 0
-    ripple_length             float   Distance of their crests [m]. Default: 0.2
-    ripple_bearing_deg        float   Direction across the crests, from +x to +y [deg]. Default: 0
-    filename                  string  Height map above the mean sea level: .npy, .npz, .exr, .nc, an ESRI ASCII grid
-                                      (.asc), a GeoTIFF (.tif), a Bathymetric Attributed Grid (.bag), or points (.xyz,
-                                      .csv, .txt)
-    map_size                  float   Side along x of a height map that carries no positions [m]
-    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: what the file
-                                      states, or ``heights``
-    map_unit                  string  Unit of the values where the file does not state it: ``m``, ``cm``, ``km``,
-                                      ``ft``, ``ftUS`` (US survey foot) or ``fathom``. Default: ``m``
-    map_no_data               float   Value of cells without a height where the file does not declare it
-    map_holes                 string  ``refuse`` or ``fill`` cells without a value, with that of the nearest cell.
-                                      Default: ``refuse``
-    map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
-                                      or their mean spacing
-    origin_x, origin_y        float   Point of the map, in its coordinates in metres, that lies at x = y = 0. Default:
-                                      of an .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the
-                                      centre; positions in other files are those of the scene
-    reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
-    patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
-                                      1; where they overlap the last one counts. Default: none
-    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e7 to 1e7. Default: 0, or the map's
-                                      centre; 0 if ``refined_size`` of a map in map coordinates is given
-    refined_size              float   Its side [m], or ``auto``: 20 m, or the map's longer side, or more for the
-                                      patches. Default: ``auto``
-    cell_size                 float   Side of its cells [m], or ``auto``: an eighth of the ripples' length, an eighth of
-                                      the smallest patch's radius, the map's own or 0.25 m, the smallest of them.
-                                      Default: ``auto``
-    size                      float   Side of the bottom [m], 0.001 to 1e6: cells grow outside the square.
-                                      Default: 1000
-    (nested)                  bsdf    Any BSDF instead of the Lambertian one
-    ========================  ======  ==================================================================================
+    .. parameters::
 
     The height at (x, y), at a distance r from the centre, is
 
@@ -288,7 +235,7 @@ class Seabed(mi.Mesh):
     """
 
     def __init__(self, props: RecordedProperties) -> None:
-        self.bottom = Bottom(props.get)
+        self.bottom = Bottom(props.read)
         if not any(isinstance(child, mi.BSDF) for _, child in props.objects()):
             props["reflection"] = create_object(
                 "diffuse", reflectance=create_object("mesh_attribute", name=REFLECTANCE)
@@ -334,4 +281,4 @@ class Seabed(mi.Mesh):
         )
 
 
-mi.register_shape("seabed", recorded(Seabed))
+register("shape", SEABED, Seabed)

@@ -8,38 +8,21 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite
+from mitransient_lidar.core.parameters.bottom import SEDIMENT
 from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.sediments import bottom_reflectance
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
-#: Values of the parameter ``model``.
-MODELS = ("lambertian", "hapke")
-
-#: Parameters of particles, and their defaults.
-_PARTICLES = {"lobe_asymmetry": 0.0, "backward_share": 0.5, "opposition_amplitude": 1.0, "opposition_width": 0.06}
+#: Parameters of particles.
+_PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
 
 
 class Sediment(mi.BSDF):
     r"""Bottom by reflectance or name (``sediment``).
 
-    ========================  ======  ==================================================================================
-    Parameter                 Type    Meaning
-    ========================  ======  ==================================================================================
-    model                     string  ``lambertian``, which is the default, or ``hapke``
-    reflectance               string  Share of the light that is reflected, at vertical incidence: 0 to 1, or
-                                      ``coral_sand``, ``green_algae``, ``brown_algae`` or ``red_algae``. Default: 0.1
-    wavelength_nm             float   Wavelength of a reflectance by name [nm], 400 to 700. Default: 532
-    single_scattering_albedo  float   hapke: albedo of the particles, 0 to 1, instead of ``reflectance``
-    lobe_asymmetry            float   hapke: asymmetry *b* of the lobes of the particles' phase function, 0 to 0.9.
-                                      Default: 0, particles that scatter evenly
-    backward_share            float   hapke: share *s* of the lobe towards the source, 0 to 1; (1 + c)/2 with Hapke's
-                                      c. Default: 0.5
-    opposition_amplitude      float   hapke: opposition effect :math:`B_0`, 0 to 3. Default: 1
-    opposition_width          float   hapke: its half width *h* [rad], 0.001 to 1. Default: 0.06
-    ========================  ======  ==================================================================================
+    .. parameters::
 
     With ``lambertian`` it is Mitsuba's ``diffuse``. With ``hapke`` it reflects, at the angle *g* between the directions
     to source and receiver,
@@ -76,9 +59,8 @@ class Sediment(mi.BSDF):
         {'type': 'sediment', 'model': 'hapke', 'reflectance': 'coral_sand'}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        props.get("model", MODELS[0])
         particles = _particles(props)
         if "single_scattering_albedo" in props:
             if "reflectance" in props:
@@ -86,7 +68,7 @@ class Sediment(mi.BSDF):
                     f"reflectance = {props['reflectance']} and single_scattering_albedo = "
                     f"{props['single_scattering_albedo']} give the same: give one of them"
                 )
-            albedo = finite("single_scattering_albedo", props["single_scattering_albedo"])
+            albedo = props.read("single_scattering_albedo")
             #: Reflection (`physics.water.hapke.HapkeSurface`).
             self.surface = particles.of_albedo("single_scattering_albedo", albedo)
         else:
@@ -163,24 +145,20 @@ class Sediment(mi.BSDF):
         return f"Sediment[{self.surface}]"
 
 
-def _reflectance(props: mi.Properties) -> float:
+def _reflectance(props: RecordedProperties) -> float:
     """Return the reflectance at vertical incidence."""
-    value, wavelength = props.get("reflectance", 0.1), props.get("wavelength_nm", 532.0)
-    return bottom_reflectance("reflectance", value, finite("wavelength_nm", wavelength))
+    return bottom_reflectance("reflectance", props.read("reflectance", 0.1), props.read("wavelength_nm"))
 
 
-def _particles(props: mi.Properties) -> HapkeSurface:
+def _particles(props: RecordedProperties) -> HapkeSurface:
     """Return a surface of particles without their albedo."""
-    return HapkeSurface(0.0, *(finite(name, props.get(name, default)) for name, default in _PARTICLES.items()))
+    return HapkeSurface(0.0, *map(props.read, _PARTICLES))
 
 
-def _create(props: mi.Properties) -> Any:
+def _create(props: RecordedProperties) -> Any:
     """Return a `Sediment`, or Mitsuba's own Lambertian surface."""
-    model = props.get("model", MODELS[0])
-    if model not in MODELS:
-        raise UserError(f"model = {model!r} must be one of {', '.join(MODELS)}")
-    if model == "hapke":
-        return recorded(Sediment)(props)
+    if props.read("model") == "hapke":
+        return Sediment(props)
     if "single_scattering_albedo" in props:
         raise UserError(
             f"single_scattering_albedo = {props['single_scattering_albedo']} needs model = 'hapke': give reflectance"
@@ -190,4 +168,4 @@ def _create(props: mi.Properties) -> Any:
     return create_object("diffuse", reflectance=_reflectance(props))
 
 
-mi.register_bsdf("sediment", _create)
+register("bsdf", SEDIMENT, _create, Sediment)

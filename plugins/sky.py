@@ -6,27 +6,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.parameters.bottom import SKY
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, recorded
-from mitransient_lidar.transport.daylight.sky import SKIES, read_direction, relative_irradiance
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, register
+from mitransient_lidar.transport.daylight.sky import SKIES, direction_of, relative_irradiance
 
 
 class Sky(EmitterWithoutExtent):
     r"""Sky (``sky``).
 
-    ===============  ======  ===========================================================================================
-    Parameter        Type    Meaning
-    ===============  ======  ===========================================================================================
-    distribution     string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
-                             ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
-                             horizon), or ``uniform``. Default: ``clear``
-    irradiance       float   Irradiance at the sea on a level plane [W m^-2 nm^-1], 0 to 1e6. Default for ``clear``:
-                             that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`); required
-                             for the others
-    sun_zenith_deg   float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
-    sun_azimuth_deg  float   ``clear``: azimuth of the sun, from +x towards +y [deg]. Default: 0
-    ===============  ======  ===========================================================================================
+    .. parameters::
 
     The upper half of an infinite sphere; the lower half is black. The radiance distribution (for ``clear`` of Harrison
     and Coombes 1988, doi:10.1016/0038-092X(88)90072-2) is scaled to the irradiance. The sun itself is the plugin
@@ -47,19 +36,17 @@ class Sky(EmitterWithoutExtent):
     #: Kind of daylight, by which integrators identify it.
     daylight = "sky"
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.distribution = props.get("distribution", "clear")
-        if self.distribution not in SKIES:
-            raise UserError(f"distribution = {self.distribution!r} must be one of {', '.join(SKIES)}")
+        self.distribution = props.read("distribution")
         for name in ("sun_zenith_deg", "sun_azimuth_deg"):
             if name in props and self.distribution != "clear":
                 raise UserError(f"{name} = {props[name]:g} is for distribution = 'clear': leave it out")
-        zenith, self.sun = read_direction(props, "sun_")
+        zenith = props.read("sun_zenith_deg")
+        self.sun = direction_of(zenith, props.read("sun_azimuth_deg"))
         if "irradiance" not in props and self.distribution != "clear":
             raise UserError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
-        default = clear_sky_irradiance(zenith).diffuse
-        self.irradiance = ranged("irradiance", props.get("irradiance", default))
+        self.irradiance = props.read("irradiance", clear_sky_irradiance(zenith).diffuse)
         self._scale = self.irradiance / relative_irradiance(self.distribution, self.sun)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value
@@ -95,4 +82,4 @@ class Sky(EmitterWithoutExtent):
         return f"Sky[{self.distribution}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
 
 
-mi.register_emitter("sky", recorded(Sky))
+register("emitter", SKY, Sky)

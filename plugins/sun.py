@@ -6,26 +6,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.physics.lidar.clear_sky import SUN_RADIUS_DEG, clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, recorded
-from mitransient_lidar.transport.daylight.sky import read_direction
+from mitransient_lidar.core.parameters.bottom import SUN
+from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, register
+from mitransient_lidar.transport.daylight.sky import direction_of
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
 
 class Sun(EmitterWithoutExtent):
     r"""Sun (``sun``).
 
-    ==================  =====  =========================================================================================
-    Parameter           Type   Meaning
-    ==================  =====  =========================================================================================
-    zenith_deg          float  Angle of the sun's centre from the vertical [deg], 0 to 89. Default: 40
-    azimuth_deg         float  Its azimuth, from +x (the receiver's viewing direction) towards +y [deg]. Default: 0
-    irradiance          float  Irradiance at the sea on a plane normal to its rays [W m^-2 nm^-1], 0 to 1e6. Default:
-                               that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)
-    angular_radius_deg  float  Radius of its disc [deg], 0.001 to 5. Default: 0.2666
-    ==================  =====  =========================================================================================
+    .. parameters::
 
     A disc at infinity of the uniform radiance :math:`E / (\pi \sin^2 r)`. ``passive_volpath`` draws one point of it for
     each path; the lidar integrators leave it out. Mitsuba's own integrators sample the disc, and do not meet it by
@@ -46,12 +37,12 @@ class Sun(EmitterWithoutExtent):
     #: Kind of daylight, by which integrators identify it.
     daylight = "sun"
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.zenith_deg, self.direction = read_direction(props)
-        default = clear_sky_irradiance(self.zenith_deg).direct_normal
-        self.irradiance = ranged("irradiance", props.get("irradiance", default))
-        radius = in_range("angular_radius_deg", props.get("angular_radius_deg", SUN_RADIUS_DEG), 1e-3, 5.0)
+        self.zenith_deg = props.read("zenith_deg")
+        self.direction = direction_of(self.zenith_deg, props.read("azimuth_deg"))
+        self.irradiance = props.read("irradiance", clear_sky_irradiance(self.zenith_deg).direct_normal)
+        radius = props.read("angular_radius_deg")
         # sin^2 of half the radius, as the cosine of so small an angle is 1 to rounding.
         self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)
         self._radiance = self.irradiance / (np.pi * np.sin(np.radians(radius)) ** 2)
@@ -95,4 +86,4 @@ class Sun(EmitterWithoutExtent):
         return f"Sun[zenith_deg={self.zenith_deg:g}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
 
 
-mi.register_emitter("sun", recorded(Sun))
+register("emitter", SUN, Sun)

@@ -6,16 +6,13 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import finite, integer
+from mitransient_lidar.core.parameters.declaration import AUTO
+from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
-from mitransient_lidar.physics.lidar.time_axis import MOST_BINS, TimeAxis
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.histogram import TransientHistogram
-
-#: Value of a parameter that is chosen for the scene.
-_AUTO = "auto"
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
@@ -24,25 +21,7 @@ _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
 class TimeGatedFilm(mi.Film):
     r"""Time histogram of received energy of each pixel, and gates (``time_gated_film``).
 
-    ================  =======  =========================================================================================
-    Parameter         Type     Meaning
-    ================  =======  =========================================================================================
-    time_start_ns     float    Start of the first bin [ns] after the pulse's peak leaves the transmitter, up to
-                               1e9 before or after, or ``auto``: before the first light. Default: ``auto``
-    bin_width_ns      float    Width of a bin [ns], 1e-6 to 1e6. Default: 0.5
-    bin_count         integer  Number of bins, 1 to 1 000 000, or ``auto``: until after the last light.
-                               Default: ``auto``
-    gate_count        integer  Number of gates, 0 (none) to 100 000. Default: 0
-    gate_start_ns     float    Half height of the first gate's rising edge [ns]
-    gate_start_depth  float    Instead: depth of the echoes that arrive at that time [m], on the receiver's axis
-    gate_width_ns     float    Time between the half heights of a gate's edges [ns], 1e-6 to 1e9. Default: 10
-    gate_step_ns      float    Time from gate to gate [ns], 1e-6 to 1e9. Default: the width
-    gate_rise_ns,     float    10-90 % times of raised-cosine edges [ns], 0 (sharp) to 1e9. Default: 0
-    gate_fall_ns
-    gate_profile      string   Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in
-                               other units below a heading that names them
-    pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
-    ================  =======  =========================================================================================
+    .. parameters::
 
     With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
     ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
@@ -76,12 +55,12 @@ class TimeGatedFilm(mi.Film):
         {'type': 'time_gated_film', 'time_start_ns': 1390.0, 'bin_width_ns': 0.5, 'bin_count': 'auto'}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
-        start, count = (props.get(name, _AUTO) for name in ("time_start_ns", "bin_count"))
+    def __init__(self, props: RecordedProperties) -> None:
+        start, count = map(props.read, ("time_start_ns", "bin_count"))
         #: Parameters of the record; None for a start [ns] or a number of bins that is chosen.
-        self.time_start_ns = None if start == _AUTO else ranged("time_start_ns", start)
-        self.bin_width_ns = ranged("bin_width_ns", props.get("bin_width_ns", 0.5))
-        self.bin_count = None if count == _AUTO else _bin_count(count)
+        self.time_start_ns = None if start == AUTO else start
+        self.bin_width_ns = props.read("bin_width_ns")
+        self.bin_count = None if count == AUTO else count
         #: Time bins of the record, None until `fit`; whether `fit` leaves them as they are.
         self.axis: TimeAxis | None = None
         self.is_fixed = False
@@ -166,20 +145,13 @@ class TimeGatedFilm(mi.Film):
     def to_string(self) -> str:
         """Return a description."""
         known = {"time_start_ns": self.time_start_ns, "bin_count": self.bin_count, **self.used_values}
-        start, count = (_AUTO if value is None else f"{value:.10g}" for value in known.values())
+        start, count = (AUTO if value is None else f"{value:.10g}" for value in known.values())
         return f"TimeGatedFilm[time_start_ns={start}, bin_width_ns={self.bin_width_ns:g}, bin_count={count}]"
 
 
-def _bin_count(value: object) -> int:
-    """Return a number of bins, or its text, as an integer."""
-    if isinstance(value, str):
-        value = int(value) if value.strip().isdecimal() else finite("bin_count", value)
-    return integer("bin_count", value, 1, MOST_BINS)
-
-
-def _gate_plan(props: mi.Properties) -> GatePlan | None:
+def _gate_plan(props: RecordedProperties) -> GatePlan | None:
     """Read the gates of the film, or None; raise UserError where parameters contradict each other."""
-    count = integer("gate_count", props.get("gate_count", 0), 0, 100_000)
+    read, count = props.read, props.read("gate_count")
     given = [name for name in (*_GATE_SHAPE, *_GATE_START, "gate_step_ns", "gate_profile", "pulses") if name in props]
     if count == 0:
         for name in given:
@@ -188,21 +160,19 @@ def _gate_plan(props: mi.Properties) -> GatePlan | None:
     starts = [name for name in _GATE_START if name in given]
     if len(starts) != 1:
         raise UserError(f"gate_count = {count} gates need either gate_start_ns or gate_start_depth")
-    start = ranged(starts[0], props[starts[0]])
-    pulses = integer("pulses", props.get("pulses", 1), 1, 10**9)
+    start, pulses = read(starts[0]), read("pulses")
     if "gate_profile" in props:
         for name in _GATE_SHAPE:
             if name in given:
                 raise UserError(f"{name} = {props[name]:g} and gate_profile: give one of them")
         profile = GateShape.from_file(str(props["gate_profile"]))
-        step = ranged("gate_step_ns", props.get("gate_step_ns", profile.width_ns))
+        step = read("gate_step_ns", profile.width_ns)
         train = GateTrain.measured(profile, 0.0, step, count, pulses)
     else:
-        width = ranged("gate_width_ns", props.get("gate_width_ns", 10.0))
-        rise, fall = (ranged(name, props.get(name, 0.0)) for name in _GATE_SHAPE[1:])
-        step = ranged("gate_step_ns", props.get("gate_step_ns", width))
+        width, rise, fall = map(read, _GATE_SHAPE)
+        step = read("gate_step_ns", width)
         train = GateTrain(0.0, width, step, count, rise, fall, pulses)
     return GatePlan(train, **{"start_ns" if starts[0] == "gate_start_ns" else "start_depth": start})
 
 
-mi.register_film("time_gated_film", recorded(TimeGatedFilm))
+register("film", TIME_GATED_FILM, TimeGatedFilm)

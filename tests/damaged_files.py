@@ -160,11 +160,10 @@ def damage_attributes(path: Path, rng: random.Random) -> None:
 
 def set_extreme(path: Path, rng: random.Random) -> None:
     """Set one parameter of a plugin of a scene to an end of its range, or to an extreme."""
-    from mitransient_lidar.core.ranges import limits
-    from mitransient_lidar.loading.plugin_pages import plugin_parameters
+    from mitransient_lidar.core.parameters.catalogue import PLUGINS, limits
 
     tree = ElementTree.parse(path)
-    parts = [(part, name) for part in tree.iter() for name in plugin_parameters(part.get("type", ""))]
+    parts = [(part, each.name) for part in tree.iter() for each in PLUGINS.get(part.get("type", ""), ())]
     part, name = rng.choice(parts)
     setting = next((one for one in part if one.get("name") == name and one.get("value") is not None), None)
     if setting is None:

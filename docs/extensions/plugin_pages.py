@@ -64,13 +64,13 @@ def plugins() -> list[Plugin]:
     found = []
     for name in PLUGIN_MODULES:
         module = importlib.import_module(f"mitransient_lidar.plugins.{name}")
-        registered = re.search(r'^mi\.register_(\w+)\("(\w+)"', inspect.getsource(module), re.MULTILINE)
+        registered = re.search(r'^register\("(\w+)", (\w+)', inspect.getsource(module), re.MULTILINE)
         if registered is None:
             continue  # a base class
-        kind = {"mesh": "shape"}.get(registered[1], registered[1])
+        kind, declared = registered[1], vars(module)[registered[2]]
         manuals = {one.__doc__ for one in vars(module).values() if isinstance(one, type)}
-        (manual,) = (text for text in manuals if text and f"(``{registered[2]}``)" in text.partition("\n")[0])
-        found.append(Plugin(registered[2], kind, inspect.cleandoc(manual)))
+        (manual,) = (text for text in manuals if text and f"(``{declared.name}``)" in text.partition("\n")[0])
+        found.append(Plugin(declared.name, kind, inspect.cleandoc(manual)))
     return sorted(found, key=lambda one: (list(_KINDS).index(one.kind), one.name))
 
 
@@ -122,9 +122,9 @@ def _page(plugin: Plugin) -> str:
     text, xml_block, _ = rest.partition(".. code-block:: xml")
     assert xml_block, f"{plugin.name}: no example in XML"
     # The table of parameters comes first; it has a class for the style sheet.
-    tables, rule, prose = text.strip().rpartition("==\n")
+    table, prose = re.fullmatch(r"(.. list-table::\n(?:   .*\n|\n)+)(.*)", text.strip(), re.DOTALL).groups()
     prose = re.sub(r"doi:(10\.\S*[^\s.,;)])", r"`doi:\1 <https://doi.org/\1>`__", prose)
-    text = f"Parameters\n----------\n\n.. rst-class:: parameters\n\n{tables}{rule}{prose}\n"
+    text = f"Parameters\n----------\n\n.. rst-class:: parameters\n\n{table}\n{prose}\n"
     tabs = "".join(
         f"   .. tab-item:: {title}\n\n      .. code-block:: {language}\n\n"
         + textwrap.indent(example(plugin.manual, language), " " * 9)

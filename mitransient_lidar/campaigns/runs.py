@@ -14,7 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone

@@ -12,7 +12,8 @@ from xml.dom import minidom
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import LARGEST_COORDINATE, limits
+from mitransient_lidar.core.parameters.catalogue import limits
+from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, is_number, shown
 from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
 
@@ -79,8 +80,9 @@ def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
     elif element.tagName in ("spectrum", "rgb") and attribute == "value":
         _check_spectrum(label, value)
     if attribute == "value" and element.tagName in ("float", "integer", "string"):
+        parent: Any = element.parentNode
         for number in _numbers_in(value):
-            _check_range(label.name, owner, number)
+            _check_range(label.name, owner, parent.getAttribute("type"), number)
     if attribute == "value" and _is_share(element):
         for word in re.split(r"[\s,]+", value.strip()):
             in_range(label.name, word.rpartition(":")[2], 0, 1)
@@ -151,7 +153,7 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                 if isinstance(value, float):
                     finite(label, value)
                 for number in _numbers_in(str(value)):
-                    _check_range(label, key, number)
+                    _check_range(label, key, str(part.get("type")), number)
                 if _SHARE.search(key):
                     _check_shares(label, value)
             elif is_transform(value):
@@ -227,9 +229,9 @@ def _numbers_in(text: str) -> list[float]:
     return [float(word) for word in words] if all(map(is_number, words)) else []
 
 
-def _check_range(label: str, name: str, number: float) -> None:
-    """Check a number against the range of the parameter `name`."""
-    if found := limits(name):
+def _check_range(label: str, name: str, plugin: str, number: float) -> None:
+    """Check a number against the range of the parameter `name` of a plugin."""
+    if found := limits(name, plugin):
         in_range(label, number, *found)
 
 

@@ -12,8 +12,12 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.catalogue import PLUGINS
 from mitransient_lidar.core.validation import finite, is_number, shown
 from mitransient_lidar.loading.document import SceneDocument
+
+#: Plugins of Mitsuba that lidar scenes use.
+_OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
 
 _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
@@ -59,8 +63,23 @@ def without_alternatives(parameters: Mapping[str, str], given: Mapping[str, str]
     return kept
 
 
+def unknown_parameters(message: str) -> str | None:
+    """Return the sentence for Mitsuba's message about parameters that a plugin does not have, or about no plugin."""
+    if found := re.search(r'unreferenced propert\w+ in [\w ]+ of type "(\w+)":((?:\s+- \w+ "[^"]+"[^"]*)+)', message):
+        plugin = PLUGINS.get(found[1])
+        allowed = [each.name for each in plugin or () if each.name.isidentifier()]
+        names = re.findall(r'- \w+ "([^"]+)"', found[2])
+        close = [near for name in names for near in difflib.get_close_matches(name, allowed, n=1)]
+        hint = f"did you mean {' and '.join(close)}" if close else f"it has {', '.join(allowed)}"
+        return f"{found[1]}: there is no parameter {' or '.join(names)}" + (f"; {hint}" if allowed else "")
+    if found := re.search(r'Plugin "([^"]*)" not found', message):
+        close = difflib.get_close_matches(found[1], [*PLUGINS, *_OTHERS], n=2)
+        return f"type = {found[1]!r} is not a plugin" + (f"; did you mean {' or '.join(close)}" if close else "")
+    return None
+
+
 def value_of(parameters: Mapping[str, str], name: str) -> float:
-    """Return the value of a number among the parameters of a scene, in the unit of `core.ranges.unit_of`.
+    """Return the value of a number among the parameters of a scene, in the unit of `core.parameters.catalogue.unit_of`.
 
     Parameters
     ----------

@@ -37,19 +37,16 @@ import numpy as np
 from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import check_regular, is_file_name, is_there, open_file
+from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, PLUGINS
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.mesh_files import PLY_PLUGINS, check_ply
-from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 from mitransient_lidar.loading.scene_json import from_json, to_json
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-#: Parameters that name files.
-FILE_PARAMETERS = ("filename", "pixel_map", "blur_file", "profile_file", "pulse_file", "profile", "gate_profile")
 
 #: Origin of a frame that is that of the scene.
 _ORIGIN = np.zeros(3)
@@ -268,7 +265,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN) -> dict[str, An
     own = part.parameters
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
-    known: list[str] = ["type", *plugin_parameters(str(own["type"]))]
+    known = ["type", *(each.name for each in PLUGINS[str(own["type"])] if each.name.isidentifier())]
     used = {"used": part.used_values} if isinstance(part, Automatic) and part.used_values else {}
     return {**dict.fromkeys(known), **plain, **used, **_named(objects, origin)}
 
@@ -329,7 +326,7 @@ def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> di
     files = {}
     searched = [*folders, *(Path(str(place)) for place in mi.file_resolver()), Path()]
     for plugin, name in references:
-        places = [Path()] if is_own_plugin(plugin) else searched
+        places = [Path()] if plugin in PLUGINS else searched
         path = next((found for place in places if name and is_there(found := place / name)), None)
         if path is not None:
             path = path.resolve()

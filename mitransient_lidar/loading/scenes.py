@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
+from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
@@ -19,9 +20,8 @@ from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_docum
 from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
-from mitransient_lidar.loading.parameters import check_params, fill
-from mitransient_lidar.loading.plugin_pages import unknown_parameters
-from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, SceneRecord
+from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters
+from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:

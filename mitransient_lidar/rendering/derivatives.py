@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.parameters import parameter_of, value_of
 from mitransient_lidar.transport.perturbations import Perturbation

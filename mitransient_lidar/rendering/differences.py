@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value

@@ -18,7 +18,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.ranges import RANGES
+from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
@@ -293,7 +293,7 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
         raise UserError(f"positions of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
-    in_range("positions", float(pairs.flat[np.abs(pairs).argmax()]), *RANGES["aim_x"])
+    in_range("positions", float(pairs.flat[np.abs(pairs).argmax()]), -LARGEST_COORDINATE, LARGEST_COORDINATE)
     if (apart := float(np.ptp(pairs, axis=0).max())) > 2 * FARTHEST:
         raise UserError(f"positions are {apart:g} m apart along x or y: at most {2 * FARTHEST:g} m may be")
     return pairs

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import RANGES
+from mitransient_lidar.core.parameters.catalogue import limits
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results.formats import PER_PIXEL
 
@@ -70,7 +70,7 @@ _COORDINATES = (
 def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
     """Raise `UserError` if a known attribute of a result is of another kind than a render writes, or out of range."""
     for name, (low, high) in _NUMBERS.items():
-        high = min(high, RANGES[name][1]) if name in RANGES else high
+        high = min(high, (limits(name) or (low, high))[1])
         value = attributes.get(name, low)
         if name in PER_PIXEL and _are_numbers(value) and min(value) >= low and max(value) <= high:
             continue

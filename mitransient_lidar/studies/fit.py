@@ -24,7 +24,7 @@ from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import RANGES
+from mitransient_lidar.core.parameters.water import LAYERED_WATER
 from mitransient_lidar.core.validation import integer, shown
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
@@ -268,7 +268,7 @@ class _RenderedModel:
             # Coefficients may also be those of a water by name, or of layers that the name does not tell apart.
             with contextlib.suppress(UserError):
                 value = value_of(self.texts, other)
-                found[name] = (value, RANGES[base][1]) if base == "attenuation" else (0.0, value)
+                found[name] = (value, LAYERED_WATER[base].high) if base == "attenuation" else (0.0, value)
         return found
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_vector
@@ -38,21 +37,6 @@ class KernelPose(Pose):
     delay: float | FloatArray = 0.0
     lanes: Lanes | None = None
     frame_origin: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    @classmethod
-    def from_properties(cls, props: mi.Properties) -> KernelPose:
-        """Read ``to_world``, or ``altitude``, ``off_nadir_deg``, ``aim_x`` and ``aim_y``, from plugin parameters."""
-        if "to_world" in props:
-            if "altitude" in props or "off_nadir_deg" in props:
-                raise UserError(f"{props.plugin_name()}: give either to_world or altitude and off_nadir_deg, not both")
-            matrix = np.array(props["to_world"].matrix, dtype=np.float64)
-            return cls.from_matrix(f"{props.plugin_name()}: to_world", matrix)
-        return cls.from_angles(
-            props.get("altitude", 200.0),
-            props.get("off_nadir_deg", 20.0),
-            props.get("aim_x", 0.0),
-            props.get("aim_y", 0.0),
-        )
 
     def in_frame(self, frame_origin: FloatArray) -> Self:
         """Return a pose in the scene relative to a place there [m], shape (3,)."""

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.core.parameters.water import FOURNIER_FORAND
 from mitransient_lidar.physics.water.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 
 class FournierForand(TabulatedPhaseFunction):
     r"""Fournier-Forand phase function (``fournier_forand``).
 
-    =================  =====  ==========================================================================================
-    Parameter          Type   Meaning
-    =================  =====  ==========================================================================================
-    backscatter_ratio  float  Backscattered share of the scattering bb/b, 3.4e-8 to 0.4999. Default: 0.0183
-    refractive_index,  float  Instead: index of the particles relative to water, above 1, and slope of their size
-    junge_slope               distribution, 3 to 5 (give both)
-    =================  =====  ==========================================================================================
+    .. parameters::
 
     Scattering by particles with a power-law size distribution (Fournier and Forand 1994; closed form of Fournier and
     Jonasz 1999). A backscatter ratio alone picks index and slope on the line
@@ -41,15 +33,14 @@ class FournierForand(TabulatedPhaseFunction):
         {'type': 'fournier_forand', 'backscatter_ratio': 0.04}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         if "refractive_index" in props or "junge_slope" in props:
             if "backscatter_ratio" in props or not ("refractive_index" in props and "junge_slope" in props):
                 raise UserError("fournier_forand: give backscatter_ratio, or both refractive_index and junge_slope")
-            self.refractive_index = in_range("refractive_index", props["refractive_index"], 1.0001, 2.0)
-            self.junge_slope = in_range("junge_slope", props["junge_slope"], 3.0001, 4.9999)
+            self.refractive_index = props.read("refractive_index")
+            self.junge_slope = props.read("junge_slope")
         else:
-            ratio = props.get("backscatter_ratio", 0.0183)
-            self.refractive_index, self.junge_slope = fournier_forand_parameters(ratio)
+            self.refractive_index, self.junge_slope = fournier_forand_parameters(props.read("backscatter_ratio"))
         super().__init__(props, PowerLawTable.fournier_forand(self.refractive_index, self.junge_slope))
         self.backscatter_ratio = fournier_forand_backscatter_ratio(self.refractive_index, self.junge_slope)
 
@@ -61,4 +52,4 @@ class FournierForand(TabulatedPhaseFunction):
         )
 
 
-mi.register_phase("fournier_forand", recorded(FournierForand))
+register("phase", FOURNIER_FORAND, FournierForand)

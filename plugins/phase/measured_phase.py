@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 
-import mitsuba as mi
-
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.water import MEASURED_PHASE
 from mitransient_lidar.physics.water.phase_file import read_phase_table
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 logger = logging.getLogger(__name__)
@@ -20,13 +19,7 @@ _TOLERATED = 0.02
 class MeasuredPhase(TabulatedPhaseFunction):
     r"""Measured phase function (``measured_phase``).
 
-    =========  ======  =================================================================================================
-    Parameter  Type    Meaning
-    =========  ======  =================================================================================================
-    filename   string  Text file of two columns: scattering angle [deg], increasing, at least 10, the last 170 or more;
-                       and value in any unit, as of a volume scattering function: the values are normalised, with a
-                       warning where their integral is not 1 within 2 %
-    =========  ======  =================================================================================================
+    .. parameters::
 
     Interpolated in log-log, and extrapolated below the first angle with the power law of the first two
     (`mitransient_lidar.physics.water.phase_file.read_phase_table`).
@@ -42,7 +35,7 @@ class MeasuredPhase(TabulatedPhaseFunction):
         {'type': 'measured_phase', 'filename': 'harbour.csv'}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         if "filename" not in props:
             raise UserError("measured_phase: filename is missing: the file of angles and values")
         self.filename = props["filename"]
@@ -58,4 +51,4 @@ class MeasuredPhase(TabulatedPhaseFunction):
         return f"MeasuredPhase[{self.filename}]"
 
 
-mi.register_phase("measured_phase", recorded(MeasuredPhase))
+register("phase", MEASURED_PHASE, MeasuredPhase)

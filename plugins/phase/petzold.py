@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.water import PETZOLD
 from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase import petzold_average_particle
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 _AVERAGE = "average_particle"
@@ -17,14 +16,7 @@ _AVERAGE = "average_particle"
 class Petzold(TabulatedPhaseFunction):
     r"""Petzold's measured phase functions (``petzold``).
 
-    =========  ======  =================================================================================================
-    Parameter  Type    Meaning
-    =========  ======  =================================================================================================
-    water      string  ``average_particle``, or one of the measured waters ``clear`` (ocean off the Bahamas, bb/b
-                       0.044), ``coastal`` (off California, 0.013), ``turbid`` (San Diego harbour, 0.020), ``autec_7``
-                       (0.025), ``autec_9`` (0.038), ``haoce_5`` (0.014), ``nuc_2200`` (0.019) and ``nuc_2240``
-                       (0.018). Default: ``average_particle``
-    =========  ======  =================================================================================================
+    .. parameters::
 
     Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised, with power laws below 0.1 degrees.
     The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
@@ -41,8 +33,8 @@ class Petzold(TabulatedPhaseFunction):
         {'type': 'petzold', 'water': 'coastal'}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
-        self.water = props.get("water", _AVERAGE)
+    def __init__(self, props: RecordedProperties) -> None:
+        self.water = props.read("water")
         if self.water != _AVERAGE and self.water not in PETZOLD_WATERS:
             raise UserError(f"water = {self.water!r} must be one of {', '.join([_AVERAGE, *PETZOLD_WATERS])}")
         measured = petzold_average_particle() if self.water == _AVERAGE else petzold_water(self.water)
@@ -53,4 +45,4 @@ class Petzold(TabulatedPhaseFunction):
         return f"Petzold[water={self.water}]"
 
 
-mi.register_phase("petzold", recorded(Petzold))
+register("phase", PETZOLD, Petzold)

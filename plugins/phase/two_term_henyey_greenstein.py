@@ -5,22 +5,16 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.core.parameters.water import TWO_TERM_HENYEY_GREENSTEIN
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio
-from mitransient_lidar.plugins.bases import recorded
+from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 
 
 class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     r"""Two-term Henyey-Greenstein phase function (``two_term_henyey_greenstein``).
 
-    ==========  =====  =================================================================================================
-    Parameter   Type   Meaning
-    ==========  =====  =================================================================================================
-    weight      float  Share of the forward lobe, 0 to 1. Default: 0.98
-    g_forward   float  Asymmetry of the forward lobe, 0 to 0.999. Default: 0.9
-    g_backward  float  Asymmetry of the backward lobe, 0 to 0.999, as a positive number. Default: 0.3
-    ==========  =====  =================================================================================================
+    .. parameters::
 
     .. math:: p = w\, p_{HG}(g_f) + (1 - w)\, p_{HG}(-g_b)
 
@@ -39,11 +33,9 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         {'type': 'two_term_henyey_greenstein', 'weight': 0.98, 'g_forward': 0.93, 'g_backward': 0.3}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.weight = in_range("weight", props.get("weight", 0.98), 0.0, 1.0)
-        self.g_forward = in_range("g_forward", props.get("g_forward", 0.9), 0.0, 0.999)
-        self.g_backward = in_range("g_backward", props.get("g_backward", 0.3), 0.0, 0.999)
+        self.weight, self.g_forward, self.g_backward = map(props.read, ("weight", "g_forward", "g_backward"))
         forward, backward = (henyey_greenstein_backscatter_ratio(g) for g in (self.g_forward, -self.g_backward))
         self.backscatter_ratio = self.weight * forward + (1 - self.weight) * backward
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
@@ -84,4 +76,4 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         )
 
 
-mi.register_phase("two_term_henyey_greenstein", recorded(TwoTermHenyeyGreenstein))
+register("phase", TWO_TERM_HENYEY_GREENSTEIN, TwoTermHenyeyGreenstein)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import limits
+from mitransient_lidar.core.parameters.catalogue import limits
 from mitransient_lidar.core.validation import finite
 
 SCALE, TIME_OFFSET = "scale", "time_offset_ns"

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.parameters.declaration import Read
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian beam.
 WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": math.sqrt(2 * math.log(2)), "divergence_1e2_mrad": 2.0}
 
 
-def given_divergences(get: Callable[[str, Any], Any]) -> list[str]:
-    """Return which of the three parameters have a value other than an empty text; `get` maps (name, default) to it."""
-    return [name for name in WIDTHS if get(name, "") != ""]
-
-
-def read_divergence(get: Callable[[str, Any], Any], is_top_hat: bool = False) -> float | None:
+def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     """Read the divergence of a beam from one of its three parameters.
 
     Parameters
     ----------
-    get
-        Function (name, default) -> value of a parameter.
+    read
+        Reader of the parameters of the plugin.
     is_top_hat
         Whether the irradiance is even up to the edge of the beam instead of Gaussian.
 
@@ -45,11 +38,8 @@ def read_divergence(get: Callable[[str, Any], Any], is_top_hat: bool = False) ->
     2 sqrt(2 ln 2) sigma = 2.355 sigma and 4 sigma. A top-hat beam has its full irradiance up to its edge and none
     beyond: all three are its full angle.
     """
-    given = given_divergences(get)
+    given = read.given(*WIDTHS)
     if len(given) > 1:
-        values = " and ".join(f"{name} = {get(name, '')}" for name in given)
+        values = " and ".join(f"{name} = {read.get(name, '')}" for name in given)
         raise UserError(f"{values} describe one width: give one of {', '.join(WIDTHS)}")
-    if not given:
-        return None
-    name = given[0]
-    return 1e-3 * ranged(name, get(name, "")) / (1.0 if is_top_hat else WIDTHS[name])
+    return 1e-3 * read(given[0]) / (1.0 if is_top_hat else WIDTHS[given[0]]) if given else None

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import RANGES, ranged
+from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
 from mitransient_lidar.core.validation import FloatArray, IntArray, in_range
 
 #: Smallest distance of a pose from the mean sea level [m].
@@ -60,16 +60,18 @@ class Pose:
 
         Values out of range raise UserError.
         """
-        altitude = ranged("altitude", altitude)
+        allowed = LIDAR_TRANSMITTER["altitude"]
+        altitude = allowed.number(altitude)
         if abs(altitude) < _NEAREST:
             raise UserError(
-                f"altitude = {altitude:g} must lie between {_NEAREST:g} and {RANGES['altitude'][1]:g}, or "
-                f"{RANGES['altitude'][0]:g} and {-_NEAREST:g} under water"
+                f"altitude = {altitude:g} must lie between {_NEAREST:g} and {allowed.high:g}, or "
+                f"{allowed.low:g} and {-_NEAREST:g} under water"
             )
         angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9 if altitude > 0 else 180.0))
         sin, cos = np.sin(angle), np.cos(angle)
         back = altitude * sin / cos if altitude > 0 else 0.0
-        origin = np.array([ranged("aim_x", aim_x) - back, ranged("aim_y", aim_y), altitude])
+        x, y = (LIDAR_TRANSMITTER[name].number(value) for name, value in (("aim_x", aim_x), ("aim_y", aim_y)))
+        origin = np.array([x - back, y, altitude])
         return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
 
     @classmethod

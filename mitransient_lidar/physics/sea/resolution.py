@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-from mitransient_lidar.core.ranges import RANGES, ranged
-from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.core.parameters.declaration import AUTO, Read
 from mitransient_lidar.physics.lidar.divergence import read_divergence
 
 #: Shortest wave, and sides of a cell and of the patch without a lidar [m].
@@ -37,8 +35,6 @@ _BEAM_HALF_WIDTH = 3.0
 
 #: Full angles [rad] of beam and field of view unless they are given.
 _DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3
-
-Get = Callable[[str, Any], Any]
 
 
 @dataclass(frozen=True)
@@ -101,13 +97,13 @@ class Resolution:
     beam_wave: float  #: The shortest waves that the beam alone needs, not shorter than those.
 
     @classmethod
-    def read(cls, get: Get, footprints: Sequence[Footprint]) -> Resolution:
+    def read(cls, read: Read, footprints: Sequence[Footprint]) -> Resolution:
         """Read the parameters of the plugin ``ocean_surface``, and choose those that are ``auto``.
 
         Parameters
         ----------
-        get
-            Function (name, default) -> value of a parameter.
+        read
+            Reader of the parameters.
         footprints
             Those of the lasers and receivers above the sea. Values of the parameters ``altitude``, ``off_nadir_deg``,
             ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
@@ -117,14 +113,13 @@ class Resolution:
         UserError
             If a value is not positive or out of range.
         """
-        cell, side = read_length(get, "cell_size"), read_length(get, "refined_size")
-        size, wave = read_length(get, "size"), read_length(get, "shortest_wave")
-        found = _with_own_values(get, footprints)
+        names = ("cell_size", "refined_size", "size", "shortest_wave")
+        cell, side, size, wave = (None if value == AUTO else value for value in map(read, names))
+        found = _with_own_values(read, footprints)
         areas = [_square(found), _square([each for each in found if each.is_laser] or found)]
         centre = tuple(
-            automatic if value == "auto" else finite(name, value)
-            for name, automatic in zip(("centre_x", "centre_y"), areas[0][:2], strict=True)
-            for value in [get(name, "auto")]
+            automatic if value == AUTO else value
+            for value, automatic in zip(map(read, ("centre_x", "centre_y")), areas[0][:2], strict=True)
         )
         everything, lit = (_SIZE_PER_FOOTPRINT * area[2] + SIZE_MARGIN for area in areas)
         size = size or max(_LEAST_SURFACE, _SURFACE_PER_SIZE * everything)
@@ -161,13 +156,12 @@ def _square(footprints: Sequence[Footprint]) -> tuple[float, float, float]:
     return 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), max(high[0] - low[0], high[1] - low[1])
 
 
-def _with_own_values(get: Get, footprints: Sequence[Footprint]) -> list[Footprint]:
+def _with_own_values(read: Read, footprints: Sequence[Footprint]) -> list[Footprint]:
     """Return the footprints with the values that the sea's own parameters give."""
-    altitude, off_nadir, field = get("altitude", None), get("off_nadir_deg", None), get("field_of_view_mrad", None)
-    altitude = None if altitude is None else in_range("altitude", altitude, 0.1, RANGES["altitude"][1])
-    off_nadir = None if off_nadir is None else math.radians(in_range("off_nadir_deg", off_nadir, 0.0, 89.9))
-    field = None if field is None else 1e-3 * ranged("field_of_view_mrad", field)
-    divergence = read_divergence(get)
+    altitude, off_nadir, field = (read(name) for name in ("altitude", "off_nadir_deg", "field_of_view_mrad"))
+    off_nadir = None if off_nadir is None else math.radians(off_nadir)
+    field = None if field is None else 1e-3 * field
+    divergence = read_divergence(read)
     found = list(footprints)
     if altitude is not None and not found:
         pose = (0.0, 0.0), altitude, math.radians(20.0)
@@ -184,9 +178,3 @@ def _with_own_values(get: Get, footprints: Sequence[Footprint]) -> list[Footprin
             each = replace(each, half_angle=0.5 * field)
         own.append(each)
     return own
-
-
-def read_length(get: Get, name: str) -> float | None:
-    """Return a positive length of at most 1000 km [m], or None for ``auto``."""
-    value = get(name, "auto")
-    return None if value == "auto" else in_range(name, positive(name, value), 0.0, RANGES["size"][1])

@@ -14,12 +14,13 @@ import numpy as np
 
 from mitransient_lidar.core.array_files import read_npz, readable_suffix
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, non_negative, positive
-from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, GramCharlierSeries, cox_munk
+from mitransient_lidar.core.parameters.declaration import AUTO, Read
+from mitransient_lidar.core.validation import FloatArray, in_range
+from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
-from mitransient_lidar.physics.sea.resolution import Footprint, Get, Resolution, read_length
+from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -45,9 +46,6 @@ _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 #: Water depth [m] from which no wave notices the bottom.
 DEEP = 1e4
 
-#: Steepest mean slope of the sea along x and y [degree].
-_STEEPEST_DEG = 15.0
-
 #: Wind speed [m/s] below which there are no waves.
 _CALM = 1e-6
 
@@ -59,8 +57,6 @@ _SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 
 #: Grid lines along x and y of a level sea, over its size.
 _LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
-
-_SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
 
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -90,13 +86,13 @@ class SeaSurface:
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
 
     @classmethod
-    def read(cls, get: Get, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
+    def read(cls, read: Read, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
         """Build a sea from parameters of the plugin ``ocean_surface``.
 
         Parameters
         ----------
-        get
-            Function (name, default) -> value of a parameter.
+        read
+            Reader of the parameters.
         footprints
             Those of the lasers and receivers above the sea, for its automatic values.
         is_placeholder
@@ -107,27 +103,19 @@ class SeaSurface:
         UserError
             If a parameter is out of range, or a file cannot be read.
         """
-        spectrum = get("spectrum", "elfouhaily")
-        if spectrum not in _SPECTRA:
-            raise UserError(f"spectrum = {spectrum!r} must be one of {', '.join(_SPECTRA)}")
-        wind_speed = in_range("wind_speed", get("wind_speed", 3.0), 0.0, MAX_WIND_SPEED)
+        spectrum, wind_speed = read("spectrum"), read("wind_speed")
         wind_speed = wind_speed if wind_speed >= _CALM else 0.0
-        wind_direction = _read_angle(get, "wind_direction_deg")
-        state = _read_waves(get, spectrum, wind_speed, wind_direction)
-        slope_variance = get("slope_variance", "cox_munk")
-        seed = integer("surface_seed", get("surface_seed", 1), 0, 2**53)
-        wake = _read_wake(get)
-        slope = _read_slope(get, "slope_x_deg"), _read_slope(get, "slope_y_deg")
-        resolution = Resolution.read(get, footprints)
-        period = read_length(get, "period")
-        time = finite("time", get("time", 0.0))
-        depth = positive("water_depth", get("water_depth", DEEP))
-        current = in_range("current_speed", get("current_speed", 0.0), 0.0, 10.0)
-        current_direction = _read_angle(get, "current_direction_deg")
-        map_size = read_length(get, "map_size")
-        path = get("filename", "")
-        focuses = _read_switch(get, "ripple_focusing")
-        series = _read_series(get, slope_variance, wind_speed)
+        wind_direction, current_direction = (
+            math.radians(read(name)) for name in ("wind_direction_deg", "current_direction_deg")
+        )
+        state = _read_waves(read, spectrum, wind_speed, wind_direction)
+        slope_variance, seed, time, current = map(read, ("slope_variance", "surface_seed", "time", "current_speed"))
+        wake = _read_wake(read)
+        slope = tuple(math.tan(math.radians(read(name))) for name in ("slope_x_deg", "slope_y_deg"))
+        resolution = Resolution.read(read, footprints)
+        period, map_size = (None if value == AUTO else value for value in map(read, ("period", "map_size")))
+        depth, path, focuses = read("water_depth"), read("filename", ""), read("ripple_focusing")
+        series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
         waves: PeriodicHeights | NestedHeights | HeightMap | None = None
@@ -138,7 +126,7 @@ class SeaSurface:
             cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
             period = period or _period(state)
-            if cell <= period / _FEWEST_CELLS or get("cell_size", "auto") != "auto":
+            if cell <= period / _FEWEST_CELLS or read("cell_size") != AUTO:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
@@ -153,7 +141,7 @@ class SeaSurface:
             cell = float(terrain.x[1] - terrain.x[0])
             refined_size = float(terrain.x[-1] - terrain.x[0])
             middle = tuple(0.5 * float(lines[0] + lines[-1]) for lines in (terrain.x, terrain.y))
-            is_free = [get(name, "auto") == "auto" for name in ("centre_x", "centre_y")]
+            is_free = [read(name) == AUTO for name in ("centre_x", "centre_y")]
             centre = (middle[0] if is_free[0] else centre[0], middle[1] if is_free[1] else centre[1])
             _check_number_of_cells(refined_size, cell)
             resolved = _facet_variance(terrain, wind_direction)
@@ -182,7 +170,7 @@ class SeaSurface:
             *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
-            slope,
+            (slope[0], slope[1]),
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -261,20 +249,16 @@ class SeaSurface:
         return np.asarray(heights + self.slope[0] * dx + self.slope[1] * dy[:, None])
 
 
-def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: float) -> SeaState | None:
+def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: float) -> SeaState | None:
     """Return the sea state of the parameters, None for a flat sea or a height map."""
-    fetch = get("fetch", None)
-    age = get("inverse_wave_age", None)
-    peak_enhancement = positive("peak_enhancement", get("peak_enhancement", 3.3))
-    swell_height = non_negative("swell_height", get("swell_height", 0.0))
-    swell_wavelength = positive("swell_wavelength", get("swell_wavelength", 60.0))
-    swell_direction = _read_angle(get, "swell_direction_deg")
-    path = get("filename", "")
+    fetch, age, peak_enhancement = map(read, ("fetch", "inverse_wave_age", "peak_enhancement"))
+    swell_height, swell_wavelength = read("swell_height"), read("swell_wavelength")
+    swell_direction = math.radians(read("swell_direction_deg"))
     if fetch is not None and age is not None:
         raise UserError(f"fetch = {fetch:g} and inverse_wave_age = {age:g} are alternatives: give one of them")
     components: list[WaveSpectrum] = []
     if spectrum == "table":
-        components.append(_read_table(_required(path, spectrum)))
+        components.append(_read_table(_required(read("filename", ""), spectrum)))
     elif spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
         if wind_speed == 0:
             logger.info("wind_speed = 0: the sea has no wind waves, only ripples")
@@ -290,7 +274,7 @@ def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: floa
                 deep = JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction)
             else:
                 deep = PiersonMoskowitzSpectrum(wind_speed, wind_direction)
-            depth = positive("water_depth", get("water_depth", DEEP))
+            depth = read("water_depth")
             components.append(deep if depth >= DEEP else ShallowSpectrum(deep, depth))
     if swell_height > 0:
         if spectrum in ("flat", "height_map"):
@@ -306,13 +290,10 @@ def _waves_at(
     return realise_heights(*given, replace(motion, time=time), *rest)[0]
 
 
-def _read_series(get: Get, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
+def _read_series(distribution: str, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
     """Return the series of all slopes of the sea, None for Gaussian ones."""
-    distribution = get("slope_distribution", "gaussian")
     if distribution == "gaussian":
         return None
-    if distribution != "gram_charlier":
-        raise UserError(f"slope_distribution = {distribution!r} must be 'gaussian' or 'gram_charlier'")
     if slope_variance != "cox_munk":
         raise UserError(
             f"slope_distribution = 'gram_charlier' needs the slope_variance 'cox_munk', not {slope_variance!r}"
@@ -380,33 +361,13 @@ def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, f
     return along, across
 
 
-def _read_wake(get: Get) -> Wake | None:
+def _read_wake(read: Read) -> Wake | None:
     """Return the wake of a ship as a function of grid lines, None without a ship."""
-    speed = in_range("wake_speed", get("wake_speed", 0.0), 0.0, 40.0)
-    bearing = _read_angle(get, "wake_bearing_deg")
-    length = in_range("wake_length", get("wake_length", 20.0), 1.0, 500.0)
-    x, y = finite("wake_x", get("wake_x", 0.0)), finite("wake_y", get("wake_y", 0.0))
+    speed, length, x, y = map(read, ("wake_speed", "wake_length", "wake_x", "wake_y"))
+    bearing = math.radians(read("wake_bearing_deg"))
     if speed == 0:
         return None
     return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
-
-
-def _read_switch(get: Get, name: str) -> bool:
-    """Return a parameter that is true or false, true by default."""
-    value = get(name, True)
-    if str(value).lower() not in ("true", "false"):
-        raise UserError(f"{name} = {value!r} must be true or false")
-    return str(value).lower() == "true"
-
-
-def _read_angle(get: Get, name: str) -> float:
-    """Return an angle of a parameter in degrees [rad], 0 by default."""
-    return math.radians(finite(name, get(name, 0.0)))
-
-
-def _read_slope(get: Get, name: str) -> float:
-    """Return a mean slope of a parameter in degrees [1], 0 by default."""
-    return math.tan(math.radians(in_range(name, get(name, 0.0), -_STEEPEST_DEG, _STEEPEST_DEG)))
 
 
 def _read_table(path: str) -> TabulatedSpectrum:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.parameters.water import LAYERED_WATER
 from mitransient_lidar.core.validation import FloatArray, non_negative_array, number_list
 
 LayerValues = float | str | Sequence[float] | FloatArray
@@ -51,7 +51,7 @@ class WaterColumn:
                 raise UserError(f"{name} of shape {values.shape} must be a list of one value per layer")
             if values.size != np.size(self.layer_tops):
                 raise UserError(f"{name} has {values.size} values but layer_tops has {np.size(self.layer_tops)} layers")
-            ranged(name, values.max())
+            LAYERED_WATER[name].number(values.max())
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.layer_tops[0] != 0:

@@ -9,20 +9,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitransient_lidar.core.validation import finite, in_range
-from mitransient_lidar.physics.lidar.clear_sky import LARGEST_SUN_ZENITH_DEG
-
 #: Points along each axis of the quadrature that normalises a sky.
 _QUADRATURE_POINTS = 1024
 
 
-def read_direction(props: mi.Properties, prefix: str = "") -> tuple[float, NDArray[np.float64]]:
-    """Read ``zenith_deg`` and ``azimuth_deg`` of the sun; return the zenith angle [deg] and its unit direction."""
-    name = f"{prefix}zenith_deg"
-    zenith = in_range(name, props.get(name, 40.0), 0.0, LARGEST_SUN_ZENITH_DEG)
-    azimuth = np.radians(finite(f"{prefix}azimuth_deg", props.get(f"{prefix}azimuth_deg", 0.0)))
-    sin, cos = np.sin(np.radians(zenith)), np.cos(np.radians(zenith))
-    return zenith, np.array([sin * np.cos(azimuth), sin * np.sin(azimuth), cos])
+def direction_of(zenith_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
+    """Return the unit direction of a zenith angle and an azimuth from +x towards +y [deg]."""
+    zenith, azimuth = np.radians((zenith_deg, azimuth_deg))
+    return np.array([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
 
 
 def uniform_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:

@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import FloatArray, finite, in_range
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import opaque, opaque_point
 
 
@@ -39,20 +38,6 @@ class BubblePlume:
     length: float
     width: float
     depth: float
-
-    @classmethod
-    def from_properties(cls, props: mi.Properties) -> BubblePlume | None:
-        """Read the parameters ``plume_...`` of the plugin ``layered_water``; None without bubbles."""
-        plume = cls(
-            ranged("plume_scattering", props.get("plume_scattering", 0.0)),
-            ranged("plume_x", props.get("plume_x", 0.0)),
-            ranged("plume_y", props.get("plume_y", 0.0)),
-            np.deg2rad(finite("plume_bearing_deg", props.get("plume_bearing_deg", 0.0))),
-            ranged("plume_length", props.get("plume_length", 200.0)),
-            ranged("plume_width", props.get("plume_width", 8.0)),
-            in_range("plume_depth", props.get("plume_depth", 2.0), 0.01, 100.0),
-        )
-        return plume if plume.scattering > 0 else None
 
     def displaced(self, place: FloatArray, aim: FloatArray, turn: complex) -> BubblePlume:
         """Return the plume in a frame that is turned by `turn`, of modulus 1, and has a place (x, y) at `aim` [m]."""

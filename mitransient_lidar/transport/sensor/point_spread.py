@@ -9,13 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, positive
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.sensor.image_sampling import ImageSampler, read_image
-
-#: Widest blur [mrad].
-_WIDEST = 1000.0
+from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 
 
 class PointSpread(ABC):
@@ -27,31 +22,6 @@ class PointSpread(ABC):
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to displacements (angle_x, angle_y) [rad] that are distributed as the light is."""
-
-    @staticmethod
-    def from_properties(props: mi.Properties) -> PointSpread | None:
-        """Read ``blur_mrad``, or ``blur_file`` and ``blur_file_mrad``, of a sensor plugin; None for sharp optics.
-
-        Raises
-        ------
-        UserError
-            When a value is out of range, both kinds are given, or the file is not a point-spread function.
-        """
-        if "blur_file" not in props:
-            if "blur_file_mrad" in props:
-                raise UserError("blur_file_mrad is the size of blur_file, which is missing")
-            width = in_range("blur_mrad", props.get("blur_mrad", 0.0), 0.0, _WIDEST)
-            return GaussianPointSpread(1e-3 * width) if width > 0 else None
-        if "blur_mrad" in props:
-            raise UserError("blur_mrad and blur_file: give one of them, not both")
-        if "blur_file_mrad" not in props:
-            raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
-        path = str(props["blur_file"])
-        values = read_image("blur_file", path)
-        if values.min() < 0 or values.max() <= 0:
-            raise UserError(f"blur_file = {path!r} must hold values that are not negative and not all 0")
-        width = in_range("blur_file_mrad", positive("blur_file_mrad", props["blur_file_mrad"]), 0.0, _WIDEST)
-        return MeasuredPointSpread(values, 1e-3 * width)
 
 
 class GaussianPointSpread(PointSpread):

@@ -8,8 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, interleaved_point, pass_streams, stratified_point, unit_points
@@ -29,9 +27,6 @@ _OF_VIEW, _OF_VIEW_IN_IMAGES = 1, 2
 
 #: Number of pixels from which a receiver is an imager.
 IMAGE_PIXELS = 4096
-
-#: Largest blocked share of the aperture.
-_LARGEST_OBSCURATION = 0.999
 
 
 @dataclass(frozen=True)
@@ -57,18 +52,6 @@ class ReceiverOptics:
     two_way_atmospheric_transmittance: float
     response_time_ns: float
     obscuration: float = 0.0
-
-    @classmethod
-    def from_properties(cls, props: mi.Properties) -> ReceiverOptics:
-        """Read the five parameters of a sensor plugin; raise UserError when one is out of range."""
-        name = "two_way_atmospheric_transmittance"
-        return cls(
-            ranged("aperture_area", props.get("aperture_area", 0.025)),
-            in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0),
-            in_range(name, props.get(name, 0.9), 1e-12, 1.0),
-            ranged("response_time_ns", props.get("response_time_ns", 0.0)),
-            in_range("obscuration", props.get("obscuration", 0.0), 0.0, _LARGEST_OBSCURATION),
-        )
 
     @property
     def collection(self) -> float:

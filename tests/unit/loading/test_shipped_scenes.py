@@ -6,7 +6,7 @@ import itertools
 import mitsuba as mi
 import pytest
 
-from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.loading import catalogue, scenes
 
 #: Parameters of table1 in their order.

@@ -119,7 +119,7 @@ def test_plugins_name_the_variants_that_they_need(rgb):
     sources = "".join(path.read_text() for path in Path(variants.__file__).parents[2].glob("plugins/**/*.py"))
     names = {name.rpartition(".")[2]: kind for name, kind in variants.PLUGIN_MODULES.items() if kind}
     for name, kind in names.items():
-        assert f'mi.register_{kind}("{name}"' in sources
+        assert f'register("{kind}", {name.upper()}, ' in sources
         with pytest.raises(RuntimeError, match=f"UserError: {name} needs the variant llvm_ad_mono or .* scalar_rgb is"):
             mi.load_dict({"type": name})
     mi.set_variant(variants.set_variant())

@@ -1,7 +1,6 @@
 """Parameters that the objects of the plugins keep: every one of their manual pages, with its default."""
 
 import importlib
-import inspect
 import json
 import re
 
@@ -9,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.loading.plugin_pages import plugin_parameters
-from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, object_values, plugin_values
+from mitransient_lidar.core.parameters.catalogue import PLUGINS as DECLARED
+from mitransient_lidar.loading.scene_record import object_values, plugin_values
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
@@ -47,12 +46,6 @@ WITHOUT_VALUE = {
     "fournier_forand": {"refractive_index", "junge_slope"},
 }
 
-#: Numbers of defaults that the manual pages of the larger plugins give as a number or a word.
-MOST_DEFAULTS = {
-    **{"layered_water": 20, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
-    **{"lidar_volpath": 6, "time_gated_film": 4},
-}
-
 PLUGINS = [name.rpartition(".")[2] for name in PLUGIN_MODULES if name not in ("bases", "phase.tabulated")]
 
 
@@ -68,53 +61,31 @@ def _values(plugin, folder):
     return object_values(mi.load_dict(part))
 
 
-def _table(plugin):
-    """Return the texts of the table of a plugin's manual page by the names of parameters."""
-    module = next(name for name in PLUGIN_MODULES if name.rpartition(".")[2] == plugin)
-    page = next(
-        inspect.cleandoc(part.__doc__)
-        for part in vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
-        if isinstance(part, type) and f"(``{plugin}``)" in (part.__doc__ or "")
-    )
-    rules = list(re.finditer(r"^(=+)  =[= ]+$", page, re.MULTILINE))
-    width = len(rules[0][1])
-    rows, names = {}, ()
-    for line in page[rules[1].end() : rules[2].start()].splitlines():
-        cell = tuple(re.findall(r"[a-z]\w*", line[:width]))
-        names = cell or names
-        rows[names] = f"{rows.get(names, '')} {' '.join(line[width:].split())}"
-    return rows
-
-
-def _documented_defaults(plugin):
-    """Return the defaults that a plugin's manual page gives as a number or a word, by parameter."""
-    pattern = re.compile(r"Default: (?:``([^`]+)``|(-?\d+(?:\.\d+)?(?:e[+-]?\d+)?|true|false)\b)")
-    found = {names: pattern.search(text) for names, text in _table(plugin).items()}
-    return {name: match[1] or match[2] for names, match in found.items() if match for name in names}
-
-
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_every_documented_parameter_is_kept_with_its_default(plugin, tmp_path):
+def test_every_declared_parameter_is_kept_with_its_default(plugin, tmp_path):
     values = _values(plugin, tmp_path)
-    names = set(plugin_parameters(plugin))
+    declared = {each.name: each for each in DECLARED[plugin] if each.name.isidentifier()}
     assert values["type"] == plugin
-    assert names
-    assert names <= set(values)
+    assert declared
+    assert set(declared) <= set(values)
     assert {name for name, value in values.items() if value is None} == WITHOUT_VALUE.get(plugin, set())
-    defaults = {name: value for name, value in _documented_defaults(plugin).items() if values.get(name) is not None}
-    for name, text in defaults.items():
-        assert str(values[name]).lower() == text or float(values[name]) == float(text), name
-    assert len(defaults) >= MOST_DEFAULTS.get(plugin, 0)
+    defaults = {name: each.default for name, each in declared.items() if each.default not in (None, "")}
+    defaults = {name: default for name, default in defaults.items() if name != "model" and values[name] is not None}
+    assert {name: values[name] for name in defaults} == defaults
 
 
-def test_files_of_every_parameter_that_names_one_are_recorded():
-    """Other parameters whose text names a kind of file only refer to one of these."""
-    texts = {name: text for plugin in PLUGINS for names, text in _table(plugin).items() for name in names}
-    named = {name for name, text in texts.items() if re.search(r"\bfile\b|\.(png|npy|npz|nc|csv|asc)\b", text)}
-    assert named >= set(FILE_PARAMETERS) - {"filename"}
-    assert named - set(FILE_PARAMETERS) == {
-        *("spectrum", "origin_x", "origin_y", "map_values", "map_unit", "map_no_data")
+def test_manual_pages_have_the_table_of_the_declared_parameters():
+    pages = {
+        match[1]: part.__doc__
+        for name in PLUGIN_MODULES
+        for part in vars(importlib.import_module(f"mitransient_lidar.plugins.{name}")).values()
+        if isinstance(part, type) and (match := re.search(r"\(``(\w+)``\)", (part.__doc__ or "").partition("\n")[0]))
     }
+    assert set(pages) == set(DECLARED) == set(PLUGINS)
+    for plugin, page in pages.items():
+        for each in DECLARED[plugin]:
+            assert f"* - ``{each.name}``\n" in page
+            assert each.meaning in page
 
 
 def test_given_values_and_nested_objects_are_kept():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
@@ -23,7 +24,7 @@ def lidar(altitude=200.0, divergence=10e-3, field_of_view=30e-3, pixel=13e-3, ai
 
 
 def choose(footprints, **parameters):
-    return Resolution.read(lambda name, default: parameters.get(name, default), footprints)
+    return Resolution.read(OCEAN_SURFACE.reader(parameters.get), footprints)
 
 
 @pytest.mark.parametrize("altitude", [5.0, 200.0, 3000.0, 5e5])
@@ -44,7 +45,7 @@ def test_every_lidar_has_cells_within_their_limits(altitude, divergence, field_o
 @pytest.mark.parametrize(("divergence", "altitude"), [(5e-4, 200.0), (1e-3, 200.0), (2e-2, 5.0), (2e-2, 5e5)])
 def test_total_slope_variance_is_that_of_cox_and_munk(wind, divergence, altitude):
     parameters = {"wind_speed": wind}
-    sea = SeaSurface.read(lambda name, default: parameters.get(name, default), lidar(altitude, divergence))
+    sea = SeaSurface.read(OCEAN_SURFACE.reader(parameters.get), lidar(altitude, divergence))
     # The ripples' least variance of 1e-5 stands above 0 along calm water.
     assert sea.slope_variance == pytest.approx(sum(cox_munk(wind)), abs=2e-5 if wind < 1 else 1e-9)
     assert min(sea.ripple_variance) >= 1e-5
@@ -121,6 +122,6 @@ def test_one_definition_of_the_divergence_may_be_given():
 
 def test_waves_that_no_cell_resolves_become_ripples():
     """From 500 km a beam of 20 mrad lights 10 km: cells would be longer than the waves."""
-    sea = SeaSurface.read(lambda _, default: default, lidar(5e5, 2e-2))
+    sea = SeaSurface.read(OCEAN_SURFACE.reader({}.get), lidar(5e5, 2e-2))
     assert sea.cell_size == math.inf
     np.testing.assert_allclose(sea.ripple_variance, cox_munk(3.0))

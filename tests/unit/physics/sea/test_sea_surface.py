@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from significance import assert_equal
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, realise_heights
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
@@ -19,7 +20,7 @@ PERIOD = 32.0
 
 
 def read(**parameters):
-    return SeaSurface.read(lambda name, default: parameters.get(name, default))
+    return SeaSurface.read(OCEAN_SURFACE.reader(parameters.get))
 
 
 def variance_of_long_waves(wind, shortest):

@@ -1,0 +1,1 @@
+"""What is declared: the parameters of all plugins."""

@@ -1,0 +1,214 @@
+"""Declaration of a plugin's parameters: one line each, from which reading, refusals, records and the manual follow."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import (
+    FloatArray,
+    finite,
+    in_range,
+    integer,
+    non_negative,
+    number_list,
+    positive,
+)
+
+#: Text that leaves the choice of a value to the scene.
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a plugin.
+
+    Attributes
+    ----------
+    name, kind, meaning
+        Name, type as in the manual (``float``, ``integer``, ``boolean``, ``string``, or kind of an object), meaning.
+    default
+        Value where none is given; None without one.
+    unit
+        Unit as in data files, ``1`` of a plain number; empty for texts.
+    low, high
+        Range of a number, or of each number of a list.
+    above
+        Whether `low`, which is then 0, is itself outside the range.
+    choices
+        Allowed texts; empty for any.
+    is_list
+        Whether the value is a text of numbers, one for each layer or one for all.
+    may_be_auto, may_be_empty
+        Whether ``auto`` leaves the choice to the scene, and whether an empty text counts as not given.
+    is_file
+        Whether the value is the name of a file.
+    otherwise
+        What holds without a value where `default` does not say it.
+    """
+
+    name: str
+    kind: str
+    meaning: str
+    default: Any = None
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    choices: tuple[str, ...] = ()
+    is_list: bool = False
+    may_be_auto: bool = False
+    may_be_empty: bool = False
+    is_file: bool = False
+    otherwise: str = ""
+
+    def checked(self, value: Any) -> Any:
+        """Return a value of this parameter: a float, an integer or a truth value within its range; others as given.
+
+        Raises
+        ------
+        UserError
+            If it is not allowed; the sentence names the parameter, the value and what is allowed.
+        """
+        if value is None or (self.may_be_auto and value == AUTO) or self.is_list:
+            return value
+        if self.choices and value not in self.choices:
+            raise UserError(f"{self.name} = {value!r} must be one of {', '.join(self.choices)}")
+        if self.kind == "integer":
+            if isinstance(value, str) and self.may_be_auto:
+                value = int(value) if value.strip().isdecimal() else finite(self.name, value)
+            return integer(self.name, value, int(self.low), int(self.high))
+        if self.kind == "boolean":
+            if str(value).lower() not in ("true", "false"):
+                raise UserError(f"{self.name} = {value!r} must be true or false")
+            return str(value).lower() == "true"
+        return self.number(value) if self.kind == "float" else value
+
+    def number(self, value: object) -> float:
+        """Return a number within the range; else raise ``UserError``."""
+        number = (positive if self.above else finite)(self.name, value)
+        if self.low == 0 and self.high == math.inf:
+            return non_negative(self.name, number)
+        return number if math.inf in (self.high, -self.low) else in_range(self.name, number, self.low, self.high)
+
+    def per_layer(self, given: Any, layers: int) -> FloatArray:
+        """Return one number a layer of a list of one for all or one for each; else raise ``UserError``."""
+        values = number_list(self.name, given)
+        if values.size not in (1, layers):
+            raise UserError(f"{self.name} has {values.size} values but must have 1 or {layers}, one a layer")
+        for value in values:
+            self.number(value)
+        return np.broadcast_to(values, layers)
+
+    @property
+    def allowed(self) -> str:
+        """What is allowed, for the manual."""
+        if self.choices:
+            return ", ".join(f"``{each}``" for each in self.choices)
+        low, high = (_shown(float(limit)) for limit in (self.low, self.high))
+        numbers = f"{low} to {high}"
+        if self.above:
+            numbers = f"above {low}" + (f" to {high}" if self.high < math.inf else "")
+        elif self.high == math.inf:
+            numbers = "" if self.low == -math.inf else f"at least {low}"
+        unit = "" if self.unit in ("", "1") else f"{numbers and ' '}{self.unit}"
+        return f"{numbers}{unit}" + (f", or ``{AUTO}``" if self.may_be_auto else "")
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """Name of a plugin and its parameters, in the order of the manual."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+
+    def __getitem__(self, name: str) -> Parameter:
+        """Return a parameter by name."""
+        return next(each for each in self.parameters if each.name == name)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        """Yield the parameters."""
+        return iter(self.parameters)
+
+    def reader(self, get: Callable[[str, Any], Any]) -> Read:
+        """Return the reader of values that a function (name, default) -> value gives."""
+        return Read(self, get)
+
+    def table(self) -> str:
+        """Return the table of the manual in reStructuredText."""
+        lines = [".. list-table::", "   :header-rows: 1", "   :widths: auto", ""]
+        rows = [("Parameter", "Type", "Allowed", "Default", "Meaning")]
+        for each in self.parameters:
+            default = each.otherwise or ("" if each.default in (None, "") else f"``{_shown(each.default)}``")
+            rows.append((f"``{each.name}``", each.kind, each.allowed, default, each.meaning))
+        for row in rows:
+            lines += [f"   {'* - ' if not number else '  - '}{cell}".rstrip() for number, cell in enumerate(row)]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Read:
+    """Reader of a plugin's values: each is checked as it is declared."""
+
+    plugin: Plugin
+    get: Callable[[str, Any], Any]
+
+    def __call__(self, name: str, default: Any = None) -> Any:
+        """Return the value of a parameter, else the declared default, or the given one."""
+        parameter = self.plugin[name]
+        return parameter.checked(self.get(name, parameter.default if default is None else default))
+
+    def given(self, *names: str) -> list[str]:
+        """Return those of some parameters that have a value."""
+        return [name for name in names if self.get(name, None) not in (None, "")]
+
+
+def _shown(value: Any) -> str:
+    """Return the text of a value in the manual."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}") if isinstance(value, float) else str(value)
+
+
+def number(
+    name: str, default: float | str | None, unit: str, low: float, high: float, meaning: str, **more: Any
+) -> Parameter:
+    """Return a number, in a unit and a range."""
+    return Parameter(name, "float", meaning, default, unit, low, high, may_be_auto=default == AUTO, **more)
+
+
+def count(name: str, default: int | str | None, low: int, high: int, meaning: str, **more: Any) -> Parameter:
+    """Return an integer in a range."""
+    return Parameter(name, "integer", meaning, default, "1", low, high, may_be_auto=default == AUTO, **more)
+
+
+def numbers(name: str, default: Any, unit: str, low: float, high: float, meaning: str, **more: Any) -> Parameter:
+    """Return a text of numbers, one for each layer or one for all, which may be empty."""
+    more = {"may_be_empty": True, **more}
+    return Parameter(name, "string", meaning, default, unit, low, high, is_list=True, **more)
+
+
+def text(name: str, default: str | None, meaning: str, choices: tuple[str, ...] = (), **more: Any) -> Parameter:
+    """Return a text, one of some choices where there are any."""
+    return Parameter(name, "string", meaning, default, choices=choices, **more)
+
+
+def switch(name: str, default: bool | None, meaning: str, **more: Any) -> Parameter:
+    """Return a parameter that is true or false."""
+    return Parameter(name, "boolean", meaning, default, **more)
+
+
+def file(name: str, meaning: str, **more: Any) -> Parameter:
+    """Return the name of a file."""
+    return Parameter(name, "string", meaning, is_file=True, **more)
+
+
+def nested(name: str, kind: str, meaning: str) -> Parameter:
+    """Return an object inside the plugin; a name in brackets for any."""
+    return Parameter(name, kind, meaning)
