@@ -15,6 +15,7 @@ number differ. Where bits differ, the largest difference beside its standard err
 import mitransient_lidar  # noqa: I001
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -30,7 +31,7 @@ from mitransient_lidar.loading.instruments import instrument_names
 from mitransient_lidar.rendering.passive import render_passive
 
 #: Attributes that may differ: of the machine, and those that hold whole scenes.
-OTHER = {"elapsed_s", "created", "history", "plugin_parameters", "scene_xml"}
+OTHER = {"elapsed_s", "created", "history", "scene_xml"}
 #: Paths of a pass of each integrator.
 PATHS = {"lidar_merging": 2**13, "lidar_volpath": 2**13}
 
@@ -137,9 +138,19 @@ def differences(old, new):
             said.append(f"{name}: {apart(old, new, name)}")
     for name in sorted((set(old.attrs) | set(new.attrs)) - OTHER):
         a, b = old.attrs.get(name), new.attrs.get(name)
-        if str(np.asarray(a).tolist()) != str(np.asarray(b).tolist()):
+        if name == "plugin_parameters" and None not in (a, b):
+            said += [f"plugin_parameters: {line}" for line in unlike(json.loads(a), json.loads(b))]
+        elif str(np.asarray(a).tolist()) != str(np.asarray(b).tolist()):
             said.append(f"attribute {name}: {str(a)[:120]}, now {str(b)[:120]}")
     return said
+
+
+def unlike(old, new, place=""):
+    """Return sentences about values that differ in trees of dicts; the order of names does not count."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return [] if old == new else [f"{place}: {old!r}, now {new!r}"]
+    names = sorted(set(old) | set(new))
+    return [line for name in names for line in unlike(old.get(name), new.get(name), f"{place}.{name}")]
 
 
 def apart(old, new, name):
