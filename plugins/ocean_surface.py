@@ -31,9 +31,8 @@ class OceanSurface(mi.Mesh):
     Parameter                 Type     Meaning
     ========================  =======  =================================================================================
     spectrum                  string   ``elfouhaily`` (Elfouhaily et al. 1997), ``jonswap`` (needs ``fetch``),
-                                       ``pierson_moskowitz``, ``table`` (``filename``: .npz with ``kx``, ``ky`` [rad/m]
-                                       and ``density`` [m^4]), ``height_map`` (``filename``: formats of ``seabed``),
-                                       or ``flat``: no waves, all slopes are ripples. Default: ``elfouhaily``
+                                       ``pierson_moskowitz``, ``height_map`` (``filename``: formats of ``seabed``), or
+                                       ``flat``: no waves, all slopes are ripples. Default: ``elfouhaily``
     wind_speed                float    Wind speed at 10 m [m/s], 0 to 30. Default: 3
     wind_direction_deg        float    Direction the wind blows towards, from +x to +y [deg]. Default: 0
     fetch, inverse_wave_age   float    Distance over which the wind has blown over water [m], or inverse wave age, 0.84
@@ -128,7 +127,7 @@ class OceanSurface(mi.Mesh):
     within 4 % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m; without it the shortest ones give 16, 23,
     20 and 11 % more at 1, 2, 3 and 5 m. It is a mean: one place has it without the pattern of its ripples. It depends
     on waves of centimetres, which slicks lack. Above half a metre, where it would grow, little is known of them, and
-    depths are within the waves: it falls to 1 at the surface. Seas without a spectrum of ripples (``flat``, ``table``,
+    depths are within the waves: it falls to 1 at the surface. Seas without a spectrum of ripples (``flat``,
     ``height_map``) and lidars under water have none. Give ``shortest_wave`` to compare images with receivers of few
     pixels on exactly the same sea.
 

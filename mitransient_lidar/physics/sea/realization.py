@@ -109,7 +109,7 @@ def wave_coefficients(
         drift = dk * (velocity[0] * ix + velocity[1] * iy[:, None]) * time
         advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), depth) * time
     coefficients = np.zeros((iy.size, ix.size), dtype=np.complex128)
-    for number, waves in enumerate(spectrum.travelling_parts()):
+    for number, waves in enumerate(spectrum.systems):
         square, phase = _noise(seed, number, ix, iy)
         modulus = np.sqrt(np.multiply(square, waves.mode_variances(ix, iy, dk), out=square), out=square)
         if time != 0:
@@ -141,38 +141,6 @@ def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> Floa
     return np.asarray(np.fft.fftshift(heights), dtype=np.float64)
 
 
-def mesh_slope_variance(
-    spectrum: WaveSpectrum, period: float, cells: int, direction: float | None = None
-) -> tuple[float, float]:
-    """Compute the expected slope variances of the triangles of a mesh from `realise`.
-
-    Parameters
-    ----------
-    spectrum, period, cells
-        As for `realise`.
-    direction : float, optional
-        Axis of the variances [rad], counter-clockwise from +x. Default: the direction of the spectrum.
-
-    Returns
-    -------
-    along, across : float
-        Slope variances [1] of the linear facets along and across the direction, reduced against those of the waves by
-        the facets' low-pass.
-
-    Notes
-    -----
-    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d. Their
-    covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles of a
-    cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the mesh.
-    """
-    ix, iy, dk = wave_numbers(period, cells)
-    half = iy.size // 2
-    variance = spectrum.mode_variances(ix, iy, dk)
-    variance[half, :] = variance[:, half] = 0
-    axis = spectrum.direction if direction is None else direction
-    return facet_slope_variance(variance, ix, iy, period, cells, axis)
-
-
 def facet_slope_variance(
     variance: FloatArray, ix: IntArray, iy: IntArray, period: float, cells: float, axis: float
 ) -> tuple[float, float]:
@@ -189,7 +157,12 @@ def facet_slope_variance(
     axis
         Direction [rad], counter-clockwise from +x.
 
-    For the formula see `mesh_slope_variance`.
+    Notes
+    -----
+    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the
+    side of a cell. Their covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over
+    both triangles of a cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds
+    oblique to the mesh.
     """
     variance[:, 1:] *= 2  # for the half plane kx < 0
     # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
@@ -232,11 +205,11 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
 def _noise(seed: int, number: int, ix: IntArray, iy: IntArray) -> tuple[FloatArray, FloatArray]:
     """Squared moduli, of mean 1, and phases [rad] of complex Gaussian numbers, shape (iy, ix) (Box-Muller).
 
-    They are a function of the seed, the number of the travelling part, and the indices.
+    They are a function of the seed, the number of the wave system, and the indices.
     """
     key = _mix(np.array([int(seed) & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64))
     if number > 0:
-        # Hashed first: a small number would give the key of the first part's column ix = number.
+        # Hashed first: a small number would give the key of the first system's column ix = number.
         key = _mix(key ^ _mix(np.array([number], dtype=np.uint64)))
     key = _mix(_mix(key ^ ix.astype(np.uint64)) ^ iy.astype(np.uint64)[:, None])
     # 53 bits each; the added half keeps the argument of the logarithm above 0.

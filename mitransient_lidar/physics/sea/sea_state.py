@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative, positive
-from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, TravellingWaves, WaveSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum
 
 _LARGEST_FRACTION = 0.75  # of the slope variance on one axis: that of the angular density cos^2(phi)/pi
 _NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
@@ -52,10 +52,6 @@ class SeaState(WaveSpectrum):
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         return np.asarray(sum(component.omnidirectional(k) for component in self.components))
 
-    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`."""
-        return np.asarray(sum(component.directional(kx, ky) for component in self.components))
-
     def elevation_variance(self) -> float:
         """Variance of the elevation [m^2]."""
         return sum(component.elevation_variance() for component in self.components)
@@ -68,9 +64,10 @@ class SeaState(WaveSpectrum):
         """Elevation variances [m^2]; see `WaveSpectrum.mode_variances`."""
         return np.asarray(sum(component.mode_variances(ix, iy, dk) for component in self.components))
 
-    def travelling_parts(self) -> tuple[TravellingWaves, ...]:
-        """Return the parts of all components, in their order."""
-        return tuple(part for component in self.components for part in component.travelling_parts())
+    @property
+    def systems(self) -> tuple[WaveSpectrum, ...]:
+        """Wave systems of all components, in their order."""
+        return tuple(system for component in self.components for system in component.systems)
 
 
 @dataclass(frozen=True)

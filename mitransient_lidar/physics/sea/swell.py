@@ -80,7 +80,7 @@ class SwellSpectrum(AxialSpectrum):
         return np.full(np.shape(k), 2 * float(np.sum(weight * np.cos(2 * angle))))
 
     def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`."""
+        """Directional spectrum Psi [m^4] at wavenumber components [rad/m] that broadcast, equal for opposite waves."""
         cos, sin = np.cos(self.direction), np.sin(self.direction)
         along = cos * np.asarray(kx) + sin * np.asarray(ky)
         across = cos * np.asarray(ky) - sin * np.asarray(kx)
@@ -97,7 +97,7 @@ class SwellSpectrum(AxialSpectrum):
         peak = self.peak_wavenumber
         width = self.relative_bandwidth * peak
         if dk <= min(width, self.directional_spread * peak):
-            return super().mode_variances(ix, iy, dk)
+            return np.asarray(self.directional(ix * dk, iy[:, None] * dk) * dk**2)
         # Each point of the hump is assigned to the nearest wave, which conserves the variance.
         angle, angle_weight = self._angles(self._count(self.directional_spread * peak, dk))
         count = self._count(width, dk)
