@@ -125,39 +125,13 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
     return _ffbb_index(mu), mu
 
 
-def henyey_greenstein(theta: npt.ArrayLike, g: float) -> FloatArray:
-    """Henyey-Greenstein (1941) phase function [1/sr] at angles `theta` [rad] for a mean cosine -1 < `g` < 1."""
-    _check_cosine(g)
-    # 1 + g^2 - 2 g cos(theta), without its cancellation at small angles
-    spread = (1 - g) ** 2 + 4 * g * _half_angle(theta)
-    return np.asarray((1 - g * g) / (4 * np.pi * spread**1.5))
-
-
 def henyey_greenstein_backscatter_ratio(g: float) -> float:
     """Backscattered fraction of a Henyey-Greenstein function: (1-g)/(2g) ((1+g)/sqrt(1+g^2) - 1), or 1/2 at g = 0."""
-    _check_cosine(g)
+    if not -1 < finite("g", g) < 1:
+        raise UserError(f"g = {g:g} must lie between -1 and 1, both excluded")
     root = np.hypot(1, g)
     # ((1+g) - root)/g = 2/((1+g) + root), which has no 0/0 at g = 0
     return float((1 - g) / (root * (1 + g + root)))
-
-
-def two_term_henyey_greenstein(theta: npt.ArrayLike, weight: float, g_forward: float, g_backward: float) -> FloatArray:
-    """Mixture weight HG(g_forward) + (1 - weight) HG(-g_backward) of phase functions [1/sr].
-
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad].
-    weight : float
-        Weight of the forward lobe, 0 to 1.
-    g_forward, g_backward : float
-        Asymmetry of the lobes, 0 <= g < 1 each; the backward lobe has mean cosine -g_backward.
-    """
-    w = in_range("weight", weight, 0, 1)
-    for name, g in (("g_forward", g_forward), ("g_backward", g_backward)):
-        if not 0 <= finite(name, g) < 1:
-            raise UserError(f"{name} = {g:g} must be at least 0 and below 1")
-    return np.asarray(w * henyey_greenstein(theta, g_forward) + (1 - w) * henyey_greenstein(theta, -g_backward))
 
 
 def petzold_average_particle() -> PhaseFunction:
@@ -210,9 +184,3 @@ def _binomial_tail(a: float, eps: FloatArray) -> FloatArray:
 def _power_ratio(a: float, log_delta: FloatArray) -> FloatArray:
     """(1 - delta^a) / (1 - delta), which tends to a at delta = 1."""
     return np.asarray(np.where(log_delta == 0, a, np.expm1(a * log_delta) / np.expm1(log_delta)))
-
-
-def _check_cosine(g: float) -> None:
-    """Reject a mean cosine outside (-1, 1)."""
-    if not -1 < finite("g", g) < 1:
-        raise UserError(f"g = {g:g} must lie between -1 and 1, both excluded")
