@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer
 from mitransient_lidar.plugins.bases import PassIntegrator, recorded
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.volpath import CONNECTIONS, VolpathOptions, VolpathRenderer
+from mitransient_lidar.transport.volpath import VolpathOptions, VolpathRenderer
 
 
 class VolpathIntegrator(PassIntegrator):
@@ -23,20 +22,16 @@ class VolpathIntegrator(PassIntegrator):
     def __init__(self, props: mi.Properties, guiding_probability: float, complement_only: bool = False) -> None:
         super().__init__(props)
         self.paths_per_pass = integer("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
-        connection = props.get("connection", "mis")
-        if connection not in CONNECTIONS:
-            raise UserError(f"connection = {connection!r} must be one of {', '.join(CONNECTIONS)}")
         self.options = VolpathOptions(
             integer("max_scatterings", props.get("max_scatterings", -1), -1, 2**30),
             in_range("roulette_threshold", props.get("roulette_threshold", self.roulette_threshold), 0.0, 1.0),
             in_range("guiding_probability", props.get("guiding_probability", guiding_probability), 0.0, 0.99),
-            connection,
-            complement_only,
+            complement_only=complement_only,
         )
 
     def to_string(self) -> str:
         """Return a description."""
-        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}, connection={self.options.connection}]"
+        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}]"
 
 
 class LidarVolpath(VolpathIntegrator):
@@ -54,9 +49,6 @@ class LidarVolpath(VolpathIntegrator):
                                   direction is drawn from a broad lobe towards the laser instead of the phase function
                                   or BSDF, 0 to 0.99: every echo needs one large scattering angle, which is rare.
                                   Default: 0.4
-    connection           string   How vertices under water are connected to the laser: ``mis`` (multiple importance
-                                  sampling), or for tests ``emitter`` (directions sampled towards the laser) or
-                                  ``phase`` (the path's own directions) alone. Default: ``mis``
     complement_only      boolean  Whether to leave out the paths of ``lidar_merging``: echoes of one vertex in the air,
                                   all paths that scatter in the water and meet no solid, and those whose first solid is
                                   under water and not a mirror. Default: false

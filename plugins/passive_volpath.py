@@ -30,8 +30,7 @@ class PassiveVolpath(VolpathIntegrator):
     roulette_threshold         float    Expected contribution below which Russian roulette begins, 0 to 1: throughput
                                         times radiance under water, relative to its mean over all directions, which is
                                         assumed to be largest about the refracted sun. Default: 0.1
-    max_scatterings,                    As for ``lidar_volpath``
-    connection
+    max_scatterings            integer  As for ``lidar_volpath``
     =========================  =======  ================================================================================
 
     Renders the radiance of each pixel [W m^-2 sr^-1 nm^-1]. Paths start uniformly over the field of view and are traced

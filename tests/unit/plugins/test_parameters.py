@@ -50,7 +50,7 @@ WITHOUT_VALUE = {
 #: Numbers of defaults that the manual pages of the larger plugins give as a number or a word.
 MOST_DEFAULTS = {
     **{"layered_water": 20, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
-    **{"lidar_volpath": 6, "time_gated_film": 4},
+    **{"lidar_volpath": 5, "time_gated_film": 4},
 }
 
 PLUGINS = [name.rpartition(".")[2] for name in PLUGIN_MODULES if name not in ("bases", "phase.tabulated")]
@@ -112,9 +112,7 @@ def test_files_of_every_parameter_that_names_one_are_recorded():
     texts = {name: text for plugin in PLUGINS for names, text in _table(plugin).items() for name in names}
     named = {name for name, text in texts.items() if re.search(r"\bfile\b|\.(png|npy|npz|nc|csv|asc)\b", text)}
     assert named >= set(FILE_PARAMETERS) - {"filename"}
-    assert named - set(FILE_PARAMETERS) == {
-        *("spectrum", "origin_x", "origin_y", "map_values", "map_unit", "map_no_data")
-    }
+    assert named - set(FILE_PARAMETERS) == {*("origin_x", "origin_y", "map_values", "map_unit", "map_no_data")}
 
 
 def test_given_values_and_nested_objects_are_kept():
@@ -139,7 +137,7 @@ def test_values_of_mitsubas_own_objects_are_kept():
     scene = mi.load_dict({"type": "scene", **parts})
     values = json.loads(plugin_values(scene, mi.load_dict({"type": "lidar_volpath"})))
     assert set(values) == {"integrator", "a", "b"}
-    assert values["integrator"]["connection"] == "mis"
+    assert values["integrator"]["max_scatterings"] == -1
     assert values["a"]["bsdf"]["reflectance"]["value"] == 0.25
     assert values["b"]["bsdf"]["own"]["width_deg"] == 3
 

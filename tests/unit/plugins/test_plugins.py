@@ -202,7 +202,6 @@ REFUSED = [
     ({"type": "ocean_surface", "altitude": 1e-30}, "altitude = 1e-30 must lie between 0.1 and 1e+06"),
     ({"type": "lidar_transmitter", "to_world": 1.0}, "to_world is of type float: it must be of type transform"),
     ({"type": "ocean_surface", "refined_size": 0.0}, "refined_size = 0 must be greater than 0"),
-    ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
     ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
     ({"type": "lidar_volpath", "guiding_probability": 1.0}, "guiding_probability = 1 must lie between"),
     (
