@@ -5,11 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.half_space import phase_moments, water_leaving_reflectance
+from oracles.wave_spectra import realise
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.physics.sea.realization import realise
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering import passive

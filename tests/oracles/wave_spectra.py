@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitransient_lidar.physics.sea.realization import facet_slope_variance, wave_numbers
+from mitransient_lidar.physics.sea.realization import facet_slope_variance, heights_of, wave_coefficients, wave_numbers
 from mitransient_lidar.physics.sea.sea_state import SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 
@@ -18,6 +18,11 @@ def directional(spectrum, kx, ky):
     along = (np.cos(spectrum.direction) * np.asarray(kx) + np.sin(spectrum.direction) * np.asarray(ky)) / safe
     angular = (1 + spectrum.spreading(safe) * (2 * along**2 - 1)) / (2 * np.pi)
     return np.where(k > 0, spectrum.omnidirectional(k) * angular / safe, 0)
+
+
+def realise(*options, **others):
+    """Return the elevations [m] of waves of `wave_coefficients`, which has the same parameters."""
+    return heights_of(wave_coefficients(*options, **others))
 
 
 def mesh_slope_variance(spectrum, period, cells, axis=None):

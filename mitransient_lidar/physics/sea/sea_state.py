@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative, positive
-from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum, variances_along
 
 _LARGEST_FRACTION = 0.75  # of the slope variance on one axis: that of the angular density cos^2(phi)/pi
 _NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
 
 
 @dataclass(frozen=True)
-class SeaState(WaveSpectrum):
+class SeaState:
     """Sum of independent wave systems, each with its own direction of travel.
 
     Parameters
@@ -64,10 +64,14 @@ class SeaState(WaveSpectrum):
         """Elevation variances [m^2]; see `WaveSpectrum.mode_variances`."""
         return np.asarray(sum(component.mode_variances(ix, iy, dk) for component in self.components))
 
+    def slope_variance(self) -> tuple[float, float]:
+        """Slope variances [1] along and across the direction."""
+        return variances_along(self.slope_covariance(), self.direction)
+
     @property
     def systems(self) -> tuple[WaveSpectrum, ...]:
-        """Wave systems of all components, in their order."""
-        return tuple(system for component in self.components for system in component.systems)
+        """Independent wave systems, in the order of the components."""
+        return self.components
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,7 @@ class MatchedSpectrum(CosineSpectrum):
         )
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `AxialSpectrum.spreading`."""
+        """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `WaveSpectrum.spreading`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         up, cross = self._fractions(wavenumber)
         fraction = _upwind_fraction(self.scales[0] * up, self.scales[1] * cross)

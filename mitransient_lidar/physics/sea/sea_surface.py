@@ -16,7 +16,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, inte
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Get, Resolution, read_length
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, in_range, non_negative, positive
-from mitransient_lidar.physics.sea.wave_spectrum import AxialSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
 
 _REACH = 6.0  # half width of the hump in standard deviations, which neglects 2e-9 of it
 
 
 @dataclass(frozen=True)
-class SwellSpectrum(AxialSpectrum):
+class SwellSpectrum(WaveSpectrum):
     """Swell as a Gaussian hump in wavenumber and in direction.
 
     Parameters
@@ -75,7 +75,7 @@ class SwellSpectrum(AxialSpectrum):
         return np.asarray(np.where((wavenumber > low) & (wavenumber < high), hump, 0))
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Anisotropy Delta [1], the same for all waves; see `AxialSpectrum.spreading`."""
+        """Anisotropy Delta [1], the same for all waves; see `WaveSpectrum.spreading`."""
         angle, weight = self._angles(2000)
         return np.full(np.shape(k), 2 * float(np.sum(weight * np.cos(2 * angle))))
 

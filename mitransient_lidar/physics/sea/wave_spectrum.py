@@ -37,7 +37,10 @@ def variances_along(covariance: FloatArray, direction: float) -> tuple[float, fl
 
 
 class WaveSpectrum(ABC):
-    """Directional wave spectrum."""
+    """Waves of one system, symmetric about its direction: integrals depend only on S(k) and the spreading Delta(k).
+
+    A wave of wavenumber k travels along k if k . direction > 0, else against it.
+    """
 
     direction: float
 
@@ -52,18 +55,6 @@ class WaveSpectrum(ABC):
 
         Its integral over k > 0 is the elevation variance.
         """
-
-    @abstractmethod
-    def elevation_variance(self) -> float:
-        """Variance of the elevation [m^2]."""
-
-    @abstractmethod
-    def slope_covariance(self) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
-
-    def slope_variance(self) -> tuple[float, float]:
-        """Slope variances [1] along and across the direction."""
-        return variances_along(self.slope_covariance(), self.direction)
 
     @abstractmethod
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
@@ -84,12 +75,8 @@ class WaveSpectrum(ABC):
 
     @property
     def systems(self) -> tuple[WaveSpectrum, ...]:
-        """Independent wave systems: a wave of wavenumber k of one travels along k if k . direction > 0."""
+        """Independent wave systems: this one."""
         return (self,)
-
-
-class AxialSpectrum(WaveSpectrum):
-    """Spectrum symmetric about its direction, whose integrals depend only on S(k) and the spreading Delta(k)."""
 
     @abstractmethod
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
@@ -136,7 +123,7 @@ class AxialSpectrum(WaveSpectrum):
         return np.concatenate(nodes), np.concatenate(weights)
 
 
-class CosineSpectrum(AxialSpectrum):
+class CosineSpectrum(WaveSpectrum):
     """Spectrum with the angular density (1 + Delta cos 2 phi)/(2 pi), Delta -1 to 1, defined by S(k) and Delta(k)."""
 
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 from frequencies import assert_uniform
-from oracles.wave_spectra import directional, mesh_slope_variance
+from oracles.wave_spectra import directional, mesh_slope_variance, realise
 from scipy import stats
 from scipy.integrate import trapezoid
 from significance import largest_z
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.realization import angular_frequency, realise, wave_numbers
+from mitransient_lidar.physics.sea.realization import angular_frequency, wave_numbers
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, JonswapSpectrum, PiersonMoskowitzSpectrum
