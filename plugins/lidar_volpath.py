@@ -19,12 +19,12 @@ class VolpathIntegrator(PassIntegrator):
     def __init__(self, props: RecordedProperties, complement_only: bool = False) -> None:
         super().__init__(props)
         self.paths_per_pass = props.read("paths_per_pass")
-        names = ("max_scatterings", "roulette_threshold", "guiding_probability", "connection")
-        self.options = VolpathOptions(*map(props.read, names), complement_only)
+        names = ("max_scatterings", "roulette_threshold", "guiding_probability")
+        self.options = VolpathOptions(*map(props.read, names), complement_only=complement_only)
 
     def to_string(self) -> str:
         """Return a description."""
-        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}, connection={self.options.connection}]"
+        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}]"
 
 
 class LidarVolpath(VolpathIntegrator):

@@ -76,7 +76,7 @@ class OceanSurface(mi.Mesh):
     within 4 % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m; without it the shortest ones give 16, 23,
     20 and 11 % more at 1, 2, 3 and 5 m. It is a mean: one place has it without the pattern of its ripples. It depends
     on waves of centimetres, which slicks lack. Above half a metre, where it would grow, little is known of them, and
-    depths are within the waves: it falls to 1 at the surface. Seas without a spectrum of ripples (``flat``, ``table``,
+    depths are within the waves: it falls to 1 at the surface. Seas without a spectrum of ripples (``flat``,
     ``height_map``) and lidars under water have none. Give ``shortest_wave`` to compare images with receivers of few
     pixels on exactly the same sea.
 

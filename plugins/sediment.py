@@ -9,8 +9,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEDIMENT
-from mitransient_lidar.physics.water.hapke import HapkeSurface
-from mitransient_lidar.physics.water.sediments import bottom_reflectance
+from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
 from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
@@ -69,7 +68,7 @@ class Sediment(mi.BSDF):
                     f"{props['single_scattering_albedo']} give the same: give one of them"
                 )
             albedo = props.read("single_scattering_albedo")
-            #: Reflection (`physics.water.hapke.HapkeSurface`).
+            #: Reflection (`physics.water.sediments.HapkeSurface`).
             self.surface = particles.of_albedo("single_scattering_albedo", albedo)
         else:
             self.surface = particles.of_reflectance("reflectance", _reflectance(props))

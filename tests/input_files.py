@@ -392,13 +392,6 @@ def read_measured(path: Path) -> None:
     measured(path)
 
 
-def wave_spectrum(folder: Path) -> Path:
-    """Write a table of a wave spectrum."""
-    k = np.linspace(-2.0, 2.0, 21)
-    np.savez(folder / "a.npz", kx=k, ky=k, density=k**2 * np.exp(-(k[:, None] ** 2) - k**2) * 1e-3)
-    return folder / "a.npz"
-
-
 _MEASURED = "time_ns,red,red_stderr\n" + "".join(f"{i},{1 + i % 5},{0.1 + 0.01 * i:.2f}\n" for i in range(30))
 _PULSE = "time_ns,power\n" + "".join(f"{0.5 * i},{np.exp(-((i - 10) ** 2) / 20):.5f}\n" for i in range(21))
 _PHASE = "angle (deg),phase function\n" + "".join(f"{i},{1 / (1 + i):.6f}\n" for i in range(0, 181, 5))
@@ -444,6 +437,5 @@ KINDS = {
     "receiver": Kind(shipped("leica_hawkeye4x_deep.toml"), read_receiver, "text"),
     "corrections": Kind(shipped("leica_hawkeye4x_deep_depths.nc"), read_corrections),
     "measured": Kind(written("a.csv", _MEASURED), read_measured, "text"),
-    "wave_spectrum": Kind(wave_spectrum, load_part("ocean_surface", spectrum="table", filename="FILE", size=20.0)),
     **{f"image{suffix}": Kind(image(suffix), read_image) for suffix in (".png", ".npy", ".exr")},
 }

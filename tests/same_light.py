@@ -101,7 +101,6 @@ def cases():
     found["shots/mine"] = lambda: mitransient_lidar.render_shots(
         "fig13_2x2", count=6, passes=4, move_target=True, components=True
     )
-    found["reweight/merging"] = lambda: render("table1", reweight=[{"attenuation": 0.35}, {"scattering": 0.1}])
     found["flights/strip"] = flight
     return found
 

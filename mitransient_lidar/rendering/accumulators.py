@@ -16,7 +16,6 @@ from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import ErrorCorrelation, ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.reweighting import Case, check_share, effective_share
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
 
@@ -125,7 +124,6 @@ class WaveformAccumulator(PassAccumulator):
         train: GateTrain | None,
         origins: Sequence[str] = (),
         parameters: Sequence[Parameter] = (),
-        reweighted: Sequence[Case] = (),
         differences: Differences | None = None,
         batches: int = 0,
     ) -> None:
@@ -133,7 +131,7 @@ class WaveformAccumulator(PassAccumulator):
         response = scene.receiver.optics.response_time_ns
         self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
         self._energy, self._power, self._correlation = PassStatistics(), PassStatistics(), ErrorCorrelation()
-        self._origins, self._parameters, self._cases = list(origins), list(parameters), list(reweighted)
+        self._origins, self._parameters = list(origins), list(parameters)
         self._perturbed, self._differences = (PassStatistics(), PassStatistics()), differences
         self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._parts = PassStatistics(), PassStatistics()
@@ -161,14 +159,14 @@ class WaveformAccumulator(PassAccumulator):
             self._parts[0].add(parts)
             self._parts[1].add(waveform(parts, self.scene.axis.bin_width_ns, self._kernel))
             energy = parts.sum(axis=1)
-        if self._scores or self._cases:
+        if self._scores:
             perturbed, classes = histogram.perturbed(), max(len(self._origins), 1)
             shape = len(perturbed), self.scene.receiver.pixels.count, classes, -1
             perturbed = perturbed.reshape(shape).sum(axis=2)
             self._perturbed[0].add(perturbed)
             self._perturbed[1].add(waveform(perturbed, self.scene.axis.bin_width_ns, self._kernel))
             if self._weights is not None:
-                self._gate_slopes.add(perturbed[: self._scores] @ self._weights)
+                self._gate_slopes.add(perturbed @ self._weights)
         energy = energy.reshape(self.scene.receiver.pixels.count, -1)
         power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
         self._energy.add(energy)
@@ -212,15 +210,6 @@ class WaveformAccumulator(PassAccumulator):
         if self._parameters:
             about = ([getattr(one, name) for one in self._parameters] for name in ("name", "value", "units", "method"))
             built = results.add_derivatives(built, *about, *self._derivatives())
-        if self._cases:
-            first = self._scores
-            mean = self._perturbed[0].mean[first:]
-            pairs = zip(mean[::2], mean[1::2], strict=True)
-            shares = [effective_share(self._energy.mean, *pair) for pair in pairs]
-            for case, share in zip(self._cases, shares, strict=True):
-                check_share(case.label, share)
-            labels, values = [case.label for case in self._cases], self._perturbations(slice(first, None, 2))
-            built = results.add_reweighted(built, labels, shares, *values)
         if self._batches:
             count, batches = self._power.count, len(self._batches)
             passes = [len(range(number, count, batches)) for number in range(min(batches, count))]
@@ -233,13 +222,9 @@ class WaveformAccumulator(PassAccumulator):
             stack = add_gate_derivatives(stack, *self._gate_derivatives())
         return built.merge(stack, combine_attrs="override").assign_attrs(stack.attrs)
 
-    def _perturbations(self, chosen: slice) -> list[FloatArray]:
-        """Return energy, power and their standard errors of some perturbations."""
-        return [values[chosen] for part in self._perturbed for values in (part.mean, part.stderr)]
-
     def _derivatives(self) -> list[FloatArray]:
         """Return derivatives of energy and power and their standard errors, in the order of the parameters."""
-        of_paths = self._perturbations(slice(0, self._scores)) if self._scores else []
+        of_paths = [values for part in self._perturbed for values in (part.mean, part.stderr)] if self._scores else []
         one = self._differences
         others = [] if one is None else [one.impulse_response, one.impulse_response_stderr]
         others += [] if one is None else [one.waveform, one.waveform_stderr]
@@ -305,15 +290,14 @@ def choose_accumulator(
     max_memory: float,
     origins: Sequence[str] = (),
     parameters: Sequence[Parameter] = (),
-    reweighted: Sequence[Case] = (),
     differences: Differences | None = None,
     batches: int = 0,
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
     Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
-    `origins`, differentiated by `parameters`, some by `differences`, and `reweighted`, if there are any. The power of
-    `batches` of passes is kept, too.
+    `origins`, and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of
+    passes is kept, too.
 
     Raises
     ------
@@ -324,14 +308,14 @@ def choose_accumulator(
 
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
     each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
-    channels = 1 + len(parameters) + 2 * len(reweighted)
+    channels = 1 + len(parameters)
     bins = each * (1 + len(origins)) * channels
     train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
-        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted, differences, batches)
+        return WaveformAccumulator(scene, window, train, origins, parameters, differences, batches)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
     if origins:
         size = size.replace(" takes", f" x {len(origins)} components takes")

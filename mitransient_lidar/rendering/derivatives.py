@@ -68,15 +68,12 @@ class Parameter:
 
 
 def path_parameters(
-    renderer: PassRenderer,
-    names: Sequence[str] | str,
-    option: str = "derivatives",
-    others: Mapping[str, str] | None = None,
+    renderer: PassRenderer, names: Sequence[str] | str, others: Mapping[str, str] | None = None
 ) -> list[Parameter]:
     """Return the parameters of names: a coefficient of layered water stands for that of each layer.
 
-    Messages name the `option` by which the names were given. `others` are the parameters of the scene, with their
-    values as text, of which those whose derivatives paths do not sum are left to central differences; none by default.
+    `others` are the parameters of the scene, with their values as text, of which those whose derivatives paths do not
+    sum are left to central differences; none by default.
 
     Raises
     ------
@@ -84,7 +81,7 @@ def path_parameters(
         If a name is unknown or given twice, or the light does not depend on the parameter.
     """
     if not isinstance(names, (str, Sequence)):
-        raise UserError(f"{option} = {shown(names)} must be names of parameters")
+        raise UserError(f"derivatives = {shown(names)} must be names of parameters")
     listed = [names] if isinstance(names, str) else list(names)
     found: list[Parameter] = []
     known = known_names(renderer.scene)
@@ -93,12 +90,12 @@ def path_parameters(
         if others and not of_paths and isinstance(name, str) and parameter_of(name) in others:
             found.append(Parameter(name, value_of(others, name), unit_of(parameter_of(name)) or "1", None))
         else:
-            found += _parameters(renderer, name, option, others or {})
+            found += _parameters(renderer, name, others or {})
     repeated = [one.name for index, one in enumerate(found) if one.name in [other.name for other in found[:index]]]
     if repeated:
-        raise UserError(f"{option}: {repeated[0]} is given twice")
+        raise UserError(f"derivatives: {repeated[0]} is given twice")
     if len(found) > MOST_PARAMETERS:
-        raise UserError(f"{option}: {len(found)} parameters; allowed are at most {MOST_PARAMETERS}")
+        raise UserError(f"derivatives: {len(found)} parameters; allowed are at most {MOST_PARAMETERS}")
     return found
 
 
@@ -122,7 +119,7 @@ def known_names(scene: LidarScene) -> list[str]:
     return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in diffuse)]
 
 
-def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[str, str]) -> list[Parameter]:
+def _parameters(renderer: PassRenderer, name: str, others: Mapping[str, str]) -> list[Parameter]:
     """Return the parameters of a name."""
     scene, focusing = renderer.scene, renderer.focusing
     match = _NAME.match(name) if isinstance(name, str) else None
@@ -134,7 +131,7 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
         close = get_close_matches(str(name), [*known, *others], 1)
         hint = f"; did you mean {close[0]}?" if close else ""
         more = ", or a number among the scene's parameters" if others else ""
-        raise UserError(f"{option} = {shown(name)} must be one of {', '.join(known)}{more}{hint}")
+        raise UserError(f"derivatives = {shown(name)} must be one of {', '.join(known)}{more}{hint}")
     if solid is not None:
         return [_reflectance(name, solid)]
     if name == DIVERGENCE and name in known:
@@ -148,7 +145,7 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
     column = water.layers.column
     layers = range(column.count) if match["layer"] is None else [int(match["layer"])]
     if layers[-1] >= column.count:
-        raise UserError(f"{option}: {name} must have the number of a layer, 0 to {column.count - 1}")
+        raise UserError(f"derivatives: {name} must have the number of a layer, 0 to {column.count - 1}")
     return [
         Parameter(
             stem if column.count == 1 else f"{stem}[{layer}]",

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
@@ -57,7 +56,6 @@ def render(
     components: bool | None = None,
     derivatives: Sequence[str] | str | None = None,
     batches: int | None = None,
-    reweight: Sequence[Mapping[str, float]] | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
     **others: Any,
@@ -113,9 +111,6 @@ def render(
     batches
         Number of batches of passes whose waveforms are kept, 2 to 256; none by default. They show how errors of
         different bins are correlated, as a fit to the result needs to state its own errors.
-    reweight
-        Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
-        whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. What was active
         before is active afterwards.
@@ -133,11 +128,9 @@ def render(
         ``impulse_response_by_origin`` and ``waveform_by_origin``, with standard errors, over ``origin`` and the same
         dimensions, whose sums over ``origin`` are the whole. With `derivatives`, ``waveform_derivative`` and
         ``impulse_response_derivative``, with standard errors, over ``parameter`` and the same dimensions. With
-        `reweight`, ``waveform_reweighted`` and ``impulse_response_reweighted``, with standard errors, over ``case`` and
-        the same dimensions, and the coordinate ``effective_share``. With `batches`, ``waveform_batch`` [W], the
-        mean over each batch of passes (as many as the coordinate ``batch_passes`` says), over ``batch`` and the same
-        dimensions. After Ctrl-C it includes the completed passes, and the attribute ``interrupted`` is 1. Of a result,
-        as of the function that rendered it.
+        `batches`, ``waveform_batch`` [W], the mean over each batch of passes (as many as the coordinate
+        ``batch_passes`` says), over ``batch`` and the same dimensions. After Ctrl-C it includes the completed passes,
+        and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
 
     Raises
     ------
@@ -152,15 +145,13 @@ def render(
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
-    if reweight is not None and again.is_result(scene):
-        raise UserError("reweight: a result is rendered again with its own parameters; give its scene")
     if again.is_result(scene):
         result: Any = scene
         given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
         return render_again(result, **given, progress=progress, **options, **others)
     chosen = RenderOptions(**options, **others)
     session = open_scene(scene, params, chosen.variant, instrument, sensor=sensor)
-    return _render(session, integrator, chosen, reweight or [], progress)
+    return _render(session, integrator, chosen, progress)
 
 
 def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.Dataset:
@@ -203,7 +194,6 @@ def _render(
     session: Session,
     integrator: str | Mapping[str, Any] | mi.Integrator | None,
     options: RenderOptions,
-    reweight: Sequence[Mapping[str, float]],
     progress: ProgressCallback | None,
 ) -> xarray.Dataset:
     """Render a loaded scene, as `render` describes."""
@@ -218,15 +208,12 @@ def _render(
     lidar: LidarScene = renderer.scene
     from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
     from mitransient_lidar.rendering.differences import Differences
-    from mitransient_lidar.rendering.reweighting import cases
 
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]
     differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
-    reweighted = cases(renderer, reweight)
     session.tell_record()
-    changes = perturbations(parameters) + [one for case in reweighted for one in (case.perturbation, case.squared)]
-    if changes:
+    if changes := perturbations(parameters):
         renderer = renderer.perturbed(changes)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
@@ -240,7 +227,7 @@ def _render(
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
     accumulator = choose_accumulator(
-        lidar, window, surface, max_memory, origins, parameters, reweighted, differences, options.batches or 0
+        lidar, window, surface, max_memory, origins, parameters, differences, options.batches or 0
     )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 

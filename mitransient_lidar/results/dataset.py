@@ -8,8 +8,7 @@ among them the scene and all parameters of its plugins (`loading.scene_record`),
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
 by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
 by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and
-these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``. The
-power of batches of passes is in ``waveform_batch``, over ``batch`` and the same dimensions.
+these. The power of batches of passes is in ``waveform_batch``, over ``batch`` and the same dimensions.
 
 EXR files round the values to 32 bits and store everything else exactly, without the light by origin; NetCDF files store
 everything exactly.
@@ -202,27 +201,6 @@ def add_derivatives(
     return _add(dataset, "derivative", coords, arrays, described)
 
 
-def add_reweighted(
-    dataset: xr.Dataset, labels: Sequence[str], shares: Sequence[float], *arrays: npt.ArrayLike
-) -> xr.Dataset:
-    """Return a result of `build` with the light in other water.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    labels, shares : sequences
-        Description of each case, and the share of the paths that are effective there, 0 to 1.
-    arrays : array-like of shape (case, pixel, time)
-        The four arrays of `build`, of each case.
-    """
-    coords = {
-        "case": (np.array(labels, dtype=str), {"long_name": "values of parameters"}),
-        "effective_share": (np.array(shares), {"units": "1", "long_name": "share of the paths effective here"}),
-    }
-    return _add(dataset, "reweighted", coords, arrays, lambda about: _suffixed(about, ", by case"))
-
-
 def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
     """Return a result of `build` with the mean power of each batch of passes, ``waveform_batch`` [W].
 
@@ -396,7 +374,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         if file_format == "exr":
             _write_exr(dataset, path, temporary)
         else:
-            endings = "by_origin", "derivative", "reweighted"
+            endings = "by_origin", "derivative"
             large = [*_VARIABLES, "waveform_batch", sum_errors.VARIABLE]
             large += [_with_ending(name, ending) for ending in endings for name in _VARIABLES]
             large = [name for name in large if name in dataset]

@@ -31,7 +31,7 @@ from mitransient_lidar.results.schema import check_attributes, check_coordinates
 _LOG = logging.getLogger(__name__)
 
 _CHANNELS = {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}
-_OF_BINS = ("time", "origin", "case", "batch", *sum_errors.DIMS)  # dimensions of results with time bins alone
+_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)  # dimensions of results with time bins alone
 _SLOPES = "gate_energy_derivative"
 _HEADER = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence and different between sequences

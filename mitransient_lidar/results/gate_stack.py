@@ -4,7 +4,7 @@ A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stder
 collects while a gate is open, summed over the pulses of the gate. Dimensions are (row, column, gate) for imagers and
 (pixel, gate) otherwise. Coordinates are those of the pixels, ``gate`` (0, 1, ...), ``gate_start`` and ``gate_width``
 [ns] between half heights, and ``gate_depth`` [m], the depth of the gate's middle on the receiver's axis, NaN where the
-time of the surface echo is unknown. In the other pixels the middle has other depths; see `pixel_depths`. The attributes
+time of the surface echo is unknown. In the other pixels the middle has other depths; see `LinesOfSight`. The attributes
 are those of the result and of the gate train.
 """
 
@@ -25,7 +25,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
+from mitransient_lidar.results.geometry import lidar_geometry, optional_number
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
@@ -94,20 +94,6 @@ def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
         return lidar_geometry(attributes, surface="measured").depth_of_time(train.middles_ns)
     except UserError:
         return np.full(train.count, np.nan)
-
-
-def pixel_depths(stack: xr.Dataset) -> xr.DataArray:
-    """Return the depths [m] of the gates' middles along the line of sight of every pixel, below the mean sea level.
-
-    The dimensions are (row, column, gate) or (pixel, gate); see `geometry.LinesOfSight.from_dataset` for the errors.
-    """
-    middles = np.asarray(stack["gate_start"].values + 0.5 * stack["gate_width"].values, dtype=np.float64)
-    dims = ("row", "column") if "row" in stack.dims else ("pixel",)
-    lines = LinesOfSight.from_dataset(stack, dims)
-    depth = lines.depth_of_time(np.broadcast_to(middles, (lines.off_nadir.size, middles.size)))
-    shape = tuple(stack.sizes[dim] for dim in dims)
-    about = {"units": "m", "long_name": "depth of the middle of the gate along the line of sight", "positive": "down"}
-    return xr.DataArray(depth.reshape(*shape, -1), dims=(*dims, "gate"), attrs=about)
 
 
 def build_gates(

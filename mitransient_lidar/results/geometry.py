@@ -19,8 +19,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar import refraction
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pose import Pose
 
 Attributes = Mapping[str, Any]

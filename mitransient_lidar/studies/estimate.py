@@ -15,8 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.sea.double_passage import (
     LEAST_DEPTH,
     EnhancementTable,

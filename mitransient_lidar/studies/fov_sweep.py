@@ -56,7 +56,7 @@ def fov_sweep(
     fov_mrad
         Full angles of the circles [mrad], above 0, in any order.
     min_depth, max_depth
-        Limits of the fit as in `effective_attenuation` [m], in homogeneous water and far from bottom and targets.
+        Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
     passes
         Independent passes for each field of view, 4 to 10 000.
     max_time
@@ -82,7 +82,7 @@ def fov_sweep(
     ------
     UserError
         If the scene is invalid, has no water, bubbles, or several layers between the depths, the echo of a solid can
-        overlap with them, a number is out of range, or as for `effective_attenuation`.
+        overlap with them, a number is out of range, or as for `ColumnBins`.
 
     Notes
     -----

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water import seawater, water_types
-from mitransient_lidar.physics.water.petzold_waters import petzold_water
-from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_water
 from mitransient_lidar.physics.water.profiles import Profile, read_profile
 from mitransient_lidar.physics.water.water_types import water_of
 

@@ -64,7 +64,7 @@ class PassRecord:
         if self.focusing is not None and echo is not None:
             factor = self.focusing.of(echo, order, length)
             energy = energy * factor
-            sums = self.focusing.perturb(sums or [], self.histogram.perturbations, factor, echo, order, length)
+            sums = self.focusing.perturb(sums or [], factor, echo, order, length)
         self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active, sums)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:

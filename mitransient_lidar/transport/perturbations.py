@@ -1,10 +1,9 @@
-"""Derivatives of the contributions of paths by properties of water and solids, and their weights in other water.
+"""Derivatives of the contributions of paths by properties of water and solids.
 
 A path of lengths L in the layers, with n scattering events by the angles theta and m reflections by a solid,
 contributes in proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over
-the path, and so is any change of it: -L for a change of c (b fixed), n / b for one of b (c fixed), and so on. The sum
-gives the derivative, contribution times sum, or the contribution in other water, contribution times exp(sum), from
-paths that are drawn for the unchanged scene (perturbation Monte Carlo: Hayakawa et al. 2001,
+the path, and so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The derivative of the
+contribution is contribution times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001,
 doi:10.1364/OL.26.001335). The weights between techniques that find the same path add up to 1 in any water, and are not
 differentiated.
 """
@@ -56,7 +55,7 @@ class LayerChange:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A change of water and solids: what it adds to the logarithm of a path's contribution.
+    """A change of water and solids by a parameter: the derivative of the logarithm of a path's contribution.
 
     Attributes
     ----------
@@ -64,21 +63,17 @@ class Perturbation:
         Additions by water between depths.
     solids
         Solids with what a reflection by each adds.
-    finite
-        Whether the sum is the logarithm of a ratio of contributions, instead of a derivative.
     focusing
-        Derivative of `RippleFocusing.factors`, or the changed factors; None where they do not change.
+        Derivative of `RippleFocusing.factors`; None where they do not change.
     ripples
-        For a derivative, ripples of the sea with a parameter below and above its value, and the difference of these two
-        values; None where they do not change.
+        Ripples of the sea with the parameter below and above its value, and the difference of these two values; None
+        where they do not change.
     beam
-        For a derivative, the change of the logarithm of the widths of a Gaussian beam with a parameter; None where they
-        do not change.
+        Change of the logarithm of the widths of a Gaussian beam with the parameter; None where they do not change.
     """
 
     layers: tuple[LayerChange, ...] = ()
     solids: tuple[tuple[mi.Shape, float], ...] = ()
-    finite: bool = False
     focusing: FloatArray | None = None
     ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
     beam: float | None = None
@@ -292,11 +287,8 @@ class Perturbations:
         return found
 
     def channels(self, energy: mi.Float, sums: Sums) -> list[mi.Float]:
-        """Return the derivatives of energies of complete paths, or the energies in the perturbed scene."""
-        return [
-            energy * (dr.exp(total) if one.finite else total)
-            for one, total in zip(self.perturbations, sums, strict=True)
-        ]
+        """Return the derivatives of energies of complete paths."""
+        return [energy * total for total in sums]
 
 
 def joined(first: Sums, second: Sums) -> Sums:

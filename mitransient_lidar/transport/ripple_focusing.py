@@ -23,7 +23,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, opaque
-from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
+from mitransient_lidar.transport.perturbations import Perturbation, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest depth of the table [m], and its number of depths.
@@ -153,15 +153,12 @@ class RippleFocusing:
         """
         return self._look_up(self._table, 1.0, echo, order, length)
 
-    def perturb(
-        self, sums: Sums, perturbations: Perturbations, factor: mi.Float, echo: Echo, order: mi.UInt32, length: mi.Float
-    ) -> Sums:
-        """Return the sums of perturbations with the changes of the factors."""
+    def perturb(self, sums: Sums, factor: mi.Float, echo: Echo, order: mi.UInt32, length: mi.Float) -> Sums:
+        """Return the sums of perturbations with the derivatives of the factors."""
         found = []
-        for total, one, table in zip(sums, perturbations.perturbations, self._changes, strict=True):
+        for total, table in zip(sums, self._changes, strict=True):
             if table is not None:
-                change = self._look_up(table, 1.0 if one.finite else 0.0, echo, order, length) / factor
-                total = total + (dr.log(change) if one.finite else change)
+                total = total + self._look_up(table, 0.0, echo, order, length) / factor
             found.append(total)
         return found
 

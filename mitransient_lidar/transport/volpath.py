@@ -51,9 +51,6 @@ _STREAM = 3
 
 BYTES_PER_PATH = 18  #: Memory of a path: the state of its random numbers [bytes].
 
-#: How connections are estimated: by both samplings with multiple importance sampling, or by one of them.
-CONNECTIONS = ("mis", "emitter", "phase")
-
 
 @dataclass(frozen=True)
 class VolpathOptions:
@@ -61,6 +58,8 @@ class VolpathOptions:
 
     Attributes
     ----------
+    samples_emitter
+        Whether directions towards the emitter are sampled, besides the path's own: the balance heuristic combines both.
     solid_guiding_probability
         Guiding probability on solids below water that scatters all light; None is that of scattering events, with the
         same lobe.
@@ -74,7 +73,7 @@ class VolpathOptions:
     max_scatterings: int = -1
     roulette_threshold: float = 0.001
     guiding_probability: float = 0.4
-    connection: str = "mis"
+    samples_emitter: bool = True
     complement_only: bool = False
     solid_guiding_probability: float | None = None
     expects_emitter: bool = False
@@ -283,7 +282,7 @@ class PathTracer:
         submerged = self._submerged(vertex)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         up, density = light.sampler.sample_in_layer(emitter, u, path.index_layer)
-        sampled = submerged & (density > 0) if self.options.connection != "phase" else mi.Bool(False)
+        sampled = submerged & (density > 0) if self.options.samples_emitter else mi.Bool(False)
         value, pdf = self._evaluate(emitter, vertex, event, sampled, up)
         ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), scene.spawn_ray(si, up))
         top = trace_to_top_layer(scene, ray, path.index_layer, sampled)
@@ -300,7 +299,7 @@ class PathTracer:
         else:
             sampled_depth = self._sampled_depth(top.ray.o, top.ray.d, distance, met | lost)
             own = pdf * share * dr.exp(top.absorption_depth - top.optical_depth - sampled_depth)
-        combined = density + (own if self.options.connection == "mis" else 0)
+        combined = density + own
         connected = value * clear / combined * top.factor
         factor = dr.select(met, connected, self._own_weight(path, transmittance))
         crossing = dr.select(met, above, si)
@@ -405,10 +404,8 @@ class PathTracer:
 
     def _own_weight(self, path: ConnectedPath, transmittance: mi.Float) -> mi.Float:
         """Return the weight of a connection made by the path's own sampling, against the sampled connection."""
-        if self.options.connection == "phase":
+        if not self.options.samples_emitter:
             return mi.Float(1)
-        if self.options.connection == "emitter":
-            return dr.select(path.emitter_ratio > 0, mi.Float(0), 1)
         return dr.select(path.emitter_ratio > 0, transmittance / (transmittance + path.emitter_ratio), 1)
 
     def _redirect(

@@ -1,4 +1,4 @@
-"""Changes of coefficients and phase functions of water, as perturbations of paths."""
+"""Derivatives by coefficients and phase functions of water, as perturbations of paths."""
 
 from __future__ import annotations
 
@@ -66,36 +66,6 @@ def coefficient_derivative(water: Water, name: str, layer: int, focusing: Ripple
             "fournier_forand functions"
         )
     return Perturbation((LayerChange(top, bottom, by_angle=by_angle),), focusing=by_ripples)
-
-
-def layer_change(water: Water, layer: int, changed: Mapping[str, float]) -> LayerChange:
-    """Return the change of a layer to other coefficients [1/m], as the logarithm of a ratio of contributions.
-
-    Raises
-    ------
-    UserError
-        If light that is not scattered in the unchanged water would be, or coefficients exceed each other.
-    """
-    column = water.layers.column
-    before = {name: float(getattr(column, name)[layer]) for name in COEFFICIENTS}
-    after = {**before, **changed}
-    WaterColumn.from_text("0", **after)
-    b, b_after = before["scattering"], after["scattering"]
-    if b_after > 0 and b == 0:
-        raise UserError(f"scattering = {b_after:g} of layer {layer}: the paths are of water without scattering")
-    per_event, by_angle = 0.0, None
-    if b > 0:
-        per_event = float(np.log(max(b_after, 1e-30) / b))
-        own = {name: after[name] for name in ("scattering", "backscattering")}
-        if b_after > 0 and own != {name: before[name] for name in own}:
-            by_angle = _logarithm(water.layers.table(layer, **own)) - _logarithm(water.layers.table(layer))
-    per_metre = before["attenuation"] - after["attenuation"]
-    return LayerChange(*_limits(column.layer_tops, layer), per_metre, per_event, by_angle)
-
-
-def changed_factors(focusing: RippleFocusing, water: Water, changed: Mapping[int, Mapping[str, float]]) -> FloatArray:
-    """Return the factors of ripples with other coefficients [1/m] of some layers."""
-    return focusing.factors_of(*_changed_water(water.layers, changed))
 
 
 def mean_cosine_derivative(water: Water, focusing: RippleFocusing | None = None) -> Perturbation:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import PETZOLD
-from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
-from mitransient_lidar.physics.water.phase import petzold_average_particle
+from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_average_particle, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.plugins.bases import RecordedProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction

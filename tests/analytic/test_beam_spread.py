@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from oracles.beam_spread import radius_rms
+from oracles.beam_spread import BeamSpread
 from oracles.echo_times import layered_time_ns
 from scipy.integrate import quad, trapezoid
 from scipy.special import j1
@@ -16,7 +16,6 @@ from significance import largest_error, largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.physics.lidar.small_angle import BeamSpread
 from mitransient_lidar.studies.beam_spread import beam_spread
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
@@ -199,10 +198,10 @@ def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
         tolerance = 0.01 + thinned
         assert abs(row["transmitted"] / total - 1) < 5e-4
         assert abs(row["unscattered"] - theory.unscattered) < largest_z(8) * row["unscattered_stderr"] + 1e-6
-        assert abs(row["shift_rms"] / radius_rms(theory) - 1) < tolerance
+        assert abs(row["shift_rms"] / theory.radius_rms - 1) < tolerance
         assert abs(1e-9 * row["delay_mean"] / theory.mean_delay - 1) < tolerance
         assert abs(1e-9 * row["delay_std"] / np.sqrt(theory.delay_variance) - 1) < tolerance + 0.02
-        for rank in np.searchsorted(spread["radius"], radius_rms(theory) * np.array([0.5, 1.0, 2.0])):
+        for rank in np.searchsorted(spread["radius"], theory.radius_rms * np.array([0.5, 1.0, 2.0])):
             radius, share = float(spread["radius"][rank]), float(row["within_shift"][rank])
             assert abs(share - within_small_angle(radius, depth, scattering)) < 0.012
             assert abs(share - (drawn.unscattered + drawn.encircled(radius)) / total) < 0.11
@@ -217,10 +216,10 @@ WATERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WATERS)
 def test_realistic_water_where_the_closed_form_holds(lidar_scene, name):
-    """The closed form is drawn with the result of every uniform water.
+    """What the closed form is good for in natural water.
 
     Expectation: its transmittance and the energy within half the depth of the axis hold while b z (1 - g) < 0.25. Its
-    moments and its core do not: few scatterings by large angles make them, see `physics.lidar.small_angle.BeamSpread`.
+    moments and its core do not: few scatterings by large angles make them, see `oracles.beam_spread.BeamSpread`.
     Tolerance: 1 to 6 % for the transmittance, which is too high, 10 % for the energy, as a plain walk found.
     """
     water = {"backscattering": 0.0, **WATERS[name]}

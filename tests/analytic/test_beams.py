@@ -8,7 +8,7 @@ from significance import FALSE_ALARM, assert_equal, assert_same, largest_z
 import mitransient_lidar
 from mitransient_lidar.analysis import comparison
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 ENERGY = 5e-3 * 0.81 * 0.9

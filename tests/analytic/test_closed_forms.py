@@ -13,17 +13,13 @@ import significance
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin
 from oracles.echo_times import bottom_time_ns
 from oracles.lidar_equation import bottom_energy, column_energy, cos_water, surface_energy
+from oracles.phase import henyey_greenstein
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.phase import (
-    fournier_forand,
-    fournier_forand_parameters,
-    henyey_greenstein,
-    petzold_average_particle,
-)
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_average_particle
 from mitransient_lidar.transport.path_classes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]

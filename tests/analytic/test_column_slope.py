@@ -7,10 +7,10 @@ J. Phys. 37, 75: in a large field of view the decay is that of absorption.
 
 import numpy as np
 import pytest
+from oracles.column_slope import effective_attenuation
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.analysis.retrieval.column_slope import effective_attenuation
 from mitransient_lidar.studies.fov_sweep import fov_sweep
 
 pytestmark = pytest.mark.long

@@ -1,4 +1,4 @@
-"""Derivatives and reweighted light: against arrival times, orders of scattering, and scenes with other values."""
+"""Derivatives: against arrival times, orders of scattering, and scenes with other values."""
 
 import compare_derivatives
 import numpy as np
@@ -8,7 +8,6 @@ import significance
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.rendering.reweighting import cases
 from mitransient_lidar.transport.path_classes import PathClasses
 
 pytestmark = pytest.mark.slow
@@ -195,48 +194,6 @@ def test_divergence_of_a_beam_that_overfills_the_view(lidar, integrator):
     share = np.exp(-0.5) / (1 - np.exp(-0.5))
     # d ln E / d ln sigma, from both sums of each pass.
     significance.assert_equal(-30 * found[:, 1:] / found[:, :1].mean(), np.array([share]), error=0.03, bias=0.004)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_derivatives_are_limits_of_reweighted_light(lidar, integrator):
-    """A change of 0.5 % from the same paths, over the step."""
-    plain, _ = lidar(integrator, water=LAYERS)
-    parameters = path_parameters(plain, ["attenuation[1]", "scattering[0]", "backscattering[1]", "bottom_reflectance"])
-    changed = cases(plain, [{one.name: 1.005 * one.value} for one in parameters])
-    energy, changes = one_pass(plain.perturbed([one.perturbation for one in (*parameters, *changed)]))
-    for parameter, slope, light in zip(parameters, changes[:4], changes[4:], strict=True):
-        scale = np.abs(slope).max()
-        found = (light - energy) / (5e-3 * parameter.value)
-        np.testing.assert_allclose(found, slope, atol=0.01 * scale, rtol=0.03, err_msg=parameter.name)
-        assert scale > 0
-
-
-@pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
-@pytest.mark.parametrize(
-    "changed",
-    [
-        pytest.param(
-            {"attenuation[0]": 0.54, "attenuation[1]": 0.27, "bottom_reflectance": 0.13}, marks=pytest.mark.long
-        ),
-        {"scattering[0]": 0.39, "scattering[1]": 0.22, "backscattering[0]": 0.012, "backscattering[1]": 0.0028},
-    ],
-)
-def test_reweighted_light_is_that_of_the_other_scene(lidar, integrator, changed):
-    """Waves and ripples, two layers; the other scene on other random numbers."""
-    sea = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "wind_speed": 4.0, "size": 60.0}
-    passes = 12 if integrator == "lidar_merging" else 24
-    renderer, _ = lidar(integrator, water=LAYERS, sea=sea)
-    (case,) = cases(renderer, [changed])
-    perturbed = renderer.perturbed([case.perturbation])
-    found = np.array([one_pass(perturbed, seed)[1][0] for seed in range(passes)])
-    water, rho = dict(LAYERS), changed.get("bottom_reflectance", 0.1)
-    for name in LAYERS:
-        values = LAYERS[name].split(", ")
-        water[name] = ", ".join(str(changed.get(f"{name}[{layer}]", value)) for layer, value in enumerate(values))
-    other, _ = lidar(integrator, water=water, sea=sea, rho=rho)
-    wanted = np.array([one_pass(other, 1000 + seed)[0] for seed in range(passes)])
-    in_bins = (values.reshape(passes, 1, -1, 8).sum(axis=3)[:, :, :13] for values in (found, wanted))
-    significance.assert_same(*in_bins, error=0.1 if integrator == "lidar_volpath" else 0.03, bias=0.003)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Properties that the estimator must have whatever the scene: sums, reciprocity, strategies that agree, energy."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import drjit as dr
@@ -62,7 +63,14 @@ def with_total(energy):
     return np.concatenate([energy, energy.sum(axis=1, keepdims=True)], axis=1)
 
 
-def connected(lidar_scene, passes, sea, count, **integrator):
+def sampled(scene, emitter):
+    """Return a scene whose integrator samples directions towards the emitter, or leaves all to the path's own."""
+    integrator = scene.integrator()
+    integrator.options = replace(integrator.options, samples_emitter=emitter)
+    return scene
+
+
+def connected(lidar_scene, passes, sea, count, emitter=True, **integrator):
     """Return energies of a single pixel in gates of 20 ns: 1 to 4 the water, 5 the bottom, then light that lags."""
     scene = lidar_scene(
         integrator={"paths_per_pass": 2**15, **integrator},
@@ -70,38 +78,39 @@ def connected(lidar_scene, passes, sea, count, **integrator):
         sea=sea,
         film={"bin_width_ns": 20.0, "bin_count": 8},
     )
-    return passes(scene, count)[:, 0]
+    return passes(sampled(scene, emitter), count)[:, 0]
 
 
 @pytest.mark.slow
 def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
     """Through absorbing water and a rough sea, where both connections find the bottom about as often."""
     sea, water = {"slope_variance": "0.1"}, {"attenuation": 0.4, "scattering": 0.0, "backscattering": 0.0}
-    combined, by_emitter, by_phase = (
+    combined, walk = (
         passes(
-            lidar_scene(
-                integrator={"connection": connection, "paths_per_pass": 2**15},
-                # Without the surface echo.
-                **{"sea": sea, "water": water, "bottom": 4.0, "film": {"time_start_ns": 1440.0}},
-                rx={"layout": "1x1"},
+            sampled(
+                lidar_scene(
+                    integrator={"paths_per_pass": 2**15},
+                    # Without the surface echo.
+                    **{"sea": sea, "water": water, "bottom": 4.0, "film": {"time_start_ns": 1440.0}},
+                    rx={"layout": "1x1"},
+                ),
+                emitter,
             ),
             16,
             first_seed=100 * number,
         ).sum(axis=(1, 2))
-        for number, connection in enumerate(("mis", "emitter", "phase"))
+        for number, emitter in enumerate((True, False))
     )
-    assert_same(combined, by_emitter, error=0.007)
-    assert_same(combined, by_phase, error=0.04)
+    assert_same(combined, walk, error=0.04)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
-def test_connections_by_emitter_by_phase_and_mis_have_one_mean(lidar_scene, passes, sea):
-    """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
+def test_connections_have_the_mean_of_the_walk_alone(lidar_scene, passes, sea):
+    """The walk is complete; weights that do not sum to one would lose or double what both samplings can find."""
     combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:6])
-    for other, count in (("emitter", 24), ("phase", 40)):
-        alone = with_total(connected(lidar_scene, passes, sea, count, connection=other)[:, 1:6])
-        compare(combined, alone, 0.032)
+    alone = with_total(connected(lidar_scene, passes, sea, 40, emitter=False)[:, 1:6])
+    compare(combined, alone, 0.032)
 
 
 @pytest.mark.long
@@ -109,7 +118,7 @@ def test_connections_by_emitter_by_phase_and_mis_have_one_mean(lidar_scene, pass
 def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
     combined = connected(lidar_scene, passes, sea, 24)
-    walk = connected(lidar_scene, passes, sea, 48, connection="phase", guiding_probability=0.0)
+    walk = connected(lidar_scene, passes, sea, 48, emitter=False, guiding_probability=0.0)
     assert walk.sum(axis=1).var(ddof=1) > 50 * combined.sum(axis=1).var(ddof=1)
     # The gate of the bottom echo, where every walk has turned.
     assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)

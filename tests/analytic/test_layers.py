@@ -16,7 +16,7 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scenes import load_scene
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn

@@ -5,11 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.half_space import phase_moments, water_leaving_reflectance
+from oracles.wave_spectra import realise
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.physics.sea.realization import realise
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering import passive
@@ -148,7 +148,7 @@ def crossing(bsdf, side, off_normal_deg):
 )
 @pytest.mark.long
 def test_sampling_does_not_change_the_image(layers):
-    """Guided directions, roulette and kinds of connections change only the noise."""
+    """Guided directions and roulette change only the noise."""
     water = {"attenuation": 0.2, "scattering": 0.12, "backscattering": 0.006}
     if layers:
         water = {name: f"{value}, {1.5 * value}" for name, value in water.items()} | layers
@@ -156,7 +156,7 @@ def test_sampling_does_not_change_the_image(layers):
     plain = {"guiding_probability": 0.1, "solid_guiding_probability": 0.0, "roulette_threshold": 0.0}
     found = [
         passes(build(sun={"zenith_deg": 40.0}, water=water, sea=sea, depth=4.0, integrator=options), 12)[:, 0]
-        for options in ({}, plain, {"connection": "emitter"})
+        for options in ({}, plain)
     ]
     for other in found[1:]:
         error = np.hypot(*(samples.std(ddof=1) / np.sqrt(len(samples)) for samples in (found[0], other)))

@@ -12,10 +12,10 @@ from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.scenes import load_scene
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
-from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.sediments import HapkeSurface
 
 SIGMA = 5e-3
 HEIGHT, OFF_NADIR, INDEX = 200.0, np.radians(20.0), 1.34

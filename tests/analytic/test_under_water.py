@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from oracles.phase import henyey_greenstein
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
@@ -11,7 +12,6 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import fresnel
-from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

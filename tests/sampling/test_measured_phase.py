@@ -4,9 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from oracles.phase import henyey_greenstein
 from significance import assert_same, largest_z
-
-from mitransient_lidar.physics.water.phase import henyey_greenstein
 
 G = 0.9
 WI = np.array([0.3, -0.5, 0.8124]) / np.linalg.norm([0.3, -0.5, 0.8124])

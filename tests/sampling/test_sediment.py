@@ -1,4 +1,4 @@
-"""The BSDF of sediment: the formula of `physics.water.hapke`, its samples, and what it refuses."""
+"""The BSDF of sediment: the formula of `physics.water.sediments`, its samples, and what it refuses."""
 
 import drjit as dr
 import mitsuba as mi
@@ -8,7 +8,7 @@ import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 from significance import assert_distribution, largest_z
 
-from mitransient_lidar.physics.water.hapke import HapkeSurface
+from mitransient_lidar.physics.water.sediments import HapkeSurface
 
 OBLIQUE = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
 GRAZING = np.array([0.95, 0.1, 0.15]) / np.linalg.norm([0.95, 0.1, 0.15])

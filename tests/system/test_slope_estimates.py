@@ -13,8 +13,7 @@ import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
-from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative, positive
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import lidar_geometry, required_number
 
 _FEWEST_BINS = 3  # of a fit
 _LARGEST_ERROR = 0.5  # relative standard error of a bin: the logarithm of a noisier one is biased
@@ -27,6 +24,17 @@ class ColumnBins:
     """Bins of a record between two depths, shape (bins,) each.
 
     Indices, one-way paths in the water to their centres [m], and solid angles of the aperture per area [sr/m^2].
+
+    Notes
+    -----
+    The one-way path in the water at the time t is s = c0 (t - t_surface)/(2 n_g), along the refracted axis, to the
+    depth s cos(phi). The impulse response is divided by the solid angle of the aperture in the water
+    (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
+    singly scattered light, even in a wide beam off nadir, since a mean over depths has the slope of the exponential.
+
+    K depends on the sea. Ripples scatter light out of a narrow field of view, and waves that focus both beam and view
+    increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
+    0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
     """
 
     inside: npt.NDArray[np.intp]
@@ -39,8 +47,13 @@ class ColumnBins:
     ) -> ColumnBins:
         """Return the bins of a record between two depths [m], 0 <= `min_depth` < `max_depth`.
 
-        `edge` is the largest angle from the axis of light that the receiver detects [rad]. The errors are those of
-        `effective_attenuation`.
+        `edge` is the largest angle from the axis of light that the receiver detects [rad].
+
+        Raises
+        ------
+        UserError
+            If the depths are out of order, the surface echo of the beam's edge reaches below the first, or the record
+            does not include them and at least 3 bins between them.
         """
         top, bottom = non_negative("min_depth", min_depth), positive("max_depth", max_depth)
         if bottom <= top:
@@ -68,7 +81,17 @@ class ColumnBins:
         return cls(inside, path, geometry.solid_angle_per_area(path))
 
     def weights(self, energy: FloatArray, stderr: FloatArray) -> tuple[FloatArray, float]:
-        """Return the weights of the logarithms of the bins in K [1/m], shape (bins,), and its standard error [1/m]."""
+        """Return the weights of the logarithms of the bins in K [1/m], shape (bins,), and its standard error [1/m].
+
+        Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential of s, since a bin without
+        rare paths has too low a signal and too small an error. The standard error takes bins as independent. Bins of
+        one pass share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
+
+        Raises
+        ------
+        UserError
+            If a bin has no signal, or a relative standard error above 0.5.
+        """
         if np.any(energy <= 0):
             raise UserError(f"the column has no signal in {np.count_nonzero(energy <= 0)} of {energy.size} bins")
         error = np.maximum(stderr / energy, 1e-12)
@@ -81,51 +104,3 @@ class ColumnBins:
         offset = self.path - np.average(self.path, weights=precision)
         weights = -0.5 * precision * offset / np.sum(precision * offset**2)
         return weights, float(np.linalg.norm(weights * error))
-
-
-def effective_attenuation(dataset: xr.Dataset, min_depth: float, max_depth: float) -> tuple[float, float]:
-    """Measure the attenuation coefficient of a result's column signal between two depths.
-
-    Parameters
-    ----------
-    dataset
-        A result of `rendering.render`. Pixels are summed.
-    min_depth, max_depth
-        Depths below the mean sea level, on the axis [m], 0 <= `min_depth` < `max_depth`, without echoes of surface,
-        bottom or targets between them.
-
-    Returns
-    -------
-    K, stderr : float
-        Attenuation coefficient [1/m] and its standard error.
-
-    Raises
-    ------
-    UserError
-        If the depths are out of order, the surface echo of the beam's edge reaches below the first, the record does not
-        include them and at least 3 bins between them, or a bin has no signal or a relative standard error above 0.5.
-
-    Notes
-    -----
-    The one-way path in the water at the time t is s = c0 (t - t_surface)/(2 n_g), along the refracted axis, to the
-    depth s cos(phi). The impulse response is divided by the solid angle of the aperture in the water
-    (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
-    singly scattered light, even in a wide beam off nadir, since a mean over depths has the slope of the exponential.
-
-    Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential of s, since a bin without rare
-    paths has too low a signal and too small an error. The standard error assumes independent bins. Bins of one pass
-    share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
-
-    K depends on the sea. Ripples scatter light out of a narrow field of view, and waves that focus both beam and view
-    increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
-    0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
-    """
-    beam, view = (required_number(dataset.attrs, name) for name in ("divergence_mrad", "field_of_view_mrad"))
-    geometry = lidar_geometry(dataset.attrs, surface="level")
-    edge = 0.5e-3 * min(BEAM_EDGE * beam, view)
-    column = ColumnBins.between(geometry, edge, results.time_axis(dataset), min_depth, max_depth)
-    bins = dataset.sizes["time"]
-    energy = dataset["impulse_response"].values.reshape(-1, bins).sum(axis=0)[column.inside]
-    stderr = np.linalg.norm(dataset["impulse_response_stderr"].values.reshape(-1, bins), axis=0)[column.inside]
-    weights, error = column.weights(energy, stderr)
-    return float(weights @ np.log(energy / column.gain)), error

@@ -74,7 +74,7 @@ def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray
     """Return the gain of a Lambertian bottom under a sloping surface [1/m^2], without attenuation in the water.
 
     It is T^2 cos(alpha)/(S_s S_t), for an echo of the energy E A (rho/pi) gain exp(-2 K s); for a level sea it equals
-    that of `lidar_equation`. Paths are as for `bottom_depth`, n is the refractive index of the water.
+    that of `lidar_geometry`. Paths are as for `bottom_depth`, n is the refractive index of the water.
 
     Notes
     -----

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitransient_lidar.core.parameters.declaration import Parameter, Plugin, count, number, switch, text
+from mitransient_lidar.core.parameters.declaration import Parameter, Plugin, count, number, switch
 
 _FEWEST, _MOST = 1024, 2**28
 
@@ -19,14 +19,6 @@ def _roulette(default: float, meaning: str) -> Parameter:
 
 _PATHS = count("paths_per_pass", 2**18, _FEWEST, _MOST, f"Paths of one pass, {_UNLESS}")
 _SCATTERINGS = count("max_scatterings", -1, -1, 2**30, "Largest number of scattering events in the water, -1 for any")
-_CONNECTION = text(
-    "connection",
-    "mis",
-    "How vertices under water are connected to the laser: ``mis`` (multiple importance sampling), or for tests "
-    "``emitter`` (directions sampled towards the laser) or ``phase`` (the path's own directions) alone",
-    ("mis", "emitter", "phase"),
-)
-
 LIDAR_MERGING = Plugin(
     "lidar_merging",
     (
@@ -71,7 +63,6 @@ LIDAR_VOLPATH = Plugin(
             "from a broad lobe towards the laser instead of the phase function or BSDF: every echo needs one large "
             "scattering angle, which is rare",
         ),
-        _CONNECTION,
         switch(
             "complement_only",
             False,
@@ -103,6 +94,5 @@ PASSIVE_VOLPATH = Plugin(
             "relative to its mean over all directions, which is assumed to be largest about the refracted sun",
         ),
         _SCATTERINGS,
-        _CONNECTION,
     ),
 )

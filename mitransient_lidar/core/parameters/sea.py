@@ -33,10 +33,9 @@ OCEAN_SURFACE = Plugin(
         text(
             "spectrum",
             "elfouhaily",
-            "Elfouhaily et al. 1997; ``jonswap`` needs ``fetch``, ``table`` a ``filename``: .npz with ``kx``, ``ky`` "
-            "[rad/m] and ``density`` [m^4]; ``height_map`` a ``filename`` of the formats of ``seabed``; ``flat``: no "
-            "waves, all slopes are ripples",
-            ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat"),
+            "Elfouhaily et al. 1997; ``jonswap`` needs ``fetch``, ``height_map`` a ``filename`` of the formats of "
+            "``seabed``; ``flat``: no waves, all slopes are ripples",
+            ("elfouhaily", "jonswap", "pierson_moskowitz", "height_map", "flat"),
         ),
         number("wind_speed", 3.0, "m s-1", 0, 30, "Wind speed at 10 m"),
         _angle("wind_direction_deg", "Direction the wind blows towards"),
@@ -115,7 +114,7 @@ OCEAN_SURFACE = Plugin(
             "Period of the sea; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m",
         ),
         _length("map_size", "Side of a height map that carries no positions"),
-        file("filename", "File of a ``table`` or a ``height_map``"),
+        file("filename", "File of a ``height_map``"),
         number(
             *("altitude", None, "m", 0.1, 1e6),
             "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene",

@@ -6,7 +6,7 @@ times the remaining distance. One scattering by 180 degrees, or the bottom, turn
 the point that is lit, and with it the time; those on the way up move only the direction from which its light is seen.
 Two-way use of the beam spread function in this way follows Katsev et al. (1997), J. Opt. Soc. Am. A 14, 1338,
 doi:10.1364/JOSAA.14.001338, and Walker and McLean (1999), Appl. Opt. 38, 2384, doi:10.1364/AO.38.002384; angles are
-drawn from the phase function here, since its moments describe sea water badly (`small_angle.BeamSpread`).
+drawn from the phase function here, since its moments describe sea water badly.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_time_ns, turn_by_slope
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn

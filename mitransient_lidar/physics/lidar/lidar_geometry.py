@@ -1,4 +1,4 @@
-"""Co-located lidar over a level sea: ranges, depths and times along its axis."""
+"""Co-located lidar over a level sea: ranges, depths and times along its axis, and parameters of the lidar equation."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
 from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 
 
 @dataclass(frozen=True)
@@ -100,3 +101,33 @@ class LidarGeometry:
         """Return the depth [m] on the axis that is simultaneous with the far surface echo of a half angle [rad]."""
         farthest = self.height / math.cos(min(self.off_nadir + edge, 0.5 * math.pi - 1e-3))
         return (farthest - self.slant_range) / self.group_index * self.cos_water
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarSystem(LidarGeometry):
+    """Co-located transmitter and receiver of a given energy and aperture."""
+
+    energy: float  #: Pulse energy [J], positive, times efficiencies of both optics and two-way transmission of the air.
+    aperture_area: float  #: Area of the receiver normal to the ray [m^2], positive.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("energy", "aperture_area"):
+            positive(name, getattr(self, name))
+
+    def water_gain(self, depth: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
+        """Received energy per unit of backscatter [J sr], without attenuation in the water.
+
+        Parameters
+        ----------
+        depth, theta : array_like
+            Depth [m], at least 0, and angle of the ray in air [rad], which broadcast.
+        """
+        _, transmittance = fresnel(theta, self.refractive_index)
+        solid_angle = solid_angle_per_area(self.height, depth, theta, self.refractive_index)
+        return np.asarray(self.energy * self.aperture_area * transmittance**2 * solid_angle)
+
+    @property
+    def column_gain(self) -> float:
+        """Power of the column's signal at the surface over the backscatter at 180 degrees, b p(pi) [W m sr]."""
+        return float(self.water_gain(0.0, self.off_nadir)) * 1e9 * self.metres_per_ns

@@ -29,7 +29,7 @@ from mitransient_lidar.core.validation import (
     non_negative,
     positive,
 )
-from mitransient_lidar.physics.receiver import afterpulses, dead_time
+from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.signal_tail import SignalTail
 
 Moments = tuple[FloatArray, list[FloatArray]]
@@ -381,7 +381,7 @@ class SinglePhotonDetector(SignalTail):
         dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
         hazard = self._hazard(bin_width_ns, events.shape[-1])
         if hazard is not None:
-            fired, covariances = afterpulses.moments(own, dead, hazard, lags)
+            fired, covariances = dead_time.afterpulse_moments(own, dead, hazard, lags)
         elif self.paralyzable:
             fired = dead_time.firing_probability_paralyzable(own, dead)
             covariances = dead_time.pair_covariances(own, fired, dead, lags, paralyzable=True)
@@ -403,7 +403,7 @@ class SinglePhotonDetector(SignalTail):
         """Return the probability of an afterpulse in each bin since a channel is live, or None without afterpulses."""
         if self.afterpulse_probability == 0 or self.afterpulse_decay_ns is None:
             return None
-        return afterpulses.hazard(self.afterpulse_probability, self.afterpulse_decay_ns / bin_width_ns, bins)
+        return dead_time.afterpulse_hazard(self.afterpulse_probability, self.afterpulse_decay_ns / bin_width_ns, bins)
 
 
 Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import turn_by_slope
+from mitransient_lidar.physics.sea.sea_state import SeaState
 from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
 
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
@@ -137,7 +138,7 @@ def slope_spread(off_nadir: float, refractive_index: float) -> float:
 
 
 def slope_structures(
-    spectrum: WaveSpectrum, resolved_variance: float, ripple_variance: float
+    spectrum: WaveSpectrum | SeaState, resolved_variance: float, ripple_variance: float
 ) -> tuple[SlopeStructure, SlopeStructure]:
     """Return the structure functions of a sea, and of the same sea with ripples drawn anew for each way.
 

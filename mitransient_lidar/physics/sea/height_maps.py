@@ -16,8 +16,13 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
-from mitransient_lidar.physics.sea.height_units import check_positions, described, heights_in_metres, position_unit
-from mitransient_lidar.physics.sea.netcdf_heights import read_netcdf_heights
+from mitransient_lidar.physics.sea.height_units import (
+    check_positions,
+    described,
+    heights_in_metres,
+    position_unit,
+    read_netcdf_heights,
+)
 from mitransient_lidar.physics.sea.point_grids import UNEVENNESS, grid_of_points, read_points
 
 logger = logging.getLogger(__name__)
@@ -96,7 +101,7 @@ def read_height_map(
         ``.exr``
             an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
         ``.nc``
-            a variable of two dimensions; see `netcdf_heights.read_netcdf_heights`;
+            a variable of two dimensions; see `height_units.read_netcdf_heights`;
         ``.asc``
             an ESRI ASCII grid, with a .prj file beside it or without;
         ``.tif``, ``.tiff``

@@ -1,15 +1,23 @@
-"""Realisations of a wave spectrum in space and time, and the slope variance that a mesh of them resolves."""
+"""Realisations of a wave spectrum in space and time at any resolution, and the slope variance that facets resolve."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, positive
+from mitransient_lidar.physics.sea.sea_state import SeaState
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY, SLOWEST_WAVENUMBER, WaveSpectrum, variances_along
+
+#: Largest number of cells per side of one grid, and number of cells of the grids for the long waves of a finer sea.
+_MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024
+
+#: Largest ratio of the periods of neighbouring grids, odd.
+_MOST_TILES = 31
 
 
 def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
@@ -40,20 +48,20 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
     return np.asarray(np.sqrt(square))
 
 
-def realise(
-    spectrum: WaveSpectrum,
+def wave_coefficients(
+    spectrum: WaveSpectrum | SeaState,
     period: float,
     cells: int,
     seed: int,
     time: float = 0.0,
     depth: float = math.inf,
     current: tuple[float, float] = (0.0, 0.0),
-) -> FloatArray:
-    """Realise a periodic square patch of sea surface as a Gaussian random field.
+) -> npt.NDArray[np.complex128]:
+    """Realise a periodic square patch of sea surface as a Gaussian random field; see `heights_of`.
 
     Parameters
     ----------
-    spectrum : WaveSpectrum
+    spectrum : WaveSpectrum or SeaState
         Waves to realise. They travel towards the half plane of their direction.
     period : float
         Side of the patch [m], positive. Longer waves are missing.
@@ -71,33 +79,14 @@ def realise(
 
     Returns
     -------
-    ndarray, shape (cells, cells)
-        Elevation [m] at x = (i - cells/2) d, y = (j - cells/2) d for heights[j, i], d = period/cells. Its mean is 0.
+    ndarray, shape (cells, cells/2 + 1)
+        Complex amplitudes [m] of the waves of `wave_numbers`; the other half plane is their conjugate. Those of the
+        constant and of the Nyquist wavenumbers are 0.
 
     Raises
     ------
     UserError
         If `period` or `depth` is not positive, `cells` not even and positive, or `time` or `current` not finite.
-    """
-    return heights_of(wave_coefficients(spectrum, period, cells, seed, time, depth, current))
-
-
-def wave_coefficients(
-    spectrum: WaveSpectrum,
-    period: float,
-    cells: int,
-    seed: int,
-    time: float = 0.0,
-    depth: float = math.inf,
-    current: tuple[float, float] = (0.0, 0.0),
-) -> npt.NDArray[np.complex128]:
-    """Return the complex amplitudes [m] of the waves of `realise`, whose parameters they are.
-
-    Returns
-    -------
-    ndarray, shape (cells, cells/2 + 1)
-        Amplitudes of the waves of `wave_numbers`; the other half plane is their conjugate. Those of the constant and of
-        the Nyquist wavenumbers are 0.
     """
     ix, iy, dk = wave_numbers(period, cells)
     finite("time", time)
@@ -109,7 +98,7 @@ def wave_coefficients(
         drift = dk * (velocity[0] * ix + velocity[1] * iy[:, None]) * time
         advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), depth) * time
     coefficients = np.zeros((iy.size, ix.size), dtype=np.complex128)
-    for number, waves in enumerate(spectrum.travelling_parts()):
+    for number, waves in enumerate(spectrum.systems):
         square, phase = _noise(seed, number, ix, iy)
         modulus = np.sqrt(np.multiply(square, waves.mode_variances(ix, iy, dk), out=square), out=square)
         if time != 0:
@@ -127,9 +116,10 @@ def wave_coefficients(
 
 
 def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> FloatArray:
-    """Return the elevations [m] of `realise` from `wave_coefficients`.
+    """Return the elevations [m] of waves of `wave_coefficients`, shape (cells, cells), of the mean 0.
 
-    The grid has `cells` per side, even and not fewer than those of the coefficients, which is the default.
+    Element [j, i] is at x = (i - cells/2) d, y = (j - cells/2) d, d = period/cells. The grid has `cells` per side, even
+    and not fewer than those of the coefficients, which is the default.
     """
     count = len(coefficients)
     cells = cells or count
@@ -139,38 +129,6 @@ def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> Floa
         coefficients[:half, : half + 1], coefficients[-half:, : half + 1] = waves[:half], waves[half:]
     heights = np.fft.irfft2(coefficients, s=(cells, cells), norm="forward")
     return np.asarray(np.fft.fftshift(heights), dtype=np.float64)
-
-
-def mesh_slope_variance(
-    spectrum: WaveSpectrum, period: float, cells: int, direction: float | None = None
-) -> tuple[float, float]:
-    """Compute the expected slope variances of the triangles of a mesh from `realise`.
-
-    Parameters
-    ----------
-    spectrum, period, cells
-        As for `realise`.
-    direction : float, optional
-        Axis of the variances [rad], counter-clockwise from +x. Default: the direction of the spectrum.
-
-    Returns
-    -------
-    along, across : float
-        Slope variances [1] of the linear facets along and across the direction, reduced against those of the waves by
-        the facets' low-pass.
-
-    Notes
-    -----
-    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d. Their
-    covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles of a
-    cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the mesh.
-    """
-    ix, iy, dk = wave_numbers(period, cells)
-    half = iy.size // 2
-    variance = spectrum.mode_variances(ix, iy, dk)
-    variance[half, :] = variance[:, half] = 0
-    axis = spectrum.direction if direction is None else direction
-    return facet_slope_variance(variance, ix, iy, period, cells, axis)
 
 
 def facet_slope_variance(
@@ -189,7 +147,12 @@ def facet_slope_variance(
     axis
         Direction [rad], counter-clockwise from +x.
 
-    For the formula see `mesh_slope_variance`.
+    Notes
+    -----
+    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the
+    side of a cell. Their covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over
+    both triangles of a cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds
+    oblique to the mesh.
     """
     variance[:, 1:] *= 2  # for the half plane kx < 0
     # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
@@ -212,7 +175,7 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     Parameters
     ----------
     period, cells
-        As for `realise`.
+        As for `wave_coefficients`.
 
     Returns
     -------
@@ -232,11 +195,11 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
 def _noise(seed: int, number: int, ix: IntArray, iy: IntArray) -> tuple[FloatArray, FloatArray]:
     """Squared moduli, of mean 1, and phases [rad] of complex Gaussian numbers, shape (iy, ix) (Box-Muller).
 
-    They are a function of the seed, the number of the travelling part, and the indices.
+    They are a function of the seed, the number of the wave system, and the indices.
     """
     key = _mix(np.array([int(seed) & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64))
     if number > 0:
-        # Hashed first: a small number would give the key of the first part's column ix = number.
+        # Hashed first: a small number would give the key of the first system's column ix = number.
         key = _mix(key ^ _mix(np.array([number], dtype=np.uint64)))
     key = _mix(_mix(key ^ ix.astype(np.uint64)) ^ iy.astype(np.uint64)[:, None])
     # 53 bits each; the added half keeps the argument of the logarithm above 0.
@@ -252,3 +215,176 @@ def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What moves waves; see `wave_coefficients`."""
+
+    time: float  #: Time [s].
+    depth: float  #: Depth of the water [m].
+    current: tuple[float, float]  #: Velocity (x, y) of the water [m/s].
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicHeights:
+    """Elevations of waves on one grid that is as fine as the facets."""
+
+    heights: FloatArray  #: Elevation [m], shape (cells, cells), as from `heights_of`.
+    cell_size: float  #: Spacing of the grid [m].
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of the grid per period."""
+        return len(self.heights)
+
+    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
+        count = self.cells
+        i, j = ((np.rint(np.asarray(lines) / self.cell_size).astype(int) + count // 2) % count for lines in (x, y))
+        return np.asarray(self.heights[np.ix_(j, i)])
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Waves of a range of wavenumbers as Fourier amplitudes."""
+
+    #: Amplitudes [m] of waves with -h to h wavelengths per period along y and 0 to h along x, shape (2 h + 1, h + 1).
+    coefficients: npt.NDArray[np.complex128]
+    period: float  #: Period [m].
+
+    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the sum of the waves [m] on grid lines x and y [m], shape (len(y), len(x))."""
+        half = self.coefficients.shape[1] - 1
+        unit = 2j * np.pi / self.period
+        along_x = np.exp(unit * np.outer(np.arange(half + 1), x))
+        along_x[1:] *= 2  # for the half plane kx < 0
+        along_y = np.exp(unit * np.outer(y, np.arange(-half, half + 1)))
+        amplitudes = along_y @ self.coefficients
+        return np.asarray(amplitudes.real @ along_x.real - amplitudes.imag @ along_x.imag)
+
+
+@dataclass(frozen=True, eq=False)
+class NestedHeights:
+    """Elevations of waves whose period is too long for one grid of the facets' cells.
+
+    The longest waves are those of a coarse grid over the period. Each band of shorter ones has a period that is an odd
+    fraction of the last, so that the wavenumbers of all bands fill the plane without gap or overlap.
+    """
+
+    bands: tuple[Band, ...]  #: Waves by decreasing period, at least one band.
+    short_waves: PeriodicHeights | None  #: The waves of the shortest period, unless they are the last band.
+
+    @property
+    def cells(self) -> int:
+        """Number of cells per period of the grid that holds the longest waves."""
+        return _LONG_WAVE_CELLS
+
+    @property
+    def cell_size(self) -> float:
+        """Spacing of the grid that holds the longest waves [m]."""
+        return self.bands[0].period / _LONG_WAVE_CELLS
+
+    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `PeriodicHeights.sample`."""
+        parts = [band.sample(x, y) for band in self.bands]
+        return sum(parts if self.short_waves is None else [*parts, self.short_waves.sample(x, y)], np.zeros(()))
+
+
+def realise_heights(
+    spectrum: WaveSpectrum | SeaState,
+    period: float,
+    cell: float,
+    seed: int,
+    motion: Motion,
+    axis: float,
+    shortest_wave: float = 0.0,
+) -> tuple[PeriodicHeights | NestedHeights, float, tuple[float, float]]:
+    """Realise a sea for facets of a given size.
+
+    Parameters
+    ----------
+    spectrum, seed
+        As for `wave_coefficients`.
+    period
+        Period of the sea [m], positive.
+    cell
+        Largest side of the cells [m], positive.
+    motion
+        Time, depth and current.
+    axis
+        Direction of the slope variances [rad], counter-clockwise from +x.
+    shortest_wave
+        Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
+
+    Returns
+    -------
+    waves, cell, variance
+        Elevations, the side of the cells [m], and the expected slope variances [1] of the facets along and across the
+        axis.
+    """
+    details = motion.time, motion.depth, motion.current
+
+    def grid_of_waves(part: float) -> int:
+        """Return the cells per period of the coarsest grid that holds all waves."""
+        finest = even_cells(cell, part)
+        return min(finest, 2 * int(part / shortest_wave) + 2) if shortest_wave > 0 else finest
+
+    # The cell of the last grid is that of the facets of all bands.
+    periods, limits = [period], [0]
+    while grid_of_waves(periods[-1]) > _MOST_CELLS:
+        tiles = 3
+        while tiles < _MOST_TILES and grid_of_waves(periods[-1] / tiles) > _MOST_CELLS:
+            tiles += 2
+        # Up to h wavelengths in this period, from j + 1 in the next: (h + 1/2)/period = (j + 1/2)/next period.
+        limits.append((_LONG_WAVE_CELLS // 2 - 1 - tiles // 2) // tiles)
+        periods.append(periods[-1] / tiles)
+    cells = even_cells(cell, periods[-1])
+    cell = periods[-1] / cells
+
+    bands: list[Band] = []
+    short_waves = None
+    resolved = np.zeros(2)
+    for number, (part, inner) in enumerate(zip(periods, limits, strict=True)):
+        is_last = number == len(periods) - 1
+        count = grid_of_waves(part) if is_last else _LONG_WAVE_CELLS
+        ix, iy, dk = wave_numbers(part, count)
+        if is_last:
+            outer = count // 2 - 1
+        else:
+            tiles = round(part / periods[number + 1])
+            outer = tiles * limits[number + 1] + tiles // 2
+        furthest = np.maximum(np.abs(iy)[:, None], ix)
+        is_missing = (furthest > outer) | (furthest <= inner) & (number > 0)
+        is_missing |= np.hypot(iy[:, None], ix) * shortest_wave > part
+        # Each band has other random numbers: plugins allow seeds up to 2^53.
+        coefficients = wave_coefficients(spectrum, part, count, seed + number * 2**54, *details)
+        coefficients[is_missing] = 0
+        variance = spectrum.mode_variances(ix, iy, dk)
+        variance[is_missing] = 0
+        resolved += facet_slope_variance(variance, ix, iy, part, part / cell, axis)
+        if is_last and cells <= _MOST_CELLS:
+            short_waves = PeriodicHeights(heights_of(coefficients, cells), cell)
+        else:
+            rows = np.roll(np.arange(count), count // 2)[count // 2 - outer : count // 2 + outer + 1]
+            bands.append(Band(coefficients[rows, : outer + 1], part))
+    found = float(resolved[0]), float(resolved[1])
+    if short_waves is not None and not bands:
+        return short_waves, cell, found
+    return NestedHeights(tuple(bands), short_waves), cell, found
+
+
+def even_cells(cell: float, period: float) -> int:
+    """Return an even number of cells per period, not longer than `cell` [m], that is fast to transform."""
+    half = max(2, math.ceil(0.5 * period / cell - 1e-9))
+    while not _is_product_of_small_primes(half):
+        half += 1
+    return 2 * half
+
+
+def _is_product_of_small_primes(number: int) -> bool:
+    """Return whether a number has no prime factors but 2, 3 and 5, so that Fourier transforms of its size are fast."""
+    for factor in (2, 3, 5):
+        while number % factor == 0:
+            number //= factor
+    return number == 1

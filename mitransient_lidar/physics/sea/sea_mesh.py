@@ -75,7 +75,7 @@ def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
 def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:
     """Return the triangle mesh of heights on grid lines.
 
-    Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.mesh_slope_variance` assumes.
+    Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.facet_slope_variance` assumes.
 
     Parameters
     ----------

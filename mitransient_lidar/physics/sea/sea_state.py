@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative, positive
-from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, TravellingWaves, WaveSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum, variances_along
 
 _LARGEST_FRACTION = 0.75  # of the slope variance on one axis: that of the angular density cos^2(phi)/pi
 _NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
 
 
 @dataclass(frozen=True)
-class SeaState(WaveSpectrum):
+class SeaState:
     """Sum of independent wave systems, each with its own direction of travel.
 
     Parameters
@@ -52,10 +52,6 @@ class SeaState(WaveSpectrum):
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         return np.asarray(sum(component.omnidirectional(k) for component in self.components))
 
-    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`."""
-        return np.asarray(sum(component.directional(kx, ky) for component in self.components))
-
     def elevation_variance(self) -> float:
         """Variance of the elevation [m^2]."""
         return sum(component.elevation_variance() for component in self.components)
@@ -68,9 +64,14 @@ class SeaState(WaveSpectrum):
         """Elevation variances [m^2]; see `WaveSpectrum.mode_variances`."""
         return np.asarray(sum(component.mode_variances(ix, iy, dk) for component in self.components))
 
-    def travelling_parts(self) -> tuple[TravellingWaves, ...]:
-        """Return the parts of all components, in their order."""
-        return tuple(part for component in self.components for part in component.travelling_parts())
+    def slope_variance(self) -> tuple[float, float]:
+        """Slope variances [1] along and across the direction."""
+        return variances_along(self.slope_covariance(), self.direction)
+
+    @property
+    def systems(self) -> tuple[WaveSpectrum, ...]:
+        """Independent wave systems, in the order of the components."""
+        return self.components
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ class MatchedSpectrum(CosineSpectrum):
         )
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `AxialSpectrum.spreading`."""
+        """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `WaveSpectrum.spreading`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         up, cross = self._fractions(wavenumber)
         fraction = _upwind_fraction(self.scales[0] * up, self.scales[1] * cross)

@@ -7,24 +7,21 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mitransient_lidar.core.array_files import read_npz, readable_suffix
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.declaration import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
-from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum, variances_along
 from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
@@ -137,7 +134,9 @@ class SeaSurface:
             elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
-            waves = terrain = read_height_map(_required(path, spectrum), map_size)
+            if not path:
+                raise UserError("filename is missing: the spectrum 'height_map' is read from it")
+            waves = terrain = read_height_map(path, map_size)
             cell = float(terrain.x[1] - terrain.x[0])
             refined_size = float(terrain.x[-1] - terrain.x[0])
             middle = tuple(0.5 * float(lines[0] + lines[-1]) for lines in (terrain.x, terrain.y))
@@ -156,7 +155,7 @@ class SeaSurface:
         lengths = (0.0, 0.0) if spectrum == "height_map" else (resolution.shortest_wave, resolution.beam_wave)
         shortest, beam_wave = (max(wave, 2 * cell) for wave in lengths)
         ripples = along, across
-        # Tables and swell have no ripples of their own.
+        # Swell has no ripples of its own.
         is_whole = state is not None and isinstance(state.components[0], CosineSpectrum)
         if series is not None:
             series = series.of_part(cox_munk(wind_speed), ripples)
@@ -257,9 +256,7 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
     if fetch is not None and age is not None:
         raise UserError(f"fetch = {fetch:g} and inverse_wave_age = {age:g} are alternatives: give one of them")
     components: list[WaveSpectrum] = []
-    if spectrum == "table":
-        components.append(_read_table(_required(read("filename", ""), spectrum)))
-    elif spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
+    if spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
         if wind_speed == 0:
             logger.info("wind_speed = 0: the sea has no wind waves, only ripples")
         else:
@@ -321,7 +318,7 @@ def _with_total_variance(
 def _matched(
     state: SeaState | None, wind_direction: float, along: float, across: float
 ) -> tuple[SeaState | None, tuple[float, float]]:
-    """Return a sea state whose wind waves have the slope variances, and the total with swell; a table is unchanged."""
+    """Return a sea state whose wind waves have the slope variances, and the total with swell."""
     if state is None:
         return None, (along, across)
     components = list(state.components)
@@ -368,23 +365,3 @@ def _read_wake(read: Read) -> Wake | None:
     if speed == 0:
         return None
     return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
-
-
-def _read_table(path: str) -> TabulatedSpectrum:
-    """Return a spectrum from an ``.npz`` file with arrays ``kx``, ``ky`` and ``density``."""
-    names = ("kx", "ky", "density")
-    readable_suffix(Path(path), (".npz",), "tabulated spectrum")
-    arrays = read_npz(Path(path), names)
-    if len(arrays) < len(names):
-        raise UserError(f"{path} must have the arrays kx, ky and density")
-    table = TabulatedSpectrum(arrays["kx"], arrays["ky"], arrays["density"])
-    if table.peak_wavenumber == 0:
-        raise UserError(f"{path} has its largest density at the wavenumber 0: it must be above 0")
-    return table
-
-
-def _required(path: str, spectrum: str) -> str:
-    """Return the name of a file; reject an empty one."""
-    if not path:
-        raise UserError(f"filename is missing: the spectrum {spectrum!r} is read from it")
-    return path

@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
-from mitransient_lidar.physics.sea.realization import realise
+from mitransient_lidar.physics.sea.realization import heights_of, wave_coefficients
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import variances_along
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
@@ -211,7 +211,7 @@ def _shots_of_one_sea(
     """Return the arrays of `SeaShots` for one realisation."""
     from scipy.ndimage import gaussian_filter
 
-    sea = realise(spectrum, _CELLS * cell, _CELLS, seed)
+    sea = heights_of(wave_coefficients(spectrum, _CELLS * cell, _CELLS, seed))
     # A circle of the same area replaces the elliptical footprint.
     smooth = gaussian_filter(
         sea, lidar.slant_range * lidar.beam / math.sqrt(math.cos(lidar.off_nadir)) / cell, mode="wrap"

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, in_range, non_negative, positive
-from mitransient_lidar.physics.sea.wave_spectrum import AxialSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
 
 _REACH = 6.0  # half width of the hump in standard deviations, which neglects 2e-9 of it
 
 
 @dataclass(frozen=True)
-class SwellSpectrum(AxialSpectrum):
+class SwellSpectrum(WaveSpectrum):
     """Swell as a Gaussian hump in wavenumber and in direction.
 
     Parameters
@@ -75,12 +75,12 @@ class SwellSpectrum(AxialSpectrum):
         return np.asarray(np.where((wavenumber > low) & (wavenumber < high), hump, 0))
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Anisotropy Delta [1], the same for all waves; see `AxialSpectrum.spreading`."""
+        """Anisotropy Delta [1], the same for all waves; see `WaveSpectrum.spreading`."""
         angle, weight = self._angles(2000)
         return np.full(np.shape(k), 2 * float(np.sum(weight * np.cos(2 * angle))))
 
     def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`."""
+        """Directional spectrum Psi [m^4] at wavenumber components [rad/m] that broadcast, equal for opposite waves."""
         cos, sin = np.cos(self.direction), np.sin(self.direction)
         along = cos * np.asarray(kx) + sin * np.asarray(ky)
         across = cos * np.asarray(ky) - sin * np.asarray(kx)
@@ -97,7 +97,7 @@ class SwellSpectrum(AxialSpectrum):
         peak = self.peak_wavenumber
         width = self.relative_bandwidth * peak
         if dk <= min(width, self.directional_spread * peak):
-            return super().mode_variances(ix, iy, dk)
+            return np.asarray(self.directional(ix * dk, iy[:, None] * dk) * dk**2)
         # Each point of the hump is assigned to the nearest wave, which conserves the variance.
         angle, angle_weight = self._angles(self._count(self.directional_spread * peak, dk))
         count = self._count(width, dk)

@@ -1,7 +1,8 @@
 """Base classes of directional wave spectra.
 
 A spectrum Psi(kx, ky) [m^4] is the variance density of a frozen surface: Psi(k) = Psi(-k), and its integral over the
-plane is the elevation variance. Psi does not contain the direction of travel; see `WaveSpectrum.travelling_parts`.
+plane is the elevation variance. Psi does not contain the direction of travel: waves travel towards the half plane of
+the direction of their system.
 Directions are those that wind and waves travel towards, in rad counter-clockwise from +x.
 """
 
@@ -9,7 +10,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -36,19 +36,11 @@ def variances_along(covariance: FloatArray, direction: float) -> tuple[float, fl
     return along, float(np.trace(covariance)) - along
 
 
-class TravellingWaves(Protocol):
-    """Waves that all travel towards the half plane of one direction."""
-
-    @property
-    def direction(self) -> float:
-        """Direction [rad] counter-clockwise from +x: a wave of wavenumber k travels along k if k . direction > 0."""
-
-    def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
-        """See `WaveSpectrum.mode_variances`."""
-
-
 class WaveSpectrum(ABC):
-    """Directional wave spectrum."""
+    """Waves of one system, symmetric about its direction: integrals depend only on S(k) and the spreading Delta(k).
+
+    A wave of wavenumber k travels along k if k . direction > 0, else against it.
+    """
 
     direction: float
 
@@ -65,24 +57,6 @@ class WaveSpectrum(ABC):
         """
 
     @abstractmethod
-    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4] at wavenumber components `kx` and `ky` [rad/m], which broadcast.
-
-        It is equal for opposite waves, and its integral over the plane is the elevation variance.
-        """
-
-    @abstractmethod
-    def elevation_variance(self) -> float:
-        """Variance of the elevation [m^2]."""
-
-    @abstractmethod
-    def slope_covariance(self) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
-
-    def slope_variance(self) -> tuple[float, float]:
-        """Slope variances [1] along and across the direction."""
-        return variances_along(self.slope_covariance(), self.direction)
-
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances of the waves of a periodic patch.
 
@@ -98,15 +72,11 @@ class WaveSpectrum(ABC):
         ndarray, shape (J, I)
             Psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
         """
-        return np.asarray(self.directional(ix * dk, iy[:, None] * dk) * dk**2)
 
-    def travelling_parts(self) -> tuple[TravellingWaves, ...]:
-        """Independent parts of the sea, each with one half plane of directions of travel."""
+    @property
+    def systems(self) -> tuple[WaveSpectrum, ...]:
+        """Independent wave systems: this one."""
         return (self,)
-
-
-class AxialSpectrum(WaveSpectrum):
-    """Spectrum symmetric about its direction, whose integrals depend only on S(k) and the spreading Delta(k)."""
 
     @abstractmethod
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
@@ -153,16 +123,8 @@ class AxialSpectrum(WaveSpectrum):
         return np.concatenate(nodes), np.concatenate(weights)
 
 
-class CosineSpectrum(AxialSpectrum):
+class CosineSpectrum(WaveSpectrum):
     """Spectrum with the angular density (1 + Delta cos 2 phi)/(2 pi), Delta -1 to 1, defined by S(k) and Delta(k)."""
-
-    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
-        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`. It is 0 at the origin."""
-        k = np.hypot(kx, ky)
-        safe = np.where(k > 0, k, 1.0)
-        along = (np.cos(self.direction) * np.asarray(kx) + np.sin(self.direction) * np.asarray(ky)) / safe
-        angular = (1 + self.spreading(safe) * (2 * along**2 - 1)) / (2 * np.pi)
-        return np.asarray(np.where(k > 0, self.omnidirectional(k) * angular / safe, 0))
 
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances Psi dk^2 [m^2]; see `WaveSpectrum.mode_variances`."""

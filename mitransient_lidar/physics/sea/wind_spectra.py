@@ -68,7 +68,7 @@ class WindSpectrum(CosineSpectrum):
         finite("direction", self.direction)
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Upwind-crosswind ratio Delta(k) [1], 0 to 1 (eq. 57); see `AxialSpectrum.spreading`."""
+        """Upwind-crosswind ratio Delta(k) [1], 0 to 1 (eq. 57); see `WaveSpectrum.spreading`."""
         if self.wind_speed == 0:
             return np.zeros(np.shape(k))
         c = phase_speed(k)
@@ -296,7 +296,7 @@ class ShallowSpectrum(CosineSpectrum):
 
     @property
     def smooth_ranges(self) -> tuple[float, ...]:
-        """See `AxialSpectrum.smooth_ranges`."""
+        """See `WaveSpectrum.smooth_ranges`."""
         return tuple(self._shallow(edge) for edge in self.deep.smooth_ranges)
 
     def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
@@ -306,7 +306,7 @@ class ShallowSpectrum(CosineSpectrum):
         return np.asarray(ratio**3 * self.deep.omnidirectional(wavenumber * ratio))
 
     def spreading(self, k: npt.ArrayLike) -> FloatArray:
-        """Anisotropy Delta(k) [1]; see `AxialSpectrum.spreading`."""
+        """Anisotropy Delta(k) [1]; see `WaveSpectrum.spreading`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         return self.deep.spreading(wavenumber * np.tanh(wavenumber * self.depth))
 

@@ -43,7 +43,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
         error = (error**2).sum("shot", skipna=False) ** 0.5 / values.sizes["shot"]
         values = values.mean("shot")
     pixels = [dim for dim in dims if dim not in ("shot", "time")]
-    others = {"shot", "origin", "parameter", "case", "batch", *sum_errors.DIMS}
+    others = {"shot", "origin", "parameter", "batch", *sum_errors.DIMS}
     own = {key: one for key, one in dataset.coords.items() if not others & {*one.dims}}
     for angle in ("angle_x", "angle_y"):
         if angle not in own or set(own[angle].dims) != set(pixels):

@@ -152,7 +152,7 @@ class DaylightRenderer:
         options = self.options
         if self.scene.sun is None:
             # Nothing to be guided to.
-            options = replace(options, connection="phase", expects_emitter=False, solid_guiding_probability=None)
+            options = replace(options, samples_emitter=False, expects_emitter=False, solid_guiding_probability=None)
             options = replace(options, guiding_probability=0.0)
         record.rays = PathTracer(self.scene, options, light).trace(path, rng)
         record.found = dr.select(light.invalid, dr.nan, record.found)

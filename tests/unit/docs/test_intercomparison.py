@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin
+from oracles.phase import henyey_greenstein
 from significance import largest_z
 
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
 FOLDER = Path(__file__).parents[3] / "docs" / "intercomparison"
 

@@ -6,7 +6,7 @@ from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, e
 from oracles.lidar_equation import bottom_energy, column_energy, column_power, surface_energy
 from scipy.integrate import trapezoid
 
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.water.layers import WaterColumn
 

@@ -110,7 +110,7 @@ def test_values_of_mitsubas_own_objects_are_kept():
     scene = mi.load_dict({"type": "scene", **parts})
     values = json.loads(plugin_values(scene, mi.load_dict({"type": "lidar_volpath"})))
     assert set(values) == {"integrator", "a", "b"}
-    assert values["integrator"]["connection"] == "mis"
+    assert values["integrator"]["max_scatterings"] == -1
     assert values["a"]["bsdf"]["reflectance"]["value"] == 0.25
     assert values["b"]["bsdf"]["own"]["width_deg"] == 3
 

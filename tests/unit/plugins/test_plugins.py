@@ -190,9 +190,10 @@ REFUSED = [
     ({"type": "ocean_surface", "spectrum": "flat", "swell_height": 1.0}, "needs a spectrum of waves, not 'flat'"),
     ({"type": "ocean_surface", "spectrum": "height_map"}, "filename is missing"),
     (
-        {"type": "ocean_surface", "spectrum": "table", "filename": "none.npz"},
-        "cannot read none.npz: No such file or directory",
+        {"type": "ocean_surface", "spectrum": "height_map", "filename": "none.npy", "map_size": 9.0},
+        "cannot read none.npy: No such file or directory",
     ),
+    ({"type": "ocean_surface", "spectrum": "table"}, "spectrum = 'table' must be one of elfouhaily"),
     ({"type": "ocean_surface", "water_depth": 0.0}, "water_depth = 0 must be greater than 0"),
     ({"type": "ocean_surface", "current_speed": 11.0}, "current_speed = 11 must lie between 0 and 10"),
     ({"type": "ocean_surface", "wake_speed": -2.0}, "wake_speed = -2 must lie between 0 and 40"),
@@ -201,7 +202,6 @@ REFUSED = [
     ({"type": "ocean_surface", "altitude": 1e-30}, "altitude = 1e-30 must lie between 0.1 and 1e+06"),
     ({"type": "lidar_transmitter", "to_world": 1.0}, "to_world is of type float: it must be of type transform"),
     ({"type": "ocean_surface", "refined_size": 0.0}, "refined_size = 0 must be greater than 0"),
-    ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
     ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
     ({"type": "lidar_volpath", "guiding_probability": 1.0}, "guiding_probability = 1 must lie between"),
     (

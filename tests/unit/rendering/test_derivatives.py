@@ -8,7 +8,6 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
 from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.rendering.reweighting import cases, check_share, effective_share
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
@@ -106,56 +105,17 @@ def test_phase_functions_stay_normalised(renderer):
     assert slope[-1] > 0 > slope[0]
 
 
-def test_cases_of_other_values(renderer):
-    (case,) = cases(renderer, [{"attenuation[0]": 0.6, "bottom_reflectance": 0.2}])
-    assert case.label == "attenuation[0] = 0.6, bottom_reflectance = 0.2"
-    assert case.perturbation.layers[0].per_metre == pytest.approx(-0.1)
-    assert case.perturbation.solids[0][1] == pytest.approx(np.log(2))
-    assert case.squared.layers[0].per_metre == pytest.approx(-0.2)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"attenuation": 0.4}, "reweight: attenuation must be a coefficient of one layer"),
-        ({"scattering[1]": 0.1}, r"scattering\[1\]: the layer has scattering = 0"),
-        ({"attenuation[0]": 0.2}, "scattering = 0.3 must not exceed attenuation = 0.2"),
-        ({"bottom_reflectance": 1.5}, "bottom_reflectance = 1.5 must lie between"),
-        ({"divergence_mrad": 9}, "reweight: divergence_mrad must be a coefficient of one layer"),
-        ({"colour": 1}, "reweight = 'colour' must be one of"),
-    ],
-)
-def test_cases_that_cannot_be_reached_are_refused(renderer, values, message):
-    with pytest.raises(UserError, match=message):
-        cases(renderer, [values])
-
-
-def test_effective_share():
-    """Equal ratios keep all paths; a ratio of which one path in four carries the light keeps a quarter."""
-    energy = np.ones(4)
-    assert effective_share(energy, 2 * energy, 4 * energy) == pytest.approx(1)
-    single = np.array([8.0, 0, 0, 0])
-    assert effective_share(energy, single, single**2) == pytest.approx(0.25)
-    with pytest.raises(UserError, match=r"reweight: a = 1 is too far .* a share of 0.1"):
-        check_share("a = 1", 0.1)
-
-
 @pytest.mark.slow
 def test_results_with_derivatives(tmp_path):
     """Waveforms are those without derivatives; a file holds all, and is rendered again to the same bits."""
     options = {"params": LAYERS, "passes": 4, "seed": 5, "integrator": FEW}
     names = ["attenuation[0]", "bottom_depth", "bottom_reflectance"]
-    shot = mitransient_lidar.render("table1", derivatives=names, reweight=[{"attenuation[0]": 0.52}], **options)
+    shot = mitransient_lidar.render("table1", derivatives=names, **options)
     plain = mitransient_lidar.render("table1", **options)
     np.testing.assert_array_equal(shot["waveform"], plain["waveform"])
     assert shot["parameter"].values.tolist() == names
     assert shot["parameter_method"].values.tolist() == ["score", "central differences", "score"]
     assert shot["waveform_derivative"].dims == ("parameter", "pixel", "time")
-    assert shot["waveform_reweighted"].dims == ("case", "pixel", "time")
-    assert 0.9 < float(shot["effective_share"][0]) < 1
-    # Light falls with absorption, and by less than exp(-0.02 * 17 m).
-    total = float(shot["waveform_reweighted"].sum() / plain["waveform"].sum())
-    assert np.exp(-0.34) < total < 1
     results.save(shot, tmp_path / "shot.nc")
     held = mitransient_lidar.open(tmp_path / "shot.nc")
     assert held.identical(shot)

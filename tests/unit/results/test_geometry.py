@@ -11,7 +11,7 @@ from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import gate_files, gate_stack
+from mitransient_lidar.results import gate_files
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
@@ -139,10 +139,6 @@ def test_lines_of_sight_survive_files_and_gates(tmp_path, suffix):
     gate_files.save_stack(gates, tmp_path / f"b{suffix}")
     stack = gate_files.open_stack(tmp_path / f"b{suffix}")
     assert_same(LinesOfSight.from_dataset(stack), lines)
-    depth = gate_stack.pixel_depths(stack)
-    assert depth.dims == ("row", "column", "gate")
-    expected = (1427.5 + 5 * np.arange(3) - lines.surface_time[:, np.newaxis]) * lines.depth_per_ns[:, np.newaxis]
-    np.testing.assert_allclose(depth.values.reshape(6, 3), expected, rtol=1e-7)
     assert_same(LinesOfSight.from_dataset(dataset.transpose("time", "column", "row")), lines)
 
 

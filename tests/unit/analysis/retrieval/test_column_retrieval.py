@@ -12,7 +12,7 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import (
     water_of_column,
 )
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import water_of
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from command_line import run
 from few_paths import few_paths
+from oracles.column_slope import effective_attenuation
 from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.retrieval.column_slope import ColumnBins, effective_attenuation
+from mitransient_lidar.analysis.retrieval.column_slope import ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis

@@ -7,7 +7,7 @@ import pytest
 from oracles.lidar_equation import cos_water
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import snell
 
 THETA, N = math.radians(20), 1.34

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import significance
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin
+from oracles.phase import henyey_greenstein
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.echo_estimate import EchoEstimate
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
 SYSTEM = LidarSystem(200.0, np.radians(20), 1.34, 1.364, energy=3e-3, aperture_area=0.02)

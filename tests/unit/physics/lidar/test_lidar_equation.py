@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 
 
 def test_gain_at_nadir():

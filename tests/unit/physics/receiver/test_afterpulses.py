@@ -5,7 +5,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.receiver import afterpulses, dead_time
+from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import SinglePhotonDetector
 
 # Dead for the rest of its bin and 9.5 bins of 1 ns: 10 bins.
@@ -61,7 +61,7 @@ def test_moments_in_changing_light(dead_ns, channels):
 def test_without_afterpulses_the_recursion_is_that_of_dead_time():
     rng = np.random.default_rng(5)
     events, dead = rng.exponential(0.1, (3, 60)), dead_time.dead_bins(6.3, 1.0)
-    fired, covariances = afterpulses.moments(events, dead, np.zeros(20), 15)
+    fired, covariances = dead_time.afterpulse_moments(events, dead, np.zeros(20), 15)
     plain, _ = dead_time.firing_probability(events, dead)
     np.testing.assert_allclose(fired, plain, atol=1e-14)
     for found, expected in zip(covariances, dead_time.pair_covariances(events, plain, dead, 15), strict=True):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles.wave_spectra import mesh_slope_variance
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
-from mitransient_lidar.physics.sea.realization import mesh_slope_variance
+from mitransient_lidar.physics.sea.realization import wave_numbers
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, PiersonMoskowitzSpectrum
 
@@ -102,7 +103,7 @@ def test_series_of_a_small_part_is_refused():
         (lambda: cox_munk(-1), "wind_speed = -1 must lie between 0 and 30"),
         (lambda: cox_munk(np.inf), "wind_speed = inf must be finite"),
         (lambda: GramCharlierSeries.of_clean_sea(15), "slope_distribution 'gram_charlier' = 15 must lie"),
-        (lambda: mesh_slope_variance(ElfouhailySpectrum(5), 10, 15), "cells = 15 must be an even"),
+        (lambda: wave_numbers(10, 15), "cells = 15 must be an even"),
     ],
 )
 def test_bad_parameters_are_rejected(call, message):

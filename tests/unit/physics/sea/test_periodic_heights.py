@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles.wave_spectra import mesh_slope_variance
 from significance import assert_equal
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
-from mitransient_lidar.physics.sea.realization import mesh_slope_variance
+from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 

@@ -6,24 +6,18 @@ import sys
 import numpy as np
 import pytest
 from frequencies import assert_uniform
+from oracles.wave_spectra import directional, mesh_slope_variance, realise
 from scipy import stats
 from scipy.integrate import trapezoid
 from significance import largest_z
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.realization import angular_frequency, mesh_slope_variance, realise
+from mitransient_lidar.physics.sea.realization import angular_frequency, wave_numbers
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
-from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, JonswapSpectrum, PiersonMoskowitzSpectrum
 
 G = 9.81
-
-
-def hump_table(kx, ky, **options):
-    """Return a table with all waves within 0.1 rad/m of (kx, ky)."""
-    offsets = np.array([-0.1, 0.0, 0.1])
-    return TabulatedSpectrum(kx + offsets, ky + offsets, np.outer([0, 1, 0], [0, 1, 0]), **options)
 
 
 SPECTRA = {
@@ -31,9 +25,8 @@ SPECTRA = {
     "pierson_moskowitz": PiersonMoskowitzSpectrum(4, direction=2.0),
     "jonswap": JonswapSpectrum(5, 3000, direction=-1.0),
     "swell": SwellSpectrum(0.5, 8, 0.5),
-    "table": hump_table(0.9, -0.7, direction=0.4),
     "matched": MatchedSpectrum(ElfouhailySpectrum(3, direction=1.0), *cox_munk(3)),
-    "sea": SeaState((ElfouhailySpectrum(3, direction=0.3), SwellSpectrum(0.5, 8, 1.9), hump_table(0.9, -0.7))),
+    "sea": SeaState((ElfouhailySpectrum(3, direction=0.3), SwellSpectrum(0.5, 8, 1.9))),
 }
 
 
@@ -80,7 +73,7 @@ def test_realised_variances_are_the_spectrum_s_integrals():
     density, asymmetry = spectrum.omnidirectional(k), spectrum.spreading(k) / 4
     shares = np.array([np.ones_like(k), k**2 * (0.5 + asymmetry), k**2 * (0.5 - asymmetry)])
     expected = trapezoid(density * shares, k)
-    psi = spectrum.directional(kx, ky) * (2 * np.pi / period) ** 2
+    psi = directional(spectrum, kx, ky) * (2 * np.pi / period) ** 2
     # Each pair of waves, k and -k, has a variance 2 psi times an exponential number.
     weights = np.array([1.0 * low, along**2 * low, across**2 * low])
     error = np.sqrt(2 * np.sum((psi * weights) ** 2, axis=(1, 2)) / seeds)
@@ -166,7 +159,7 @@ def test_components_of_a_sea_have_independent_waves():
     second = realise(SeaState((wind, wind)), 40, 64, 3) - alone
     third = realise(SeaState((wind, wind, wind)), 40, 64, 3) - alone - second
     k = wavenumbers(40, 64)
-    scale = np.sqrt(np.maximum(wind.directional(*k), 1e-300)) * 2 * np.pi / 40
+    scale = np.sqrt(np.maximum(directional(wind, *k), 1e-300)) * 2 * np.pi / 40
     parts = [(fourier(part) / scale)[1:, 33:] for part in (alone, second, third)]
     for a, b in ((0, 1), (0, 2), (1, 2)):
         # |a|^2 is exponential: products of independent amplitudes have standard error 1/sqrt(n).
@@ -208,37 +201,7 @@ def test_every_wave_travels_towards_the_half_plane_of_its_direction():
     np.testing.assert_allclose(np.where(along == 0, 0, turned), expected, atol=1e-6)
 
 
-def test_waves_of_a_table_travel_along_their_wavenumbers():
-    dk = 2 * np.pi / 64
-    k = (-6 * dk, 3 * dk)
-    quarter = np.pi / 2 / float(angular_frequency(np.hypot(*k)))
-
-    def phase_change(table):
-        before, after = (fourier(realise(table, 64, 32, 5, time))[16 + 3, 16 - 6] for time in (0.0, quarter))
-        return np.degrees(np.angle(after / before))
-
-    # The wave exp(i k x - i omega t) has turned by -90 degrees, whatever direction slopes refer to.
-    assert phase_change(hump_table(*k, direction=0.0)) == pytest.approx(-90)
-    assert phase_change(hump_table(*k, direction=np.pi)) == pytest.approx(-90)
-    assert phase_change(hump_table(-k[0], -k[1], direction=0.0)) == pytest.approx(90)
-
-
-def test_table_realised_over_seeds_has_its_height():
-    table = TabulatedSpectrum([-1, 0, 1, 2], [0, 1, 2], [[0, 1, 0, 0], [1, 2, 1, 0], [0, 1, 0, 0]], direction=0.3)
-    index = np.arange(-15, 16)
-    variances = table.mode_variances(index, index, 2 * np.pi / 30)
-    assert variances.sum() == pytest.approx(table.elevation_variance())
-    expected = table.elevation_variance() - variances[15, 15]
-    for time in (0.0, 20.0):
-        seas = [realise(table, 30, 32, seed, time) for seed in range(100)]
-        # The table has variance at k = 0 too, but the sea level no waves.
-        assert max(abs(sea.mean()) for sea in seas) < 1e-14
-        squares = [np.mean(sea**2) for sea in seas]
-        error = np.sqrt(2 * np.sum(variances**2) / 100)
-        assert abs(np.mean(squares) - expected) < largest_z(100) * error < 0.15 * expected
-
-
-@pytest.mark.parametrize("kind", ["elfouhaily", "table", "sea"])
+@pytest.mark.parametrize("kind", ["elfouhaily", "sea"])
 def test_current_carries_the_sea_along(kind):
     still = realise(SPECTRA[kind], 64, 64, 3, 4.0)
     carried = realise(SPECTRA[kind], 64, 64, 3, 4.0, current=(1.0, -0.5))
@@ -284,7 +247,7 @@ def test_facet_slopes_have_the_predicted_variance():
     # Without the facets' low-pass the crosswind prediction would be a sixth higher.
     k = 2 * np.pi / size * np.arange(-n // 2 + 1, n // 2)
     across = cos * k[:, None] - sin * k
-    unfiltered = np.sum(spectrum.directional(k, k[:, None]) * across**2) * (2 * np.pi / size) ** 2
+    unfiltered = np.sum(directional(spectrum, k, k[:, None]) * across**2) * (2 * np.pi / size) ** 2
     assert unfiltered - expected[1] > 8 * error[1]
 
 
@@ -295,9 +258,6 @@ def test_fine_mesh_resolves_the_spectrum_and_a_sea_the_sum_of_its_components():
     # Swell across the wind: along the one is across the other.
     expected = np.add(mesh_slope_variance(wind, 64, 128), mesh_slope_variance(swell, 64, 128)[::-1])
     assert mesh_slope_variance(SeaState((wind, swell)), 64, 128) == pytest.approx(tuple(expected))
-    table = hump_table(0.9, -0.7)
-    expected = mesh_slope_variance(table, 64, 128)
-    assert mesh_slope_variance(SeaState((table, table)), 64, 128) == pytest.approx((2 * expected[0], 2 * expected[1]))
 
 
 @pytest.mark.slow
@@ -322,7 +282,7 @@ def test_physics_of_the_sea_imports_no_scipy():
         (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, current=(1, np.inf)), "current holds inf"),
         (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, current=1), r"current of shape \(\) must be two velocities"),
         (lambda: angular_frequency(1.0, -1), "depth = -1 must be greater than 0"),
-        (lambda: mesh_slope_variance(ElfouhailySpectrum(5), 10, 3), "cells = 3 must be an even"),
+        (lambda: wave_numbers(10, 3), "cells = 3 must be an even"),
     ],
 )
 def test_bad_parameters_are_rejected(call, message):

@@ -11,7 +11,7 @@ from significance import assert_equal
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, realise_heights
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
@@ -172,11 +172,3 @@ def test_a_flat_sea_with_a_mean_slope_is_a_plane_and_slopes_are_limited():
     assert len(read(spectrum="flat", size=20.0).mesh().faces) == 4
     with pytest.raises(UserError, match="slope_y_deg = 16 must lie between -15 and 15"):
         read(slope_y_deg=16.0)
-
-
-def test_a_table_whose_peak_is_no_wave_is_refused(tmp_path):
-    """The period of the cells, the longest wavelength, was a division by zero."""
-    k = np.linspace(-1.0, 1.0, 5)
-    np.savez(tmp_path / "a.npz", kx=k, ky=k, density=np.exp(-(k[:, None] ** 2) - k**2))
-    with pytest.raises(UserError, match=r"a.npz has its largest density at the wavenumber 0: it must be above 0"):
-        read(spectrum="table", filename=str(tmp_path / "a.npz"))

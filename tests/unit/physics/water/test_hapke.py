@@ -5,8 +5,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.water.hapke import HapkeSurface
-from mitransient_lidar.physics.water.sediments import NAMES, bottom_reflectance
+from mitransient_lidar.physics.water.sediments import BOTTOMS, HapkeSurface, bottom_reflectance
 
 #: Lobes towards the source and away from it, narrow and wide opposition effects.
 SURFACES = [
@@ -91,7 +90,7 @@ def test_negative_values_are_refused(name):
 
 def test_bottoms_by_name_have_the_values_of_the_table():
     """At 530 nm, and between it and 540 nm (Maritorena et al. 1994, fig. 6)."""
-    assert [bottom_reflectance("reflectance", name, 530.0) for name in NAMES] == [0.429, 0.246, 0.044, 0.075]
+    assert [bottom_reflectance("reflectance", name, 530.0) for name in BOTTOMS] == [0.429, 0.246, 0.044, 0.075]
     assert bottom_reflectance("reflectance", "coral_sand") == pytest.approx(0.8 * 0.429 + 0.2 * 0.442)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
 # Summary pages of SIO Ref. 72-78: c and bb/b; median angle [deg]; fraction of b and power below 0.1 degree;

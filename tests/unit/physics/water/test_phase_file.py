@@ -4,12 +4,9 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from oracles.phase import henyey_greenstein
 
-from mitransient_lidar.physics.water.phase import (
-    henyey_greenstein,
-    henyey_greenstein_backscatter_ratio,
-    petzold_average_particle,
-)
+from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio, petzold_average_particle
 from mitransient_lidar.physics.water.phase_file import read_phase_table
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
