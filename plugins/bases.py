@@ -98,8 +98,6 @@ def register(
         used = [name for name in given if name not in left or own.was_queried(name)]
         for name in used:
             props.mark_queried(name)
-        if not hasattr(made, "__dict__"):
-            return made  # an object of Mitsuba
         # Mitsuba's base classes read some themselves.
         others = [name for name in used if name in left and name not in own.values and name not in children]
         made.parameters = {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -23,8 +21,8 @@ class Sediment(mi.BSDF):
 
     .. parameters::
 
-    With ``lambertian`` it is Mitsuba's ``diffuse``. With ``hapke`` it reflects, at the angle *g* between the directions
-    to source and receiver,
+    With ``lambertian`` it reflects as Mitsuba's ``diffuse``. With ``hapke`` it reflects, at the angle *g* between the
+    directions to source and receiver,
 
     .. math:: f = \frac{w}{4\pi (\mu_i + \mu_o)} \left[ (1 + B(g))\, p(g) + H(\mu_i) H(\mu_o) - 1 \right], \quad
               B(g) = \frac{B_0}{1 + \tan(g/2)/h},
@@ -144,6 +142,64 @@ class Sediment(mi.BSDF):
         return f"Sediment[{self.surface}]"
 
 
+class LambertianSediment(mi.BSDF):
+    """The Lambertian model of `Sediment`: Mitsuba's ``diffuse``, with parameters that a result can record."""
+
+    def __init__(self, props: RecordedProperties) -> None:
+        super().__init__(props)
+        if "single_scattering_albedo" in props:
+            albedo = props["single_scattering_albedo"]
+            raise UserError(f"single_scattering_albedo = {albedo} needs model = 'hapke': give reflectance")
+        # A scene may give the particles for either model.
+        _particles(props)
+        reflectance = _reflectance(props)
+        #: Reflectance, a number also where the parameter is a name.
+        self.used_values = {"reflectance": reflectance}
+        self._diffuse = create_object("diffuse", reflectance=reflectance)
+        self.m_components, self.m_flags = self._diffuse.m_components, self._diffuse.m_flags
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
+        """Sample a direction in proportion to its cosine; return it and BSDF times cosine over its density."""
+        return self._diffuse.sample(ctx, si, sample1, sample2, active)
+
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Color1f:
+        """Return BSDF times cosine [1/sr]."""
+        return self._diffuse.eval(ctx, si, wo, active)
+
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Float:
+        """Return the density with which `sample` draws a direction [1/sr]."""
+        return self._diffuse.pdf(ctx, si, wo, active)
+
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Color1f, mi.Float]:
+        """Return BSDF times cosine, and density [1/sr]."""
+        return self._diffuse.eval_pdf(ctx, si, wo, active)
+
+    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color1f:
+        """Return the reflectance."""
+        return self._diffuse.eval_diffuse_reflectance(si, active)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose ``reflectance``, as ``diffuse`` does."""
+        self._diffuse.traverse(callback)
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"LambertianSediment[{self._diffuse}]"
+
+
 def _reflectance(props: RecordedProperties) -> float:
     """Return the reflectance at vertical incidence."""
     return bottom_reflectance("reflectance", props.read("reflectance", 0.1), props.read("wavelength_nm"))
@@ -154,17 +210,9 @@ def _particles(props: RecordedProperties) -> HapkeSurface:
     return HapkeSurface(0.0, *map(props.read, _PARTICLES))
 
 
-def _create(props: RecordedProperties) -> Any:
-    """Return a `Sediment`, or Mitsuba's own Lambertian surface."""
-    if props.read("model") == "hapke":
-        return Sediment(props)
-    if "single_scattering_albedo" in props:
-        raise UserError(
-            f"single_scattering_albedo = {props['single_scattering_albedo']} needs model = 'hapke': give reflectance"
-        )
-    # A scene may give the particles for either model.
-    _particles(props)
-    return create_object("diffuse", reflectance=_reflectance(props))
+def _create(props: RecordedProperties) -> mi.BSDF:
+    """Return the BSDF of the parameter ``model``."""
+    return Sediment(props) if props.read("model") == "hapke" else LambertianSediment(props)
 
 
 register("bsdf", SEDIMENT, _create, Sediment)

@@ -8,6 +8,7 @@ import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 from significance import assert_distribution, largest_z
 
+from mitransient_lidar.loading.scene_record import object_values
 from mitransient_lidar.physics.water.sediments import HapkeSurface
 
 OBLIQUE = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
@@ -83,6 +84,17 @@ def test_lambertian_model_is_the_diffuse_surface_of_mitsuba(reflectance, expecte
     kept = mi.traverse(bsdf)
     assert list(kept.keys()) == ["reflectance.value"]
     assert np.array(kept["reflectance.value"]).item() == pytest.approx(expected, rel=1e-6)
+    values = object_values(bsdf)
+    assert (values["type"], values["model"], values["wavelength_nm"]) == ("sediment", "lambertian", 532)
+    assert values["used"] == {"reflectance": pytest.approx(expected, rel=1e-6)}
+    si, wo = interaction(OBLIQUE), mi.Vector3f(OBLIQUE.tolist())
+    plain = mi.load_dict({"type": "diffuse", "reflectance": np.array(kept["reflectance.value"]).item()})
+    for method in ("eval", "pdf"):
+        seen, wanted = (getattr(one, method)(mi.BSDFContext(), si, wo) for one in (bsdf, plain))
+        np.testing.assert_array_equal(np.array(seen), np.array(wanted))
+    kept["reflectance.value"] = 0.2
+    kept.update()
+    assert np.array(bsdf.eval_diffuse_reflectance(si)).ravel()[0] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(

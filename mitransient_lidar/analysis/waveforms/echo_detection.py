@@ -180,6 +180,27 @@ def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> Float
     return np.where(found, ends, 0).astype(np.float64)
 
 
+def longest_run(saturated: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the first and last bin of the longest run of saturated samples, shape (n, time); 1 and 0 without any."""
+    index = np.arange(saturated.shape[1])
+    run = index - np.maximum.accumulate(np.where(saturated, -1, index), axis=1)
+    last = run.argmax(axis=1)
+    return last - run.max(axis=1) + 1, last
+
+
+def may_be_second_return(
+    time_ns: FloatArray, half_ns: FloatArray, clipped_ns: FloatArray, width_ns: float
+) -> BoolArray:
+    """Return which echoes may be light that a bottom within a clipped time has returned twice.
+
+    Times of echoes, and halves of their delays behind the mean surface, are of the shape (n, estimator, echo), first
+    and last clipped times (n, 2). Half delays below two echo widths are within the surface's own echo.
+    """
+    start, end = clipped_ns.T[..., np.newaxis, np.newaxis]
+    clipped = (start <= time_ns - half_ns) & (time_ns - half_ns <= end) & (half_ns > 2 * width_ns)
+    return np.asarray(clipped & (np.arange(time_ns.shape[-1]) > 1))
+
+
 @dataclass(frozen=True)
 class DetectedEchoes:
     """Surface, targets and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`.

@@ -20,6 +20,8 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     EchoFlag,
     Records,
     find_echoes,
+    longest_run,
+    may_be_second_return,
     saturated_spans,
 )
 from mitransient_lidar.analysis.waveforms.records import Waveforms
@@ -95,9 +97,9 @@ def extract(
         of ``pulse_fwhm_ns``.
     noise : float or array-like, optional
         Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
-        ``waveform_stderr`` with the ``error_correlation``, or ``signal_deviation``, or the spread before the
-        surface echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over
-        a pulse to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
+        ``waveform_stderr`` with the ``error_correlation``, or ``signal_deviation``, or the spread before the surface
+        echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over a pulse
+        to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
         ``signal_mean_stderr``, so that errors of a render are no echoes.
     threshold, contrast
         As for `echo_detection.find_echoes`.
@@ -122,11 +124,10 @@ def extract(
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
         ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
         ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
-        `echo_detection.EchoFlag`. Without ``echo``:
-        ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which
-        ``depth_m_method_error`` includes. Over the dimensions of the waveforms alone: ``attenuation`` [1/m] along the
-        path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``: ``layer_depth_m``,
-        ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
+        `echo_detection.EchoFlag`. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
+        ``_stderr`` and ``_method_error``, which ``depth_m_method_error`` includes. Over the dimensions of the waveforms
+        alone: ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over
+        ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
 
     Raises
     ------
@@ -150,24 +151,25 @@ def extract(
     targets and bottoms below 3 standard errors as ``poor_fit``, and surfaces as ``column_onset``: their time is that of
     the column's onset, as of all beyond 60 degrees from nadir. They have neither amplitude nor width.
 
-    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time.
-    ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of the record's trigger and clocks, which
-    cancels where the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for
-    ``gaussian`` the typical error by scattered light that arrives later, by the light's distribution in the pixel,
-    which the surface echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from
-    40 random level seas and 36 shots on waves, its dependence on sqrt(K bb) also from one lidar. In other renders the
-    root mean squares of error over both errors together were 1.0 to 1.2: seven hexagonal pixels over level and tilted
-    bottoms in six waters, imagers of 32x32 and 128x128 pixels over a slope of 8 degrees, and 60 shots at 6 m/s (1.0 to
-    1.3 in each 20 of them). The error has the sign of the biases below: over bottoms that rise away from the lidar by 8
-    to 10 degrees the ratio was 1.2 to 1.4, over falling ones 0.7 to 0.8. The other estimators have the biases below.
+    Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time. Light
+    that a bottom returns twice arrives from twice its depth: where the half depth is clipped, an echo is ``saturated``,
+    too, and has this half as an error. ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of
+    the record's trigger and clocks, which cancels where the pixel's own surface echo counts. The method errs by more:
+    ``depth_m_method_error`` states for ``gaussian`` the typical error by scattered light that arrives later, by the
+    light's distribution in the pixel, which the surface echo samples at few places, and by waves; see
+    `depth_errors.DepthErrors`. Its constants are from 40 random level seas and 36 shots on waves, its dependence on
+    sqrt(K bb) also from one lidar. In other renders the root mean squares of error over both errors together were 1.0
+    to 1.2: seven hexagonal pixels over level and tilted bottoms in six waters, imagers of 32x32 and 128x128 pixels over
+    a slope of 8 degrees, and 60 shots at 6 m/s (1.0 to 1.3 in each 20 of them). The error has the sign of the biases
+    below: over bottoms that rise away from the lidar by 8 to 10 degrees the ratio was 1.2 to 1.4, over falling ones 0.7
+    to 0.8. The other estimators have the biases below.
 
     Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum``
     flat and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second
     that of the bottom against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in
     degrees, d is the divergence [mrad], in a field of view of 20 mrad for 2 and 30 mrad for 10. Attenuation, scattering
     and backscattering [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and
-    1, 0.8, 0.016 and 4 (turbid). Standard errors are at
-    most 0.013, those of ``peak`` up to 0.1.
+    1, 0.8, 0.016 and 4 (turbid). Standard errors are at most 0.013, those of ``peak`` up to 0.1.
 
     ======= ===== == =========== =========== =========== =========== =========== ===========
     water   angle  d threshold   edge        peak        centroid    gaussian    deconvolved
@@ -196,9 +198,8 @@ def extract(
     return most of the light, and bottom biases of at most 0.01, up to 20 degrees; edges of wide echoes are early. The
     rest is the water's: light scattered near the surface follows the surface echo and delays its peak and centroid by
     0.1 to 1.8 (surface penetration), and scattered light reaches the bottom later by 0.02 to 0.1. It arrives no earlier
-    than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo.
-
-    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
+    than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
+    attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
@@ -298,6 +299,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         error = table["time_ns_stderr"][..., echo]
         error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
+    table["clipped_ns"] = time[np.stack(longest_run(saturated), axis=1)]
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
     table |= {"attenuation": column.decay * per_metre, "attenuation_stderr": column.decay_stderr * per_metre}
     table["attenuation_chi2"] = column.chi2
@@ -359,6 +361,10 @@ def _with_depths(
         time[absent, number, 0] = error[absent, number, 0] = np.nan
         by_light[:, number] = found.method_ns.ravel()
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
+    half = 0.5 * (time - lines.surface_time[:, np.newaxis, np.newaxis])
+    second = may_be_second_return(time, half, table.pop("clipped_ns"), waveforms.echo_fwhm_ns)
+    table["flags"] |= np.where(second, int(EchoFlag.SATURATED), 0)
+    error[second] = np.hypot(error, half)[second]
     table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error, "surface_time_ns_method_error": by_light}
     if settings.depth_from == "echo":
         delay, spread = time - zero[..., np.newaxis], np.hypot(error, zero_error[..., np.newaxis])
@@ -366,17 +372,15 @@ def _with_depths(
         first = zero[:, 0]
         layer_zero = np.where(np.isfinite(first), first, peak)
     else:
-        delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], np.hypot(error, np.hypot(trigger, clock))
+        delay, spread = 2 * half, np.hypot(error, np.hypot(trigger, clock))
         layer_zero = lines.surface_time
     table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
     from_mean = settings.depth_from == "mean"
-    level = table["amplitude"][:, 0, ECHOES.index("column")]
-    level = np.where(waveforms.unit == "W", level, np.nan)
+    level = np.where(waveforms.unit == "W", table["amplitude"][:, 0, ECHOES.index("column")], np.nan)
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
-    of_onset = (table["flags"] & int(EchoFlag.COLUMN_ONSET)) > 0
-    of_surface = of_onset | ((np.arange(time.shape[-1]) > 0) != from_mean)
+    of_surface = (table["flags"] & int(EchoFlag.COLUMN_ONSET) > 0) | ((np.arange(time.shape[-1]) > 0) != from_mean)
     method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
     table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)
     if "layer_time_ns" in table:
@@ -409,11 +413,8 @@ def _label(
         values = table["surface_time_ns" + suffix]
         described = {"units": "ns", "long_name": f"{of}arrival of the surface"}
         inner = ("estimator",) if several else ()
-        data["surface_time_ns" + suffix] = (
-            (*dims, *inner),
-            values.reshape(*shape, *values.shape[1:][: len(inner)]),
-            described,
-        )
+        values = values.reshape(*shape, *values.shape[1:][: len(inner)])
+        data["surface_time_ns" + suffix] = (*dims, *inner), values, described
     meanings = {
         "units": "1",
         "long_name": "problems of the echo",

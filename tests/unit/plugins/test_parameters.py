@@ -56,8 +56,6 @@ def _values(plugin, folder):
         path = folder / "phase.csv"
         path.write_text("\n".join(f"{angle} {1 / angle}" for angle in range(5, 180, 5)))
         part["filename"] = str(path)
-    if plugin == "sediment":
-        part["model"] = "hapke"  # the other model is an object of Mitsuba
     return object_values(mi.load_dict(part))
 
 

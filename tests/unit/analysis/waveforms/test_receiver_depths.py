@@ -11,6 +11,7 @@ from significance import largest_z
 from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -95,3 +96,19 @@ def test_blocks_and_series_have_the_errors_of_whole_records(name, density, share
         assert spread == pytest.approx(1, abs=largest_z(400) / np.sqrt(2 * 400) + 0.1)
     with pytest.raises(UserError, match="dark_level and block_level must have a finite number for each pixel"):
         echo_table.extract(blocks.assign(block_level=blocks["dark_level"]))
+
+
+@pytest.mark.parametrize(("until", "hidden"), [(20.0, False), (45.0, True)])
+def test_a_bottom_behind_a_clipped_one_may_be_its_second_return(until, hidden):
+    """A bottom 60 ns behind the surface is light returned twice where another one 30 ns behind it may be clipped."""
+    record = lake(60.0)
+    level = 1.1 * float(record["waveform"].where(record["time"] > SURFACE + 50).max())
+    behind = record["time"] - SURFACE
+    # The falling edge of the last clipped echo.
+    edge = level * np.exp(-0.5 * np.maximum(behind - until, 0) ** 2 / 2**2)
+    record["waveform"] = np.maximum(record["waveform"], edge.where(behind > -5, 0.0)).clip(max=level)
+    settings = {"saturation_level": level, "noise": 1e-3 * level, "depth_from": "mean"}
+    bottom = echo_table.extract(record, **settings).sel(echo="bottom").squeeze("pixel")
+    assert float(bottom["depth_m"]) == pytest.approx(60 * PER_NS, abs=0.1)
+    assert bool(bottom["flags"] & EchoFlag.SATURATED) == hidden
+    assert (float(bottom["depth_m_stderr"]) == pytest.approx(30 * PER_NS, rel=0.05)) == hidden
