@@ -119,8 +119,8 @@ def test_bubbles_brighten_the_water_that_they_fill_and_darken_the_bottom(lidar_s
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"plume_scattering": -1.0}, "plume_scattering = -1 must not be negative"),
-        ({"plume_width": 0.0}, "plume_width = 0 must be greater than 0"),
+        ({"plume_scattering": -1.0}, "plume_scattering = -1 must lie between"),
+        ({"plume_width": 0.0}, "plume_width = 0 must lie between"),
         ({"plume_depth": 200.0}, "plume_depth = 200 must lie between 0.01 and 100"),
         ({"plume_backscatter_ratio": 0.9}, "plume_backscatter_ratio = 0.9 must lie between"),
     ],
