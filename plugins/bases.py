@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.declaration import Plugin
+from mitransient_lidar.core.parameters.fields import Plugin
 from mitransient_lidar.core.parameters.lidar import ANGLES
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
@@ -39,7 +39,7 @@ class RecordedProperties(mi.Properties):
 
     def __init__(self, props: mi.Properties, plugin: Plugin) -> None:
         super().__init__(props)
-        #: Reader of checked values (`core.parameters.declaration.Read`).
+        #: Reader of checked values (`core.parameters.fields.Read`).
         self.read = plugin.reader(self.get)
         #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
         self.values: dict[str, Any] = {}

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEABED
-from mitransient_lidar.core.parameters.declaration import AUTO, Read
+from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate

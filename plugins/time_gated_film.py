@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.declaration import AUTO
+from mitransient_lidar.core.parameters.fields import AUTO
 from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain

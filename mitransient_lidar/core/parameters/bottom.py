@@ -2,197 +2,119 @@
 
 from __future__ import annotations
 
-from mitransient_lidar.core.parameters.declaration import AUTO, Plugin, file, nested, number, text
+from mitransient_lidar.core.parameters.fields import AUTO, file, nested, number, plugin, text
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 
-SEABED = Plugin(
+# A parameter a row, which the formatter would spread over five.
+# fmt: off
+
+SEABED = plugin(
     "seabed",
-    (
-        number(
-            *("depth", None, "m", 0, 1e5),
-            "Depth at x = y = 0, above 0; with a height map from 0, added to its depths",
-            otherwise="``8``, or ``0`` with a height map",
-        ),
-        number("slope_x_deg", 0.0, "degree", -45, 45, "Tilt: positive where the bottom rises towards +x"),
-        number("slope_y_deg", 0.0, "degree", -45, 45, "Tilt towards +y"),
-        number(
-            *("curvature", 0.0, "1/m", -1, 1),
-            "Curvature of a bowl about the centre, negative for a mound; it ends half of ``refined_size`` from the "
-            "centre",
-        ),
-        number(
-            *("ripple_height", 0.0, "m", 0, float("inf")),
-            "Height of sand ripples, trough to crest, at most 0.3 of their length; 0 for none",
-        ),
-        number("ripple_length", 0.2, "m", 0, float("inf"), "Distance of their crests", above=True),
-        number("ripple_bearing_deg", 0.0, "degree", -3600, 3600, "Direction across the crests, from +x to +y"),
-        file(
-            "filename",
-            "Height map above the mean sea level: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), a GeoTIFF (.tif), "
-            "a Bathymetric Attributed Grid (.bag), or points (.xyz, .csv, .txt)",
-        ),
-        number("map_size", None, "m", 0, 1e6, "Side along x of a height map that carries no positions", above=True),
-        text(
-            "map_values",
-            None,
-            "``heights``, positive up, or ``depths``, positive down",
-            ("heights", "depths"),
-            otherwise="what the file states, or ``heights``",
-        ),
-        text(
-            "map_unit",
-            None,
-            "Unit of the values where the file does not state it: ``m``, ``cm``, ``km``, ``ft``, ``ftUS`` (US survey "
-            "foot) or ``fathom``",
-            otherwise="``m``",
-        ),
-        number(
-            *("map_no_data", None, "", float("-inf"), float("inf")),
-            "Value of cells without a height where the file does not declare it",
-        ),
-        text(
-            "map_holes",
-            None,
-            "``refuse`` or ``fill`` cells without a value, with that of the nearest cell",
-            otherwise="``refuse``",
-        ),
-        number(
-            *("map_cell", None, "m", 0, float("inf")),
-            "Cell of the grid on which points are interpolated",
-            above=True,
-            otherwise="their own grid, or their mean spacing",
-        ),
-        number(
-            *("origin_x", None, "m", float("-inf"), float("inf")),
-            "Point of the map, in its coordinates in metres, that lies at x = y = 0",
-            otherwise="of an .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the centre; positions "
-            "in other files are those of the scene",
-        ),
-        number("origin_y", None, "m", float("-inf"), float("inf"), "Its y, given together"),
-        number("reflectance", 0.1, "1", 0, 1, "Lambertian reflectance"),
-        text(
-            "patches",
-            "",
-            'Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to 1; where they overlap '
-            "the last one counts",
-            otherwise="none",
-        ),
-        number(
-            *("centre_x", None, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE),
-            "Centre of the finely resolved square",
-            otherwise="``0``, or the map's centre; ``0`` if ``refined_size`` of a map in map coordinates is given",
-        ),
-        number("centre_y", None, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y", otherwise="as ``centre_x``"),
-        number(
-            *("refined_size", AUTO, "m", 0, float("inf")),
-            "Its side; ``auto``: 20 m, or the map's longer side, or more for the patches",
-            above=True,
-        ),
-        number(
-            *("cell_size", AUTO, "m", 0, 1e4),
-            "Side of its cells; ``auto``: an eighth of the ripples' length, an eighth of the smallest patch's radius, "
-            "the map's own or 0.25 m, the smallest of them",
-            above=True,
-        ),
-        number("size", 1000.0, "m", 1e-3, 1e6, "Side of the bottom: cells grow outside the square"),
-        nested("(nested)", "bsdf", "Any BSDF instead of the Lambertian one"),
-    ),
+    number("depth", None, "m", 0, 1e5, "Depth at x = y = 0, above 0; with a height map from 0, added to its depths",
+        otherwise="``8``, or ``0`` with a height map"),
+    number("slope_x_deg", 0.0, "degree", -45, 45, "Tilt: positive where the bottom rises towards +x"),
+    number("slope_y_deg", 0.0, "degree", -45, 45, "Tilt towards +y"),
+    number("curvature", 0.0, "1/m", -1, 1,
+        "Curvature of a bowl about the centre, negative for a mound; it ends half of ``refined_size`` from the centre"),
+    number("ripple_height", 0.0, "m", 0, float("inf"),
+        "Height of sand ripples, trough to crest, at most 0.3 of their length; 0 for none"),
+    number("ripple_length", 0.2, "m", 0, float("inf"), "Distance of their crests", above=True),
+    number("ripple_bearing_deg", 0.0, "degree", -3600, 3600, "Direction across the crests, from +x to +y"),
+    file("filename",
+        "Height map above the mean sea level: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), a GeoTIFF (.tif), a "
+        "Bathymetric Attributed Grid (.bag), or points (.xyz, .csv, .txt)"),
+    number("map_size", None, "m", 0, 1e6, "Side along x of a height map that carries no positions", above=True),
+    text("map_values", None, "``heights``, positive up, or ``depths``, positive down", ("heights", "depths"),
+        otherwise="what the file states, or ``heights``"),
+    text("map_unit", None,
+        "Unit of the values where the file does not state it: ``m``, ``cm``, ``km``, ``ft``, ``ftUS`` (US survey foot) "
+        "or ``fathom``", otherwise="``m``"),
+    number("map_no_data", None, "", float("-inf"), float("inf"),
+        "Value of cells without a height where the file does not declare it"),
+    text("map_holes", None, "``refuse`` or ``fill`` cells without a value, with that of the nearest cell",
+        otherwise="``refuse``"),
+    number("map_cell", None, "m", 0, float("inf"), "Cell of the grid on which points are interpolated", above=True,
+        otherwise="their own grid, or their mean spacing"),
+    number("origin_x", None, "m", float("-inf"), float("inf"),
+        "Point of the map, in its coordinates in metres, that lies at x = y = 0",
+        otherwise="of an .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the centre; positions in "
+        "other files are those of the scene"),
+    number("origin_y", None, "m", float("-inf"), float("inf"), "Its y, given together"),
+    number("reflectance", 0.1, "1", 0, 1, "Lambertian reflectance"),
+    text("patches", "",
+        'Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to 1; where they overlap the '
+        'last one counts', otherwise="none"),
+    number("centre_x", None, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Centre of the finely resolved square",
+        otherwise="``0``, or the map's centre; ``0`` if ``refined_size`` of a map in map coordinates is given"),
+    number("centre_y", None, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y", otherwise="as ``centre_x``"),
+    number("refined_size", AUTO, "m", 0, float("inf"),
+        "Its side; ``auto``: 20 m, or the map's longer side, or more for the patches", above=True),
+    number("cell_size", AUTO, "m", 0, 1e4,
+        "Side of its cells; ``auto``: an eighth of the ripples' length, an eighth of the smallest patch's radius, the "
+        "map's own or 0.25 m, the smallest of them", above=True),
+    number("size", 1000.0, "m", 1e-3, 1e6, "Side of the bottom: cells grow outside the square"),
+    nested("(nested)", "bsdf", "Any BSDF instead of the Lambertian one"),
 )
 
-SEDIMENT = Plugin(
+SEDIMENT = plugin(
     "sediment",
-    (
-        text("model", "lambertian", "Law of reflection", ("lambertian", "hapke")),
-        text(
-            "reflectance",
-            None,
-            "Share of the light that is reflected, at vertical incidence: 0 to 1, or ``coral_sand``, ``green_algae``, "
-            "``brown_algae`` or ``red_algae``",
-            unit="1",
-            otherwise="``0.1``",
-        ),
-        number("wavelength_nm", 532.0, "nm", 400, 700, "Wavelength of a reflectance by name"),
-        number(
-            *("single_scattering_albedo", None, "1", 0, 1),
-            "hapke: albedo of the particles, instead of ``reflectance``",
-        ),
-        number(
-            *("lobe_asymmetry", 0.0, "1", 0, 0.9),
-            "hapke: asymmetry *b* of the lobes of the particles' phase function; 0 of particles that scatter evenly",
-        ),
-        number(
-            *("backward_share", 0.5, "1", 0, 1),
-            "hapke: share *s* of the lobe towards the source; (1 + c)/2 with Hapke's c",
-        ),
-        number("opposition_amplitude", 1.0, "1", 0, 3, "hapke: opposition effect :math:`B_0`"),
-        number("opposition_width", 0.06, "rad", 1e-3, 1, "hapke: its half width *h*"),
-    ),
+    text("model", "lambertian", "Law of reflection", ("lambertian", "hapke")),
+    text("reflectance", None,
+        "Share of the light that is reflected, at vertical incidence: 0 to 1, or ``coral_sand``, ``green_algae``, "
+        "``brown_algae`` or ``red_algae``", unit="1", otherwise="``0.1``"),
+    number("wavelength_nm", 532.0, "nm", 400, 700, "Wavelength of a reflectance by name"),
+    number("single_scattering_albedo", None, "1", 0, 1, "hapke: albedo of the particles, instead of ``reflectance``"),
+    number("lobe_asymmetry", 0.0, "1", 0, 0.9,
+        "hapke: asymmetry *b* of the lobes of the particles' phase function; 0 of particles that scatter evenly"),
+    number("backward_share", 0.5, "1", 0, 1,
+        "hapke: share *s* of the lobe towards the source; (1 + c)/2 with Hapke's c"),
+    number("opposition_amplitude", 1.0, "1", 0, 3, "hapke: opposition effect :math:`B_0`"),
+    number("opposition_width", 0.06, "rad", 1e-3, 1, "hapke: its half width *h*"),
 )
 
-RETROREFLECTOR = Plugin(
+RETROREFLECTOR = plugin(
     "retroreflector",
-    (
-        number("reflectance", 0.5, "1", 0, 1, "Reflected share of the light"),
-        # 32-bit directions are accurate to a thousandth of the narrowest lobe.
-        number(
-            *("width_deg", 2.0, "degree", 0.01, 180),
-            "Full angle between the directions where the lobe has fallen to e^-1/2 of its peak",
-        ),
-        number("diffuse_share", 0.0, "1", 0, 1, "Lambertian share of the reflected light"),
-    ),
+    number("reflectance", 0.5, "1", 0, 1, "Reflected share of the light"),
+    # 32-bit directions are accurate to a thousandth of the narrowest lobe.
+    number("width_deg", 2.0, "degree", 0.01, 180,
+        "Full angle between the directions where the lobe has fallen to e^-1/2 of its peak"),
+    number("diffuse_share", 0.0, "1", 0, 1, "Lambertian share of the reflected light"),
 )
 
 _INFINITE = float("-inf"), float("inf")
 
-GRAM_CHARLIER_DIELECTRIC = Plugin(
+GRAM_CHARLIER_DIELECTRIC = plugin(
     "gram_charlier_dielectric",
-    (
-        number("variance_u", 0.01, "1", 1e-6, 1, "Slope variance along the texture coordinate u"),
-        number("variance_v", 0.01, "1", 1e-6, 1, "Slope variance across it"),
-        *(
-            number(name, 0.0, "1", *_INFINITE, f"{meaning} of the series; all are 0 for Gaussian slopes")
-            for name, meaning in zip(("c21", "c03", "c40", "c22", "c04"), 5 * ("Term",), strict=True)
-        ),
-        number("int_ior", 1.34, "1", 1, 3, "Refractive index inside"),
-        number("ext_ior", 1.0, "1", 1, 3, "Refractive index outside"),
+    number("variance_u", 0.01, "1", 1e-6, 1, "Slope variance along the texture coordinate u"),
+    number("variance_v", 0.01, "1", 1e-6, 1, "Slope variance across it"),
+    *(
+        number(name, 0.0, "1", *_INFINITE, f"{meaning} of the series; all are 0 for Gaussian slopes")
+        for name, meaning in zip(("c21", "c03", "c40", "c22", "c04"), 5 * ("Term",), strict=True)
     ),
+    number("int_ior", 1.34, "1", 1, 3, "Refractive index inside"),
+    number("ext_ior", 1.0, "1", 1, 3, "Refractive index outside"),
 )
 
 _OF_A_CLEAR_SKY = "that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)"
 
-SUN = Plugin(
+SUN = plugin(
     "sun",
-    (
-        number("zenith_deg", 40.0, "degree", 0, 89, "Angle of the sun's centre from the vertical"),
-        number(
-            *("azimuth_deg", 0.0, "degree", -3600, 3600),
-            "Its azimuth, from +x (the receiver's viewing direction) towards +y",
-        ),
-        number(
-            *("irradiance", None, "W m-2 nm-1", 0, 1e6),
-            "Irradiance at the sea on a plane normal to its rays",
-            otherwise=_OF_A_CLEAR_SKY,
-        ),
-        number("angular_radius_deg", 0.2666, "degree", 1e-3, 5, "Radius of its disc"),
-    ),
+    number("zenith_deg", 40.0, "degree", 0, 89, "Angle of the sun's centre from the vertical"),
+    number("azimuth_deg", 0.0, "degree", -3600, 3600,
+        "Its azimuth, from +x (the receiver's viewing direction) towards +y"),
+    number("irradiance", None, "W m-2 nm-1", 0, 1e6, "Irradiance at the sea on a plane normal to its rays",
+        otherwise=_OF_A_CLEAR_SKY),
+    number("angular_radius_deg", 0.2666, "degree", 1e-3, 5, "Radius of its disc"),
 )
 
-SKY = Plugin(
+SKY = plugin(
     "sky",
-    (
-        text(
-            "distribution",
-            "clear",
-            "``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon), ``overcast`` (Moon and "
-            "Spencer 1942: three times as bright at the zenith as at the horizon), or ``uniform``",
-            ("clear", "overcast", "uniform"),
-        ),
-        number(
-            *("irradiance", None, "W m-2 nm-1", 0, 1e6),
-            "Irradiance at the sea on a level plane",
-            otherwise=f"for ``clear`` {_OF_A_CLEAR_SKY}; required for the others",
-        ),
-        number("sun_zenith_deg", 40.0, "degree", 0, 89, "``clear``: angle of the sun from the vertical"),
-        number(*("sun_azimuth_deg", 0.0, "degree", -3600, 3600), "``clear``: azimuth of the sun, from +x towards +y"),
-    ),
+    text("distribution", "clear",
+        "``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon), ``overcast`` (Moon and "
+        "Spencer 1942: three times as bright at the zenith as at the horizon), or ``uniform``",
+        ("clear", "overcast", "uniform")),
+    number("irradiance", None, "W m-2 nm-1", 0, 1e6, "Irradiance at the sea on a level plane",
+        otherwise=f"for ``clear`` {_OF_A_CLEAR_SKY}; required for the others"),
+    number("sun_zenith_deg", 40.0, "degree", 0, 89, "``clear``: angle of the sun from the vertical"),
+    number("sun_azimuth_deg", 0.0, "degree", -3600, 3600, "``clear``: azimuth of the sun, from +x towards +y"),
 )

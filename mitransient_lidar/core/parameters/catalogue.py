@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from mitransient_lidar.core.parameters import bottom, integrators, lidar, sea, water
-from mitransient_lidar.core.parameters.declaration import Parameter, Plugin
+from mitransient_lidar.core.parameters.fields import Parameter, Plugin
 
 #: Declarations of the plugins by name.
 PLUGINS: dict[str, Plugin] = {

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from mitransient_lidar.core.parameters.declaration import (
-    AUTO,
-    Parameter,
-    Plugin,
-    count,
-    file,
-    nested,
-    number,
-    switch,
-    text,
-)
+from mitransient_lidar.core.parameters.fields import AUTO, Parameter, count, file, nested, number, plugin, switch, text
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE, divergences
+
+# A parameter a row, which the formatter would spread over five.
+# fmt: off
 
 #: Longest side of a sea or a bottom [m].
 LARGEST_SIDE = 1e6
@@ -27,102 +20,62 @@ def _length(name: str, meaning: str) -> Parameter:
     return number(name, AUTO, "m", 0, LARGEST_SIDE, meaning, above=True)
 
 
-OCEAN_SURFACE = Plugin(
+OCEAN_SURFACE = plugin(
     "ocean_surface",
-    (
-        text(
-            "spectrum",
-            "elfouhaily",
-            "Elfouhaily et al. 1997; ``jonswap`` needs ``fetch``, ``height_map`` a ``filename`` of the formats of "
-            "``seabed``; ``flat``: no waves, all slopes are ripples",
-            ("elfouhaily", "jonswap", "pierson_moskowitz", "height_map", "flat"),
-        ),
-        number("wind_speed", 3.0, "m s-1", 0, 30, "Wind speed at 10 m"),
-        _angle("wind_direction_deg", "Direction the wind blows towards"),
-        number("fetch", None, "m", 0, float("inf"), "Distance over which the wind has blown over water", above=True),
-        number(
-            *("inverse_wave_age", None, "1", 0.84, 5),
-            "Instead: inverse wave age, 0.84 when fully developed",
-            otherwise="``0.84``",
-        ),
-        number("peak_enhancement", 3.3, "1", 0, float("inf"), "JONSWAP's gamma", above=True),
-        number(
-            *("swell_height", 0.0, "m", 0, float("inf")),
-            "Significant height of an added swell, at most a fifteenth of its length; 0 for none",
-        ),
-        number("swell_wavelength", 60.0, "m", 0, float("inf"), "Its wavelength", above=True),
-        _angle("swell_direction_deg", "Direction it travels towards"),
-        text(
-            "slope_variance",
-            "cox_munk",
-            "Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea, 1954; waves below 1 m are "
-            "scaled to it), ``spectrum`` (the integral of the spectrum) or a number, the total of an isotropic sea",
-            unit="1",
-        ),
-        text(
-            "slope_distribution",
-            "gaussian",
-            "``gram_charlier``: skewed and peaked slopes, as measured by Cox and Munk from 1 to 14 m/s, with "
-            "``slope_variance`` ``cox_munk``",
-            ("gaussian", "gram_charlier"),
-        ),
-        switch(
-            "ripple_focusing",
-            True,
-            "Whether echoes from the water are enhanced by the mean focusing of ripples that light crosses twice",
-        ),
-        count(
-            *("surface_seed", 1, 0, 2**53),
-            "Seed of the waves: the same sea at any resolution and position of the patch",
-        ),
-        number("time", 0.0, "s", -1e9, 1e9, "Time at which the waves are taken"),
-        number(
-            *("water_depth", 1e4, "m", 0, 1e5),
-            "Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et al. 1985)",
-            above=True,
-            otherwise="deep",
-        ),
-        number("current_speed", 0.0, "m s-1", 0, 10, "Current that carries the waves"),
-        _angle("current_direction_deg", "Direction the current flows towards"),
-        number("wake_speed", 0.0, "m s-1", 0, 40, "Speed of a ship whose Kelvin wake is added, 0 for none"),
-        _angle("wake_bearing_deg", "Heading of the ship"),
-        number("wake_length", 20.0, "m", 1, 500, "Length of the ship"),
-        number("wake_x", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Centre of the ship"),
-        number("wake_y", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
-        number(
-            *("slope_x_deg", 0.0, "degree", -15, 15),
-            "Mean slope under the lidar: positive where the sea rises towards +x, as on a long wave",
-        ),
-        number("slope_y_deg", 0.0, "degree", -15, 15, "Mean slope towards +y"),
-        _length("refined_size", "Side of the finely resolved patch"),
-        _length("cell_size", "Side of its cells"),
-        _length(
-            "shortest_wave",
-            "Length of the shortest waves of the mesh, at least two cells; shorter waves are ripples",
-        ),
-        number(
-            *("centre_x", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE),
-            "Centre of the patch; ``auto``: where the lidar's axis meets the sea, or the centre of a height map",
-        ),
-        number("centre_y", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
-        number(
-            *("size", AUTO, "m", 1e-3, LARGEST_SIDE),
-            "Side of the surface; ``auto``: 1000 or more. Cells grow outside the patch",
-        ),
-        _length(
-            "period",
-            "Period of the sea; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m",
-        ),
-        _length("map_size", "Side of a height map that carries no positions"),
-        file("filename", "File of a ``height_map``"),
-        number(
-            *("altitude", None, "m", 0.1, 1e6),
-            "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene",
-        ),
-        number("off_nadir_deg", None, "degree", 0, 89.9, "The same"),
-        number("field_of_view_mrad", None, "mrad", 1e-3, 3000, "The same"),
-        *divergences(None),
-        nested("(nested)", "bsdf", "Any BSDF instead of the ripples"),
-        nested("interior", "medium", "The water: ``layered_water``"),
-    ),
+    text("spectrum", "elfouhaily",
+        "Elfouhaily et al. 1997; ``jonswap`` needs ``fetch``, ``height_map`` a ``filename`` of the formats of "
+        "``seabed``; ``flat``: no waves, all slopes are ripples",
+        ("elfouhaily", "jonswap", "pierson_moskowitz", "height_map", "flat")),
+    number("wind_speed", 3.0, "m s-1", 0, 30, "Wind speed at 10 m"),
+    _angle("wind_direction_deg", "Direction the wind blows towards"),
+    number("fetch", None, "m", 0, float("inf"), "Distance over which the wind has blown over water", above=True),
+    number("inverse_wave_age", None, "1", 0.84, 5, "Instead: inverse wave age, 0.84 when fully developed",
+        otherwise="``0.84``"),
+    number("peak_enhancement", 3.3, "1", 0, float("inf"), "JONSWAP's gamma", above=True),
+    number("swell_height", 0.0, "m", 0, float("inf"),
+        "Significant height of an added swell, at most a fifteenth of its length; 0 for none"),
+    number("swell_wavelength", 60.0, "m", 0, float("inf"), "Its wavelength", above=True),
+    _angle("swell_direction_deg", "Direction it travels towards"),
+    text("slope_variance", "cox_munk",
+        "Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea, 1954; waves below 1 m are "
+        "scaled to it), ``spectrum`` (the integral of the spectrum) or a number, the total of an isotropic sea",
+        unit="1"),
+    text("slope_distribution", "gaussian",
+        "``gram_charlier``: skewed and peaked slopes, as measured by Cox and Munk from 1 to 14 m/s, with "
+        "``slope_variance`` ``cox_munk``", ("gaussian", "gram_charlier")),
+    switch("ripple_focusing", True,
+        "Whether echoes from the water are enhanced by the mean focusing of ripples that light crosses twice"),
+    count("surface_seed", 1, 0, 2**53, "Seed of the waves: the same sea at any resolution and position of the patch"),
+    number("time", 0.0, "s", -1e9, 1e9, "Time at which the waves are taken"),
+    number("water_depth", 1e4, "m", 0, 1e5,
+        "Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et al. 1985)", above=True,
+        otherwise="deep"),
+    number("current_speed", 0.0, "m s-1", 0, 10, "Current that carries the waves"),
+    _angle("current_direction_deg", "Direction the current flows towards"),
+    number("wake_speed", 0.0, "m s-1", 0, 40, "Speed of a ship whose Kelvin wake is added, 0 for none"),
+    _angle("wake_bearing_deg", "Heading of the ship"),
+    number("wake_length", 20.0, "m", 1, 500, "Length of the ship"),
+    number("wake_x", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Centre of the ship"),
+    number("wake_y", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
+    number("slope_x_deg", 0.0, "degree", -15, 15,
+        "Mean slope under the lidar: positive where the sea rises towards +x, as on a long wave"),
+    number("slope_y_deg", 0.0, "degree", -15, 15, "Mean slope towards +y"),
+    _length("refined_size", "Side of the finely resolved patch"),
+    _length("cell_size", "Side of its cells"),
+    _length("shortest_wave", "Length of the shortest waves of the mesh, at least two cells; shorter waves are ripples"),
+    number("centre_x", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE,
+        "Centre of the patch; ``auto``: where the lidar's axis meets the sea, or the centre of a height map"),
+    number("centre_y", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
+    number("size", AUTO, "m", 1e-3, LARGEST_SIDE,
+        "Side of the surface; ``auto``: 1000 or more. Cells grow outside the patch"),
+    _length("period", "Period of the sea; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m"),
+    _length("map_size", "Side of a height map that carries no positions"),
+    file("filename", "File of a ``height_map``"),
+    number("altitude", None, "m", 0.1, 1e6,
+        "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene"),
+    number("off_nadir_deg", None, "degree", 0, 89.9, "The same"),
+    number("field_of_view_mrad", None, "mrad", 1e-3, 3000, "The same"),
+    *divergences(None),
+    nested("(nested)", "bsdf", "Any BSDF instead of the ripples"),
+    nested("interior", "medium", "The water: ``layered_water``"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.declaration import Read
+from mitransient_lidar.core.parameters.fields import Read
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian beam.
 WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": math.sqrt(2 * math.log(2)), "divergence_1e2_mrad": 2.0}

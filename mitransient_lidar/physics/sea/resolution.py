@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from mitransient_lidar.core.parameters.declaration import AUTO, Read
+from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.physics.lidar.divergence import read_divergence
 
 #: Shortest wave, and sides of a cell and of the patch without a lidar [m].

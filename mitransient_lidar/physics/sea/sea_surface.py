@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.declaration import AUTO, Read
+from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map

@@ -426,7 +426,7 @@ def drop(name):
         ),
         (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
-        (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0 and 0.999"),
+        (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
         (lambda: retrieve.bottom(drop("scene.optical_efficiency"), LEVEL), "efficiency must be given"),
         (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
         (lambda: retrieve.water(result(), efficiency=3), "efficiency = 3 must lie between"),

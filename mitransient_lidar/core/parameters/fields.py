@@ -152,6 +152,11 @@ class Plugin:
         return "\n".join(lines)
 
 
+def plugin(name: str, *parameters: Parameter) -> Plugin:
+    """Return the declaration of a plugin."""
+    return Plugin(name, parameters)
+
+
 @dataclass(frozen=True)
 class Read:
     """Reader of a plugin's values: each is checked as it is declared."""
