@@ -80,12 +80,13 @@ def register(
 ) -> None:
     """Register a plugin of a kind of Mitsuba, made by its class or a function of the class that describes it.
 
-    The manual, the docstring of the class, gets the table of its parameters.
+    The manual, the docstring of the class, gets the table of its parameters, and its objects a description.
 
     Its objects have ``parameters``: the plugin's name as ``type``, the value of each parameter that they have read, and
     nested objects.
     """
-    manual = make if described is None else described
+    manual: Any = make if described is None else described
+    manual.to_string = _described
     if manual.__doc__:
         manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
 
@@ -129,6 +130,23 @@ def exposed(part: mi.Object) -> tuple[dict[str, Any], list[tuple[str, mi.Object]
 
     part.traverse(Callback())
     return values, objects
+
+
+def _described(self: Any) -> str:
+    """Return the class of a plugin's object and its parameters."""
+    values = {**self.parameters, **getattr(self, "used_values", {})}
+    given = ", ".join(f"{name}={value}" for name, value in values.items() if isinstance(value, (bool, int, float, str)))
+    return f"{type(self).__name__}[{given}]"
+
+
+def closed(plugin: Any) -> Any:
+    """Return a class of plugins whose objects ``mi.traverse`` cannot change: changed ones are loaded again."""
+
+    def traverse(self: Any, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters."""
+
+    plugin.traverse = traverse
+    return plugin
 
 
 class PassIntegrator(mi.CppADIntegrator):
@@ -202,6 +220,7 @@ class PassIntegrator(mi.CppADIntegrator):
     render_backward = render_forward
 
 
+@closed
 class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
@@ -221,9 +240,6 @@ class ReceiverSensor(mi.Sensor):
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the sensor does not extend the scene."""
         return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed receiver is loaded again."""
 
 
 def read_pose(props: RecordedProperties) -> KernelPose:
@@ -265,6 +281,7 @@ def refuse_medium(props: mi.Properties) -> None:
         )
 
 
+@closed
 class EmitterWithoutExtent(mi.Emitter):
     """Emitter that does not extend the scene and exposes no parameters."""
 
@@ -275,9 +292,6 @@ class EmitterWithoutExtent(mi.Emitter):
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the emitter does not extend the scene."""
         return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed emitter is loaded again."""
 
     def distant_sample(self, it: mi.Interaction3f, direction: mi.Vector3f) -> mi.DirectionSample3f:
         """Return the sample of a direction to infinity, without its density."""

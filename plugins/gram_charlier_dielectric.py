@@ -9,13 +9,14 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
 _TERMS = ("c21", "c03", "c40", "c22", "c04")
 
 
+@closed
 class GramCharlierDielectric(mi.BSDF):
     r"""Rough dielectric whose slopes have a Gram-Charlier series (``gram_charlier_dielectric``).
 
@@ -134,13 +135,6 @@ class GramCharlierDielectric(mi.BSDF):
         gaussian = dr.maximum(density - safe * tail, 0) / safe
         more = density * (skewness * safe / 6 + kurtosis * (safe * safe - 1) / 24) / safe
         return (1 + gaussian) / (1 + dr.maximum(gaussian + more, 0))
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed surface is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"GramCharlierDielectric[variances={self.variances}, {self.series}]"
 
 
 register("bsdf", GRAM_CHARLIER_DIELECTRIC, GramCharlierDielectric)

@@ -16,7 +16,7 @@ from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.water_types import WATER_KINDS, water_of
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -32,6 +32,7 @@ _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
 
 
+@closed
 class LayeredWater(mi.Medium):
     r"""Water in horizontal layers (``layered_water``).
 
@@ -107,15 +108,6 @@ class LayeredWater(mi.Medium):
     def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Return an infinite interval: shapes bound the water."""
         return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: changed water is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        water = self.water
-        indices = f"refractive_index={water.refractive_index:g}, group_index={water.group_index:g}"
-        return f"LayeredWater[{water.column}, {indices}]"
 
 
 def _read_water(

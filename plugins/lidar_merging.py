@@ -127,9 +127,5 @@ class LidarMerging(PassIntegrator):
         layout = layout_of.layout if isinstance(layout_of, MergingRenderer) else None
         return MergingRenderer(lidar, classes, self.options, layout, connections)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"LidarMerging[{self.options}]"
-
 
 register("integrator", LIDAR_MERGING, LidarMerging)

@@ -127,13 +127,6 @@ class LidarTransmitter(EmitterWithoutExtent):
         """Return 0: the laser has no surface."""
         return mi.Spectrum(0)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return (
-            f"LidarTransmitter[origin={self.pose.origin.tolist()}, energy={self.energy:g} J, "
-            f"{self.beam_profile} {1e3 * self.divergence:g} mrad]"
-        )
-
 
 def _profile(props: RecordedProperties, kind: str) -> BeamProfile:
     """Return the beam profile of the plugin's parameters."""

@@ -22,10 +22,6 @@ class VolpathIntegrator(PassIntegrator):
         names = ("max_scatterings", "roulette_threshold", "guiding_probability")
         self.options = VolpathOptions(*map(props.read, names), complement_only=complement_only)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}]"
-
 
 class LidarVolpath(VolpathIntegrator):
     r"""Transient volumetric path tracer with surface connection (``lidar_volpath``).

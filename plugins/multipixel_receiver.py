@@ -51,13 +51,6 @@ class MultipixelReceiver(ReceiverSensor):
         nested = [child for _, child in props.objects() if isinstance(child, mi.Sensor)]
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return (
-            f"MultipixelReceiver[origin={self.receiver.pose.origin.tolist()}, layout={self.receiver.pixels.layout}, "
-            f"pixels={self.receiver.pixels.count}, field_of_view={1e3 * self.receiver.pixels.field_of_view:g} mrad]"
-        )
-
 
 #: Parameters of pixels that are not nested.
 _LENS = ("focal_length_mm", "pixel_pitch_um")

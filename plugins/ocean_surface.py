@@ -219,16 +219,6 @@ class OceanSurface(mi.Mesh):
         along, across = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
         return along, across
 
-    def to_string(self) -> str:
-        """Return a description."""
-        sea = self.sea
-        return (
-            f"OceanSurface[{sea.spectrum}, wind_speed={sea.wind_speed:g} m/s, patch of {sea.refined_size:g} m in cells "
-            f"of {sea.cell_size:g} m, shortest_wave={sea.shortest_wave:g} m, size={sea.size:g} m, "
-            f"faces={self.face_count()}, "
-            f"resolved_variance={sea.resolved_variance}, ripple_variance={sea.ripple_variance}]"
-        )
-
 
 class SeaPatches:
     """Fine patches of an ``ocean_surface`` about several places, side by side in one mesh.

@@ -47,10 +47,6 @@ class PixelFov(ReceiverSensor):
         finally:
             mi.set_log_level(level)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"PixelFov[{self.field}]"
-
 
 def _field(props: RecordedProperties) -> FovShape:
     """Build the shape from the plugin's parameters."""

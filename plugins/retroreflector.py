@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import RETROREFLECTOR
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
 
+@closed
 class Retroreflector(mi.BSDF):
     r"""Retro-reflecting surface (``retroreflector``).
 
@@ -111,16 +112,6 @@ class Retroreflector(mi.BSDF):
         glossy = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
         diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
         return (1 - self.diffuse_share) * glossy, self.diffuse_share * diffuse
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed surface is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return (
-            f"Retroreflector[reflectance={self.reflectance:g}, width_deg={math.degrees(self.width):g}, "
-            f"diffuse_share={self.diffuse_share:g}]"
-        )
 
 
 register("bsdf", RETROREFLECTOR, Retroreflector)

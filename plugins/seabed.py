@@ -271,14 +271,5 @@ class Seabed(mi.Mesh):
         terrain = self.bottom.terrain
         return np.zeros(np.shape(x), dtype=bool) if terrain is None else ~terrain.covers(x, y)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        bottom = self.bottom
-        return (
-            f"Seabed[depth={bottom.depth:g} m, slope=({bottom.slope[0]:.3g}, {bottom.slope[1]:.3g}), "
-            f"patch of {bottom.refined_size:g} m in cells of {bottom.cell_size:g} m, size={bottom.size:g} m, "
-            f"faces={self.face_count()}, patches={len(bottom.patches)}]"
-        )
-
 
 register("shape", SEABED, Seabed)

@@ -8,7 +8,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEDIMENT
 from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
@@ -16,6 +16,7 @@ from mitransient_lidar.transport.opaque import opaque
 _PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
 
 
+@closed
 class Sediment(mi.BSDF):
     r"""Bottom by reflectance or name (``sediment``).
 
@@ -134,13 +135,6 @@ class Sediment(mi.BSDF):
         x, r0 = dr.maximum(cosine, 1e-6), self._r0
         return dr.rcp(1 - self._albedo * x * (r0 + (0.5 - r0 * x) * dr.log(1 + dr.rcp(x))))
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed bottom is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"Sediment[{self.surface}]"
-
 
 class LambertianSediment(mi.BSDF):
     """The Lambertian model of `Sediment`: Mitsuba's ``diffuse``, with parameters that a result can record."""
@@ -194,10 +188,6 @@ class LambertianSediment(mi.BSDF):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose ``reflectance``, as ``diffuse`` does."""
         self._diffuse.traverse(callback)
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"LambertianSediment[{self._diffuse}]"
 
 
 def _reflectance(props: RecordedProperties) -> float:

@@ -77,9 +77,5 @@ class Sky(EmitterWithoutExtent):
         """Return the radiance on a ray that leaves the scene [W m^-2 sr^-1 nm^-1]."""
         return mi.Spectrum(self.radiance(-si.wi)) & active
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"Sky[{self.distribution}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
-
 
 register("emitter", SKY, Sky)

@@ -81,9 +81,5 @@ class Sun(EmitterWithoutExtent):
         """Return 0: only `sample_direction` finds the disc."""
         return mi.Spectrum(0)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"Sun[zenith_deg={self.zenith_deg:g}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
-
 
 register("emitter", SUN, Sun)

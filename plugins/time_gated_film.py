@@ -11,13 +11,14 @@ from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.histogram import TransientHistogram
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
 
 
+@closed
 class TimeGatedFilm(mi.Film):
     r"""Time histogram of received energy of each pixel, and gates (``time_gated_film``).
 
@@ -138,15 +139,6 @@ class TimeGatedFilm(mi.Film):
 
     def schedule_storage(self) -> None:
         """Do nothing: passes are stored evaluated."""
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed film is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        known = {"time_start_ns": self.time_start_ns, "bin_count": self.bin_count, **self.used_values}
-        start, count = (AUTO if value is None else f"{value:.10g}" for value in known.values())
-        return f"TimeGatedFilm[time_start_ns={start}, bin_width_ns={self.bin_width_ns:g}, bin_count={count}]"
 
 
 def _gate_plan(props: RecordedProperties) -> GatePlan | None:

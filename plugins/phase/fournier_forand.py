@@ -44,12 +44,5 @@ class FournierForand(TabulatedPhaseFunction):
         super().__init__(props, PowerLawTable.fournier_forand(self.refractive_index, self.junge_slope))
         self.backscatter_ratio = fournier_forand_backscatter_ratio(self.refractive_index, self.junge_slope)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return (
-            f"FournierForand[backscatter_ratio={self.backscatter_ratio:g}, refractive_index={self.refractive_index:g}, "
-            f"junge_slope={self.junge_slope:g}]"
-        )
-
 
 register("phase", FOURNIER_FORAND, FournierForand)

@@ -46,9 +46,5 @@ class MeasuredPhase(TabulatedPhaseFunction):
             )
         super().__init__(props, table)
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"MeasuredPhase[{self.filename}]"
-
 
 register("phase", MEASURED_PHASE, MeasuredPhase)

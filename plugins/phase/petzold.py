@@ -39,9 +39,5 @@ class Petzold(TabulatedPhaseFunction):
         measured = petzold_average_particle() if self.water == _AVERAGE else petzold_water(self.water)
         super().__init__(props, PowerLawTable.from_function(measured))
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"Petzold[water={self.water}]"
-
 
 register("phase", PETZOLD, Petzold)

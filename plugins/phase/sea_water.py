@@ -33,9 +33,5 @@ class SeaWater(TabulatedPhaseFunction):
         phase = partial(water_phase_function, depolarisation=self.depolarisation)
         super().__init__(props, PowerLawTable.from_function(phase))
 
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"SeaWater[depolarisation={self.depolarisation:g}]"
-
 
 register("phase", SEA_WATER, SeaWater)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.plugins.bases import closed
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase
 
 
+@closed
 class TabulatedPhaseFunction(mi.PhaseFunction):
     """Phase function that is evaluated and sampled from a `PowerLawTable`, exact in the forward peak."""
 
@@ -33,6 +35,3 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
     ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
         """Sample a direction distributed as the phase function."""
         return NumberedPhase(self.tabulated, mi.UInt32(0)).sample(ctx, mei, sample1, sample2, active)
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed phase function is loaded again."""

@@ -7,10 +7,11 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.water import TWO_TERM_HENYEY_GREENSTEIN
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 
 
+@closed
 class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     r"""Two-term Henyey-Greenstein phase function (``two_term_henyey_greenstein``).
 
@@ -64,16 +65,6 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     def _value(self, cosine: mi.Float) -> mi.Float:
         forward, backward = (henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
         return self.weight * forward + (1 - self.weight) * backward
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed phase function is loaded again."""
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return (
-            f"TwoTermHenyeyGreenstein[weight={self.weight:g}, g_forward={self.g_forward:g}, "
-            f"g_backward={self.g_backward:g}]"
-        )
 
 
 register("phase", TWO_TERM_HENYEY_GREENSTEIN, TwoTermHenyeyGreenstein)
