@@ -158,7 +158,7 @@ def test_reads_from_xml():
     <string name="cell_size" value="auto"/><string name="patches" value="0 0 1 0.4"/></shape></scene>"""
     (shape,) = mi.load_string(text).shapes()
     assert shape.bottom.depth == 5
-    assert "depth=5 m" in str(shape)
+    assert "depth=5.0" in str(shape)
 
 
 @pytest.mark.parametrize(
