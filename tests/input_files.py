@@ -118,7 +118,7 @@ def scene(folder: Path) -> Path:
 
 def load(path: Path) -> None:
     """Load a scene, and plan the record of its lidar."""
-    from mitransient_lidar.rendering.session import open_scene
+    from mitransient_lidar.loading.scenes import open_scene
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(path, None)

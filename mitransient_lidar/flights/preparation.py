@@ -17,8 +17,8 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray
 from mitransient_lidar.flights.plan import SAME_PLACE_M, FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses, poses_of
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
 
 if TYPE_CHECKING:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
 from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
@@ -21,40 +24,82 @@ from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
-from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, SceneRecord
+from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, SceneRecord, plugin_values
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+    from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class LoadedScene:
     """A loaded scene, its name, the parameters of an XML scene with their values as text, and what loads it again.
 
-    The record is None for a scene from loaded objects.
+    The record is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
     """
 
     scene: mi.Scene
     name: str
     parameters: dict[str, str]
-    record: SceneRecord | None
+    record: SceneRecord | None = None
+    sensor_id: str = ""
 
+    @cached_property
+    def sensor(self) -> mi.Sensor:
+        """The receiver; raise UserError if the scene has none, or none of that id."""
+        from mitransient_lidar.transport.scene_parts import lidar_sensor
 
-def load_scene(
-    scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None
-) -> tuple[mi.Scene, str, dict[str, str]]:
-    """Return scene, name and parameters of `load`, which also gives parameters and errors."""
-    loaded = load(scene, params, instrument)
-    return loaded.scene, loaded.name, loaded.parameters
+        return lidar_sensor(self.scene, self.sensor_id or (self.record.sensor if self.record else ""))
+
+    def attributes(
+        self,
+        integrator: LidarIntegrator | DaylightIntegrator | None = None,
+        used: Mapping[str, float] | None = None,
+        **others: Any,
+    ) -> dict[str, Any]:
+        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
+
+        ``record_end`` is what the last light of a record of automatic length comes from.
+
+        `used` are the values that were chosen for automatic parameters of the integrator.
+        """
+        from mitransient_lidar.transport.plugin_types import GatedFilm
+
+        recorded = {} if self.record is None else self.record.attributes()
+        own = {} if integrator is None else {"integrator": integrator.plugin}
+        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, used)
+        film = self.sensor.film()
+        own |= {"record_end": film.end} if isinstance(film, GatedFilm) and film.end else {}
+        return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
+
+    def share_record(self, axis: TimeAxis) -> None:
+        """Use the time bins of other renders instead of automatic ones."""
+        self.sensor.film().share(axis)
+
+    def tell_record(self, axis: TimeAxis | None = None) -> None:
+        """Log time bins, by default those of the film, where its start or length are automatic."""
+        film = self.sensor.film()
+        if film.used_values:
+            axis, end = axis or film.axis, f"; it ends {film.end}" if film.end else ""
+            text = f"record: {axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
+            logger.info("%s%s", text, end)
 
 
 @alone_with_scene
-def load(
+def open_scene(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
+    *,
+    variant: str | None = None,
     model: mi.Scene | None = None,
+    sensor: str | None = None,
 ) -> LoadedScene:
     """Load a scene.
 
@@ -62,28 +107,35 @@ def load(
     ----------
     scene
         Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
-        scene.
+        scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
     params
         Values for the ``<default>`` parameters of an XML scene, and of the instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
+    variant
+        Mitsuba variant, as for `variants.set_variant`.
     model
         Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
+    sensor
+        Id of a receiver, by default that of a record, or the first one.
 
     Raises
     ------
     UserError
-        If there is no such scene or instrument, a parameter is unknown, not used or empty, a value is invalid, a part
-        is missing, or a file of a record is missing or has changed.
+        If there is no such scene, instrument or receiver, a parameter is unknown, not used or empty, a value is
+        invalid, a part is missing, or a file of a record is missing or has changed.
     """
+    if isinstance(scene, LoadedScene) and not params and not sensor:
+        return scene
+    variants.set_variant(variant)
     import mitsuba as mi
 
-    from mitransient_lidar.transport.scene_parts import fit_seas
+    from mitransient_lidar.transport.scene_parts import fit_seas, lidar_sensor
 
     check_params(params)
     if isinstance(scene, mi.Scene):
         _no_parameters(params, instrument, "a loaded scene")
-        loaded = LoadedScene(scene, scene.id() or "scene", {}, None)
+        loaded = LoadedScene(scene, scene.id() or "scene", {})
     elif isinstance(scene, Mapping) or (isinstance(scene, SceneRecord) and not scene.is_xml):
         _no_parameters(params, instrument, "a dict")
         loaded = _load_dict(scene)
@@ -92,7 +144,59 @@ def load(
     else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     fit_seas(loaded.scene, model)
+    if sensor:
+        record = loaded.record and replace(loaded.record, sensor=sensor)
+        loaded = replace(loaded, record=record, sensor_id=lidar_sensor(loaded.scene, sensor).id())
     return loaded
+
+
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[False] = False) -> LidarIntegrator: ...
+
+
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[True]) -> DaylightIntegrator: ...
+
+
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator | DaylightIntegrator:
+    """Return an integrator from its name, a dict or itself, by default that of the scene.
+
+    For `passive` the default is ``passive_volpath`` if that of the scene is not one for daylight.
+
+    Raises
+    ------
+    UserError
+        If it is not a lidar integrator, or for `passive`, not one for daylight.
+    """
+    import mitsuba as mi
+
+    from mitransient_lidar.transport.passes import LidarIntegrator
+
+    own = scene.integrator()
+    if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):
+        wanted = "passive_volpath"
+    if wanted is None:
+        chosen = own
+    elif isinstance(wanted, mi.Integrator):
+        chosen = wanted
+    else:
+        if not isinstance(wanted, (str, Mapping)):
+            raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
+        given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
+        check_dict(given)
+        # The files of objects in it, which no integrator of ours has, are checked as well.
+        SceneRecord.of_dict(given)
+        with as_user_error():
+            chosen = mi.load_dict(given, parallel=False)
+    if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
+        raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
+    if not isinstance(chosen, LidarIntegrator):
+        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
+    if passive and not chosen.passive:
+        raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")
+    if chosen.passive and not passive:
+        raise UserError(f"integrator: {chosen.plugin} has no laser; use a lidar integrator, or render_passive")
+    return chosen
 
 
 def read_record(
@@ -105,7 +209,7 @@ def read_record(
 
     Its parameters have the values of the scene and the instrument. Where the scene has an origin in map coordinates
     [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments, and
-    errors, are those of `load`, but for what only loading finds.
+    errors, are those of `open_scene`, but for what only loading finds.
     """
     check_params(params)
     document = _document(scene, instrument)

@@ -14,11 +14,11 @@ from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import Session, open_scene
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import LidarIntegrator, PassRenderer
@@ -79,7 +79,7 @@ class Differences:
     Parameters
     ----------
     session
-        Session of an XML scene.
+        LoadedScene of an XML scene.
     integrator
         Lidar integrator.
     names
@@ -105,7 +105,7 @@ class Differences:
 
     def __init__(
         self,
-        session: Session,
+        session: LoadedScene,
         integrator: LidarIntegrator,
         names: Sequence[str],
         *,
@@ -201,7 +201,7 @@ class Differences:
 
 @alone
 def differences(
-    session: Session,
+    session: LoadedScene,
     integrator: LidarIntegrator,
     names: Sequence[str],
     *,

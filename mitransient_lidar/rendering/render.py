@@ -9,19 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import (
-    TOLERATED_LOSS,
-    Session,
-    check_components,
-    choose_integrator,
-    open_scene,
-    pass_attributes,
-    warn_of_edge_loss,
-)
+from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -41,7 +33,7 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 
 @alone
 def render(
-    scene: str | Path | Mapping[str, Any] | mi.Scene | Session | SceneRecord | xarray.Dataset,
+    scene: str | Path | Mapping[str, Any] | mi.Scene | LoadedScene | SceneRecord | xarray.Dataset,
     *,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
@@ -159,7 +151,7 @@ def render(
         given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
         return render_again(result, **given, progress=progress, **options, **others)
     chosen = RenderOptions(**options, **others)
-    session = open_scene(scene, params, chosen.variant, instrument, sensor=sensor)
+    session = open_scene(scene, params, instrument, variant=chosen.variant, sensor=sensor)
     return _render(session, integrator, chosen, reweight or [], progress)
 
 
@@ -200,7 +192,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
 
 
 def _render(
-    session: Session,
+    session: LoadedScene,
     integrator: str | Mapping[str, Any] | mi.Integrator | None,
     options: RenderOptions,
     reweight: Sequence[Mapping[str, float]],
@@ -209,8 +201,10 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
+    from mitransient_lidar.transport.path_classes import check_solids
+
     if components:
-        check_components(session.scene)
+        check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     if components:
@@ -279,7 +273,7 @@ def _render(
     attributes = session.attributes(
         integrator=chosen,
         used=renderer.used_values,
-        **pass_attributes(log, seed),
+        **log.attributes(seed),
         pass_share=share,
         max_memory_gb=max_memory,
         components=int(components),

@@ -12,7 +12,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
-from mitransient_lidar.rendering.session import Session, check_components, choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -56,6 +56,7 @@ class ShotScene:
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shot_batches import check_size
+        from mitransient_lidar.transport.path_classes import check_solids
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         variants.leave_the_gpu("shots are rendered")
@@ -64,7 +65,7 @@ class ShotScene:
         self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
         self.session = self._open(self._at(*self._place))
         if components:
-            check_components(self.session.scene)
+            check_solids(sum(not shape.is_medium_transition() for shape in self.session.scene.shapes()))
         self._integrator = choose_integrator(self.session.scene, None)
         shifts = [(float(x), float(y)) for x, y in places - places[0]]
         own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
@@ -84,11 +85,11 @@ class ShotScene:
             check_scene(self.lidar, self._renderer.sampler, probe)
         self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
 
-    def _open(self, params: Mapping[str, Any]) -> Session:
+    def _open(self, params: Mapping[str, Any]) -> LoadedScene:
         """Load the scene with parameters."""
         return open_scene(self._scene, params, instrument=self._instrument)
 
-    def _prepare(self, session: Session) -> PassRenderer:
+    def _prepare(self, session: LoadedScene) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
         session.share_record(self._axis)
         renderer = self._integrator.prepare(session.scene, session.sensor)

@@ -24,11 +24,10 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import read_record
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene, read_record
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
 from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.session import Session, open_scene, warn_of_edge_loss
 from mitransient_lidar.rendering.shot_scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
@@ -318,7 +317,7 @@ def _warn_of_the_end(
         _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
 
 
-def _target_offset(session: Session) -> tuple[float, float]:
+def _target_offset(session: LoadedScene) -> tuple[float, float]:
     """Return the distance [m] from the aim to the target."""
     for name in ("target_x", "target_y", "aim_x", "aim_y"):
         if name not in session.parameters:

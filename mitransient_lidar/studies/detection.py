@@ -18,11 +18,11 @@ from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def detect(
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
         fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
-        seas: Session | None = None
+        seas: LoadedScene | None = None
         for i in range(renders):
             if clutter:
                 number = int(float(session.parameters["surface_seed"])) + 1 + i

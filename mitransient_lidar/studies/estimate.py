@@ -14,6 +14,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
@@ -24,7 +25,6 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_structures,
 )
 from mitransient_lidar.rendering.accumulators import WaveformAccumulator
-from mitransient_lidar.rendering.session import open_scene
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
-from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import render_shots
 
 if TYPE_CHECKING:

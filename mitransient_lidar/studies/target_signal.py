@@ -14,12 +14,12 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -105,7 +105,7 @@ def target_signal(
     log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)
     result = _measure(np.array(pairs), axis, kernel, pulse.fwhm_ns)
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
-    attributes = session.attributes(target=target_id, integrator=chosen, **pass_attributes(log, seed), **result.attrs)
+    attributes = session.attributes(target=target_id, integrator=chosen, **log.attributes(seed), **result.attrs)
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 

@@ -10,9 +10,9 @@ import pytest
 from scipy.stats import t
 from significance import assert_same, largest_z
 
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.render import render
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.rendering.shot_batches import ShotBatches
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_series import render_shots

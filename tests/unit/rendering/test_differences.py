@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.differences import Differences, default_step, differences
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
 
 
 @pytest.fixture(scope="module")
 def level():
-    """Session of a level sea, and an integrator of few paths."""
+    """LoadedScene of a level sea, and an integrator of few paths."""
     session = open_scene("fig15_2x2", {"spectrum": "flat", "surface_size": 1000})
     return session, choose_integrator(session.scene, FEW)
 
