@@ -138,19 +138,18 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
     depths = np.argsort(bottom)
     chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
     shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
-    film = session.sensor.film()
-    if not film.is_fixed:
+    fixed: TimeAxis | None = session.sensor.film().axis
+    if fixed is None:
         own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
         return TimeAxis.covering(first, last, own.bin_width_ns), beyond
     way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
     arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
-    if arrival > film.axis.end_ns:
+    if arrival > fixed.end_ns:
         raise UserError(
             f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "
-            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
+            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {fixed.end_ns:.0f} ns"
         )
-    fixed: TimeAxis = film.axis
     return fixed, beyond
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
     from mitransient_lidar.transport.passes import LidarIntegrator
+    from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
 
@@ -59,36 +60,32 @@ class LoadedScene:
 
     def attributes(
         self,
+        lidar: LidarScene | None = None,
         integrator: LidarIntegrator | DaylightIntegrator | None = None,
         used: Mapping[str, float] | None = None,
         **others: Any,
     ) -> dict[str, Any]:
         """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
 
-        ``record_end`` is what the last light of a record of automatic length comes from.
-
-        `used` are the values that were chosen for automatic parameters of the integrator.
+        ``record_end`` is what the last light of a record of automatic length comes from. `used` are the values that
+        were chosen for automatic parameters of the integrator.
         """
-        from mitransient_lidar.transport.plugin_types import GatedFilm
-
         recorded = {} if self.record is None else self.record.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
-        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, used)
-        film = self.sensor.film()
-        own |= {"record_end": film.end} if isinstance(film, GatedFilm) and film.end else {}
+        chosen: list[Any] = [(integrator or self.scene.integrator(), used or {})]
+        if lidar is not None:
+            film = self.sensor.film()
+            bins = {"time_start_ns": lidar.axis.start_ns, "bin_count": lidar.axis.bin_count}
+            chosen.append((film, {name: value for name, value in bins.items() if getattr(film, name) is None}))
+            own |= {"record_end": lidar.record_end} if lidar.record_end else {}
+        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, chosen)
         return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
 
-    def share_record(self, axis: TimeAxis) -> None:
-        """Use the time bins of other renders instead of automatic ones."""
-        self.sensor.film().share(axis)
-
-    def tell_record(self, axis: TimeAxis | None = None) -> None:
-        """Log time bins, by default those of the film, where its start or length are automatic."""
-        film = self.sensor.film()
-        if film.used_values:
-            axis, end = axis or film.axis, f"; it ends {film.end}" if film.end else ""
+    def tell_axis(self, axis: TimeAxis, end: str) -> None:
+        """Log time bins, and what ends them, where the film leaves their start or number to the scene."""
+        if self.sensor.film().axis is None:
             text = f"record: {axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
-            logger.info("%s%s", text, end)
+            logger.info("%s%s", text, f"; it ends {end}" if end else "")
 
 
 @alone_with_scene

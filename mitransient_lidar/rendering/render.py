@@ -218,7 +218,7 @@ def _render(
     moved = [one.name for one in parameters if one.perturbation is None]
     differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
     reweighted = cases(renderer, reweight)
-    session.tell_record()
+    session.tell_axis(lidar.axis, lidar.record_end)
     changes = perturbations(parameters) + [one for case in reweighted for one in (case.perturbation, case.squared)]
     if changes:
         renderer = renderer.perturbed(changes)
@@ -271,8 +271,9 @@ def _render(
     lost = log.edge_loss_share(accumulator.received)
     warn_of_edge_loss(lost)
     attributes = session.attributes(
-        integrator=chosen,
-        used=renderer.used_values,
+        lidar,
+        chosen,
+        renderer.used_values,
         **log.attributes(seed),
         pass_share=share,
         max_memory_gb=max_memory,

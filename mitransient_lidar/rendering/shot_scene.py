@@ -68,10 +68,10 @@ class ShotScene:
             check_solids(sum(not shape.is_medium_transition() for shape in self.session.scene.shapes()))
         self._integrator = choose_integrator(self.session.scene, None)
         shifts = [(float(x), float(y)) for x, y in places - places[0]]
-        own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
-        self._axis = own if axis is None else _checked_axis(axis, own)
+        own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts)
+        self._axis = own.axis if axis is None else _checked_axis(axis, own.axis)
         if check:
-            self.session.tell_record(self._axis)
+            self.session.tell_axis(self._axis, own.record_end)
         self._renderer = self._prepare(self.session)
         self.lidar: LidarScene = self._renderer.scene
         self.companions = self._find_companions()
@@ -91,8 +91,7 @@ class ShotScene:
 
     def _prepare(self, session: LoadedScene) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
-        session.share_record(self._axis)
-        renderer = self._integrator.prepare(session.scene, session.sensor)
+        renderer = self._integrator.prepare(session.scene, session.sensor, axis=self._axis)
         from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
 
         renderer = renderer.by_origin() if self._components else renderer
@@ -124,7 +123,7 @@ class ShotScene:
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""
-        found = self.session.attributes(integrator=self._integrator, used=used, **self._described, **others)
+        found = self.session.attributes(self.lidar, self._integrator, used, **self._described, **others)
         replaced = (*AIM, *(() if self._target is None else TARGET))
         return {
             name: value

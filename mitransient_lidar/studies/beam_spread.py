@@ -160,7 +160,7 @@ def beam_spread(
             100 * missed,
         )
     described = {"photons_per_pass": photons, "beam_outside_surface": missed, **_describe(lidar)}
-    return _dataset(measured, wanted, axes, session.attributes(**log.attributes(seed), **described))
+    return _dataset(measured, wanted, axes, session.attributes(lidar, **log.attributes(seed), **described))
 
 
 def _planes(lidar: LidarScene, depths: FloatArray) -> FloatArray:

@@ -114,7 +114,7 @@ def estimate(
 
     lidar = find_lidar_scene(session.scene, session.sensor)
     model = _model(lidar)
-    session.tell_record()
+    session.tell_axis(lidar.axis, lidar.record_end)
     sampler = SensorSampler(lidar.receiver, lidar.transmitter)
     probe = probe_echoes(lidar, sampler)
     window = error_window(lidar, probe)
@@ -123,7 +123,7 @@ def estimate(
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)
     described = describe_scene(lidar, probe, window, RippleFocusing.of_scene(lidar))
-    attributes = session.attributes(model="estimate", paths=paths, seed=seed, **described)
+    attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
 
 

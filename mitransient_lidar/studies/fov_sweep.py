@@ -147,6 +147,7 @@ def fov_sweep(
         "time": ("time", lidar.axis.centres_ns, {"units": "ns"}),
     }
     attributes = session.attributes(
+        lidar,
         seed=seed,
         passes=passes,
         interrupted=int(log.interrupted),

@@ -105,7 +105,7 @@ def scattering_orders(
         "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
         "time": ("time", axis.centres_ns, {"units": "ns"}),
     }
-    attributes = session.attributes(integrator=chosen, **log.attributes(seed))
+    attributes = session.attributes(lidar, chosen, **log.attributes(seed))
     return xr.Dataset(data, coords=coords, attrs=attributes)
 
 

@@ -120,8 +120,7 @@ def alone_at(scene, params, pose, record, integrator):
     session = open_scene(scene, params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]})
     session.scene.emitters()[0].pose = pose
     session.sensor.receiver = replace(session.sensor.receiver, pose=pose)
-    session.share_record(record)
-    return choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor)
+    return choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor, axis=record)
 
 
 @pytest.mark.slow
