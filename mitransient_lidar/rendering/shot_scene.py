@@ -13,12 +13,13 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.rendering.accumulators import described
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotBatches
+    from mitransient_lidar.rendering.shot_batches import ShotBatches, ShotRecord
     from mitransient_lidar.transport.passes import PassRenderer
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -91,9 +92,9 @@ class ShotScene:
 
     def _prepare(self, session: LoadedScene) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
-        renderer = self._integrator.prepare(session.scene, session.sensor, axis=self._axis)
         from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
 
+        renderer = self._integrator.prepare(session.scene, session.sensor, axis=self._axis)
         renderer = renderer.by_origin() if self._components else renderer
         if not self._derivatives:
             return renderer
@@ -131,31 +132,25 @@ class ShotScene:
             if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
         }
 
-    def dataset(
-        self,
-        arrays: Sequence[FloatArray],
-        parts: Sequence[FloatArray],
-        attributes: Mapping[str, Any],
-        derivatives: Sequence[FloatArray] = (),
-    ) -> xr.Dataset:
-        """Return the labelled result of arrays as those of a `ShotRecord`."""
+    def dataset(self, record: ShotRecord, attributes: Mapping[str, Any]) -> xr.Dataset:
+        """Return the labelled result."""
         from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
-            *arrays,
+            *record.whole,
             time=self.lidar.axis,
             pixel_names=pixels.names,
             pixel_centres_mrad=1e3 * pixels.centres(),
             grid=pixels.grid,
             attributes=attributes,
         )
-        if parts:
-            dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
-        if derivatives:
-            about = ([getattr(one, name) for one in self.parameters] for name in ("name", "value", "units", "method"))
-            first = (np.moveaxis(values, 1, 0) for values in derivatives)
-            dataset = results.add_derivatives(dataset, *about, *first).transpose("shot", ...)
+        if record.parts:
+            names = self._renderer.classes.names
+            dataset = results.add_components(dataset, names, *record.parts).transpose("shot", ...)
+        if record.derivatives:
+            first = (np.moveaxis(values, 1, 0) for values in record.derivatives)
+            dataset = results.add_derivatives(dataset, *described(self.parameters), *first).transpose("shot", ...)
         return with_lines_of_sight(dataset, self.lidar)
 
 

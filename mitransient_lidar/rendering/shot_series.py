@@ -51,9 +51,6 @@ _LISTED = (
     *("true_bottom_depth", "true_bottom_depth_below_surface"),
 )
 
-#: Arrays of a series, as of `results.build_series`.
-_ARRAYS = ("energy", "energy_stderr", "power", "power_stderr")
-
 
 def read_places(path: str | os.PathLike[str]) -> FloatArray:
     """Read places from a table with columns x and y [m], shape (count, 2); raise `UserError` if it cannot be read."""
@@ -161,7 +158,7 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
+    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, ShotRecord, share_for_error
     from mitransient_lidar.rendering.shot_poses import ShotPoses
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
@@ -205,7 +202,7 @@ def render_shots(
                 batch = batches.limited(int(most[part].max()), seconds)
                 seeds = range(first_seed + part.start, first_seed + part.stop)
                 records.append(batch.render(ShotPoses(places[part]), seeds))
-                errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
+                errors.append(series.window.relative_errors(*records[-1].whole[2:]))
                 done = part.stop
                 if progress is not None:
                     progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], options))
@@ -217,19 +214,14 @@ def render_shots(
             raise KeyboardInterrupt from error
         interrupted = True
     _warn_of_the_end(records, done, len(places), options, interrupted)
-    joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
-    by_origin, changes = (
-        [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-        for parts in ([record.parts for record in records], [record.derivatives for record in records])
-    )
-    found = np.concatenate(errors)
-    median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
-    lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
+    median, p95 = np.quantile(np.concatenate(errors), [0.5, 0.95], method="higher")
+    lost, received = sum(one.lost for one in records), sum(one.whole[0].sum() for one in records)
     lost = lost / (lost + received) if lost > 0 else 0.0
+    record = ShotRecord.joined(records)
     warn_of_edge_loss(lost)
     attributes = series.attributes(
         used=batches.used_values,
-        passes=max(record.passes for record in records),
+        passes=int(record.passes.max()),
         most_passes=passes,
         pass_share=share,
         elapsed_s=time.perf_counter() - began,
@@ -249,9 +241,8 @@ def render_shots(
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
-    rendered = np.repeat([record.passes for record in records], [len(record.power) for record in records])
-    known["shot_passes"] = ("shot", rendered, {"units": "1", "long_name": "number of passes of the shot"})
-    return series.dataset(joined, by_origin, attributes, changes).assign_coords(known)
+    known["shot_passes"] = ("shot", record.passes, {"units": "1", "long_name": "number of passes of the shot"})
+    return series.dataset(record, attributes).assign_coords(known)
 
 
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
@@ -313,7 +304,7 @@ def _warn_of_the_end(
     """Warn of shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
     if done < planned and not interrupted:
         _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
-    if missed := sum(len(record.power) for record in records if record.missed):
+    if missed := sum(record.missed for record in records):
         _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
 
 

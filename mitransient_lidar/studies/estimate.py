@@ -24,7 +24,7 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_spread,
     slope_structures,
 )
-from mitransient_lidar.rendering.accumulators import WaveformAccumulator
+from mitransient_lidar.rendering.accumulators import PassAccumulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -118,7 +118,7 @@ def estimate(
     sampler = SensorSampler(lidar.receiver, lidar.transmitter)
     probe = probe_echoes(lidar, sampler)
     window = error_window(lidar, probe)
-    accumulator = WaveformAccumulator(lidar, window, None, _ORIGINS)
+    accumulator = PassAccumulator(lidar, window, origins=_ORIGINS)
     for generator in np.random.SeedSequence(seed).spawn(_PARTS):
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)

@@ -28,7 +28,7 @@ def each_slope(session, name, integrator=SMALL, steps=None):
     sums = [np.zeros(())]
     for number in range(PASSES):
         found.add_pass(pass_seed(0, number))
-        sums.append(found.passes * found.impulse_response[0])
+        sums.append(found.light.energy.count * found.light.energy.mean[0])
     return np.array([after - before for before, after in itertools.pairwise(sums)])
 
 
