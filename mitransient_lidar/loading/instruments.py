@@ -18,7 +18,15 @@ from xml.dom import minidom
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.document import SceneDocument, parameters_of, parse_part, read_document, text_of
+from mitransient_lidar.loading.document import (
+    SceneDocument,
+    comment_on_line,
+    drop_line,
+    parameters_of,
+    parse_part,
+    read_document,
+    text_of,
+)
 from mitransient_lidar.loading.parameters import without_alternatives
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
@@ -133,9 +141,11 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
         default = document.createElement("default")
         default.setAttribute("name", key)
         default.setAttribute("value", value)
-        root.insertBefore(default, first)
-        if sources.get(key):
-            root.insertBefore(document.createComment(f" {sources[key]} "), first)
+        comments = (
+            [document.createTextNode("  "), document.createComment(f" {sources[key]} ")] if sources.get(key) else []
+        )
+        for node in (document.createTextNode("\n    "), default, *comments):
+            root.insertBefore(node, first)
     has_integrator = any(tag.parentNode is root for tag in root.getElementsByTagName("integrator"))
     for child in list(part.childNodes):
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
@@ -175,17 +185,9 @@ def _named(parent: minidom.Element, name: str) -> list[minidom.Element]:
 def _parameters(root: minidom.Element) -> Iterator[InstrumentParameter]:
     """Yield the parameters of an instrument's file, with the comments on their lines."""
     for default in root.getElementsByTagName("default"):
-        comment = _comment(default)
+        comment = comment_on_line(default)
         text = "" if comment is None else " ".join(comment.data.split())
         yield InstrumentParameter(default.getAttribute("name"), default.getAttribute("value"), text)
-
-
-def _comment(element: minidom.Element) -> minidom.Comment | None:
-    """Return the comment behind an element on its line."""
-    node = element.nextSibling
-    if isinstance(node, minidom.Text) and "\n" not in node.data:
-        node = node.nextSibling
-    return node if isinstance(node, minidom.Comment) else None
 
 
 def _drop_unused(root: minidom.Element) -> None:
@@ -193,10 +195,7 @@ def _drop_unused(root: minidom.Element) -> None:
     used = SceneDocument("", root, parameters=parameters_of(root)).used
     for default in root.getElementsByTagName("default"):
         if default.getAttribute("name") not in used:
-            assert default.parentNode is not None
-            if (comment := _comment(default)) is not None:
-                default.parentNode.removeChild(comment)
-            default.parentNode.removeChild(default)
+            drop_line(default)
 
 
 def _path(name: str) -> Path:

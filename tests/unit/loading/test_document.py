@@ -64,18 +64,16 @@ FLAT = """<!-- A level sea -->
   Over a bottom.
 -->
 <scene version="3.0.0">
+    <!-- Chosen here -->
 
     <!-- All parameters -->
 
     <!-- Ball -->
     <default name="radius" value="2"/>  <!-- m -->
     <default name="depth" value="3"/>
-    <!-- Chosen here -->
     <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
 
     <default name="power" value="7"/>
-    <!-- Matt -->
-    <default name="gain" value="1"/>
 
     <shape type="sphere" id="ball">
         <!-- Nearly "round" -->
@@ -87,11 +85,12 @@ FLAT = """<!-- A level sea -->
     <!-- Below -->
     <shape type="rectangle" id="floor">
         <bsdf type="diffuse" name="bsdf">
-            <spectrum name="reflectance" value="$grey"/>
-        </bsdf>
+  <!-- Matt -->
+  <default name="gain" value="1"/>
+  <spectrum name="reflectance" value="$grey"/>
+</bsdf>
     </shape>
     <!-- The end -->
-
 </scene>
 """
 
