@@ -20,7 +20,7 @@ import numpy as np
 import mitransient_lidar
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.drawing import pixel_colours
-from mitransient_lidar.rendering.sea_map import SeaMap
+from mitransient_lidar.rendering.shots.truth import SeaMap
 
 shot = mitransient_lidar.render("fig09_2x2", passes=8, seed=1)
 print("dimensions:", dict(shot.sizes))

@@ -19,12 +19,12 @@ from mitransient_lidar.flights.poses.mounting import PulsePoses, poses_of
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.shot_series import FARTHEST
+from mitransient_lidar.rendering.shots.series import FARTHEST
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import ShotPoses
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
         arrives after the record.
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
-    from mitransient_lidar.rendering.shot_truth import solids_below
+    from mitransient_lidar.rendering.shots.truth import solids_below
     from mitransient_lidar.transport.plugin_types import SeabedShape
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -244,7 +244,7 @@ def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
 
 def shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
     """Return the poses of pulses of one group."""
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import ShotPoses
 
     return ShotPoses.of_receiver(lidar, poses_of(inputs.__getitem__))
 

@@ -50,8 +50,8 @@ from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
 
 if TYPE_CHECKING:
-    from mitransient_lidar.rendering.shot_batches import ShotBatches
-    from mitransient_lidar.rendering.shot_scene import ShotScene
+    from mitransient_lidar.rendering.shots.batches import ShotBatches
+    from mitransient_lidar.rendering.shots.scene import ShotScene
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
@@ -237,7 +237,7 @@ class FlightRenderer:
 
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
-        from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, share_for_error
+        from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
 
         error = self.plan.target_error
         share = share_for_error(error)
@@ -294,8 +294,8 @@ class FlightRenderer:
         self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
     ) -> tuple[xr.Dataset, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
-        from mitransient_lidar.rendering.shot_batches import ShotRecord
-        from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
+        from mitransient_lidar.rendering.shots.batches import ShotRecord
+        from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan
         scene = self._scene_of(inputs)
@@ -342,7 +342,7 @@ def _shot_scene(
     renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis
 ) -> ShotScene:
     """Return the loaded scene of the lidar of a group."""
-    from mitransient_lidar.rendering.shot_scene import ShotScene
+    from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
     return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)

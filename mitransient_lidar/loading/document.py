@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.dom import minidom
 from xml.sax.saxutils import quoteattr
 
@@ -192,8 +192,8 @@ def comment_on_line(element: minidom.Element) -> minidom.Comment | None:
 
 def drop_line(element: minidom.Element) -> None:
     """Remove an element, the comment on its line, and the space before both."""
-    parent, space = element.parentNode, element.previousSibling
-    assert parent is not None
+    parent: Any = element.parentNode
+    space = element.previousSibling
     for node in (comment_on_line(element), space if isinstance(space, minidom.Text) else None, element):
         if node is not None:
             parent.removeChild(node)
@@ -215,9 +215,9 @@ def _drop_repeated(root: minidom.Element) -> None:
         comment, own = comment_on_line(default), comment_on_line(one)
         drop_line(default)
         if comment is not None and own is None:
-            assert one.parentNode is not None and root.ownerDocument is not None
-            for node in (comment, root.ownerDocument.createTextNode("  ")):
-                one.parentNode.insertBefore(node, one.nextSibling)
+            parent: Any = one.parentNode
+            for node in (comment, parent.ownerDocument.createTextNode("  ")):
+                parent.insertBefore(node, one.nextSibling)
         elif comment is not None and own is not None and not in_order:
             own.data = comment.data
 

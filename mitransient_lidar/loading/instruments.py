@@ -141,11 +141,11 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
         default = document.createElement("default")
         default.setAttribute("name", key)
         default.setAttribute("value", value)
-        comments = (
-            [document.createTextNode("  "), document.createComment(f" {sources[key]} ")] if sources.get(key) else []
-        )
-        for node in (document.createTextNode("\n    "), default, *comments):
-            root.insertBefore(node, first)
+        root.insertBefore(document.createTextNode("\n    "), first)
+        root.insertBefore(default, first)
+        if sources.get(key):
+            root.insertBefore(document.createTextNode("  "), first)
+            root.insertBefore(document.createComment(f" {sources[key]} "), first)
     has_integrator = any(tag.parentNode is root for tag in root.getElementsByTagName("integrator"))
     for child in list(part.childNodes):
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):

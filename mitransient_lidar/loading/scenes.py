@@ -281,7 +281,7 @@ def _load_xml(
     record = SceneRecord.of_document(document, scene if isinstance(scene, SceneRecord) else None)
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
-        loaded = _instantiate(lambda config: _with_dollars(mi.parser.parse_string(config, text)))
+        loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, dict(document.parameters), record)
@@ -311,26 +311,22 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     config.merge_equivalent = config.merge_meshes = config.parallel = False
     parsed = parse(config)
     for node in parsed.nodes:
-        for name in FILE_PARAMETERS:
-            if name in node.props and isinstance(node.props[name], (bool, int, float)):
-                raise UserError(f"{name} = {node.props[name]} must be a text, the name of a file")
-        if node.props.plugin_name() == "ocean_surface":
-            node.props[WAITS] = True
+        props = node.props
+        for name in list(props.keys()):
+            value = props[name]
+            if name in FILE_PARAMETERS and isinstance(value, (bool, int, float)):
+                raise UserError(f"{name} = {value} must be a text, the name of a file")
+            if isinstance(value, str) and DOLLAR in value:
+                props[name] = value.replace(DOLLAR, "$")
+        if props.plugin_name() == "ocean_surface":
+            props[WAITS] = True
     mi.parser.transform_all(config, parsed)
     move_to_aim(parsed)
-    return mi.parser.instantiate(config, parsed)
-
-
-def _with_dollars(parsed: Any) -> Any:
-    """Return a scene that is parsed, with dollar signs in its texts in place of `DOLLAR`."""
+    # Mitsuba refuses parameters that no plugin has read.
     for node in parsed.nodes:
         for name in list(node.props.keys()):
-            value = node.props[name]
-            if isinstance(value, str) and DOLLAR in value:
-                node.props[name] = value.replace(DOLLAR, "$")
-            # Mitsuba refuses parameters that no plugin has read.
             node.props.mark_queried(name, False)
-    return parsed
+    return mi.parser.instantiate(config, parsed)
 
 
 @contextlib.contextmanager

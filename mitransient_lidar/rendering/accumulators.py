@@ -21,7 +21,7 @@ from mitransient_lidar.rendering.accuracy import (
     PassStatistics,
     received_power,
 )
-from mitransient_lidar.rendering.reweighting import Case, check_share, effective_share
+from mitransient_lidar.rendering.derivatives import Case, check_share, effective_share
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
 

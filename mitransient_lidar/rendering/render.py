@@ -114,7 +114,7 @@ def render(
     progress
         Called with a `passes.Progress` after every pass.
     **others
-        Options of `shot_series.render_shots` or `passive.render_passive`, for results of these.
+        Options of `shots.series.render_shots` or `passive.render_passive`, for results of these.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     Parameters
     ----------
     result
-        Dataset of `render`, `passive.render_passive` or `shot_series.render_shots`, or its file. Of one that was
+        Dataset of `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. Of one that was
         computed from a result, as gates or signals of a receiver, that result is rendered. Of a series, all shots, or
         those that were completed before Ctrl-C.
     options
@@ -180,7 +180,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         option is invalid.
     """
     from mitransient_lidar.rendering.passive import render_passive
-    from mitransient_lidar.rendering.shot_series import render_shots
+    from mitransient_lidar.rendering.shots.series import render_shots
 
     functions: dict[str, Callable[..., xarray.Dataset]] = {
         "render": render,
@@ -210,9 +210,8 @@ def _render(
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
-    from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
+    from mitransient_lidar.rendering.derivatives import cases, path_parameters, perturbations
     from mitransient_lidar.rendering.differences import Differences
-    from mitransient_lidar.rendering.reweighting import cases
 
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]

@@ -18,7 +18,7 @@ from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.gates.images import reached_by_surface
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 
 pytestmark = pytest.mark.long
 

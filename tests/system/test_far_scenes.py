@@ -11,7 +11,7 @@ from same_bits import assert_same_bits
 import mitransient_lidar
 from mitransient_lidar.loading import catalogue, frame
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.studies.find_shots import find_shots
 from mitransient_lidar.transport.scene_parts import find_receiver, lidar_sensor
 

@@ -13,9 +13,8 @@ from significance import assert_same, largest_z
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.render import render
-from mitransient_lidar.rendering.shot_batches import ShotBatches
-from mitransient_lidar.rendering.shot_poses import ShotPoses
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes
 

@@ -19,8 +19,8 @@ from mitransient_lidar.loading.exclusive import alone, alone_with_scene
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.shot_series import random_places, render_shots
+from mitransient_lidar.rendering.shots.series import random_places, render_shots
+from mitransient_lidar.rendering.shots.truth import SeaMap
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.studies.publication.measures import Series
 

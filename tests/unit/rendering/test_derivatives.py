@@ -8,8 +8,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
-from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.rendering.reweighting import cases, check_share, effective_share
+from mitransient_lidar.rendering.derivatives import cases, check_share, effective_share, path_parameters
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
 LAYERS = {

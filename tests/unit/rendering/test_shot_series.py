@@ -13,10 +13,12 @@ from same_bits import assert_same_bits
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.rendering.shot_poses import ShotPoses
-from mitransient_lidar.rendering.shot_scene import ShotScene
+from mitransient_lidar.rendering.shots import batches as shot_batches
+from mitransient_lidar.rendering.shots import series as shot_series
+from mitransient_lidar.rendering.shots import truth as shot_truth
+from mitransient_lidar.rendering.shots.batches import ShotPoses
+from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotBatches, ShotRecord
+    from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotRecord
     from mitransient_lidar.transport.passes import PassRenderer
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -56,7 +56,7 @@ class ShotScene:
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
-        from mitransient_lidar.rendering.shot_batches import check_size
+        from mitransient_lidar.rendering.shots.batches import check_size
         from mitransient_lidar.transport.path_classes import check_solids
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -117,7 +117,7 @@ class ShotScene:
 
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
         """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
-        from mitransient_lidar.rendering.shot_batches import ShotBatches
+        from mitransient_lidar.rendering.shots.batches import ShotBatches
 
         goal = None if error is None else (error, self.window)
         return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions)

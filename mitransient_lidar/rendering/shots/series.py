@@ -27,15 +27,14 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene, read_record
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
-from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.shot_scene import AIM, TARGET, ShotScene
-from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
+from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
+from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotRecord
+    from mitransient_lidar.rendering.shots.batches import ShotRecord
 
 _LOG = logging.getLogger(__name__)
 
@@ -147,7 +146,7 @@ def render_shots(
         below the mean surface in the footprint, as depths of echoes are, the sum of depth and surface height; of the
         water, whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
         ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
-        bubbles (`shot_truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
+        bubbles (`truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
         those of the first shot; positions are left out. ``series_parameters``: JSON of the scene's parameters that
         shots replace. ``passes`` is the largest number of passes of a shot, of the coordinate ``shot_passes``, and
         ``most_passes`` the option. ``slope_deviation``: standard deviations of the two slopes of a sea with waves.
@@ -158,8 +157,7 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, ShotRecord, share_for_error
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, ShotPoses, ShotRecord, share_for_error
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
