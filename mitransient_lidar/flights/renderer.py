@@ -345,7 +345,7 @@ def _shot_scene(
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
-    return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
+    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False)
 
 
 @functools.lru_cache(maxsize=256)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,6 +78,14 @@ class SceneDocument:
     given: Mapping[str, str] = field(default_factory=dict)
     instrument: str = ""
     source: str | None = None
+
+    def copied(self) -> SceneDocument:
+        """Return a scene whose root is a copy, to be changed."""
+        assert self.root.ownerDocument is not None
+        document = self.root.ownerDocument.cloneNode(True)
+        assert isinstance(document, minidom.Document)
+        assert document.documentElement is not None
+        return replace(self, root=document.documentElement, source=None)
 
     @cached_property
     def text(self) -> str:

@@ -115,11 +115,8 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     """
     path = _path(name)
     own, part = _own_part(path), read_document(path).root
-    assert scene.root.ownerDocument is not None
-    copied = scene.root.ownerDocument.cloneNode(True)
-    assert isinstance(copied, minidom.Document)
-    root = copied.documentElement
-    assert root is not None
+    scene = scene.copied()
+    root = scene.root
     shared = parameters_of(part)
     former = parameters_of(root)
     values = {record: shared[record] for record in _RECORD}
@@ -152,7 +149,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
             root.appendChild(child)
     _drop_unused(root)
     known = {key: scene.parameters.get(key, value) for key, value in parameters_of(root).items()} | values
-    return replace(scene, root=root, parameters=without_alternatives(known, values), instrument=name, source=None)
+    return replace(scene, parameters=without_alternatives(known, values), instrument=name)
 
 
 def _own_part(path: Path) -> minidom.Element:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
-from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
@@ -217,31 +216,25 @@ def read_record(
 
 def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> SceneDocument:
     """Return a scene whose seabeds with a map in map coordinates have an ``origin_x`` and ``origin_y`` [m]."""
-    assert document.root.ownerDocument is not None
-    copied = document.root.ownerDocument.cloneNode(True)
-    assert isinstance(copied, minidom.Document)
-    assert copied.documentElement is not None
-    changed = replace(document, root=copied.documentElement, source=None)
+    changed, placed = document.copied(), False
     seabeds = {id(one.element) for one in changed.settings if one.attribute == "type" and one.value == "seabed"}
-    maps = [
-        one.element.parentNode
-        for one in changed.settings
-        if one.owner == "filename" and Path(one.value).suffix.lower() in IN_MAP_COORDINATES
-    ]
-    placed = False
-    for seabed in maps:
-        if not isinstance(seabed, minidom.Element) or id(seabed) not in seabeds:
+    for setting in changed.settings:
+        seabed: Any = setting.element.parentNode
+        if setting.owner != "filename" or Path(setting.value).suffix.lower() not in IN_MAP_COORDINATES:
+            continue
+        if id(seabed) not in seabeds:
             continue
         names = [child.getAttribute("name") for child in seabed.getElementsByTagName("float")]
         if "origin_x" in names or "origin_y" in names:
             continue
         placed = True
         for name, value in zip(("origin_x", "origin_y"), origin, strict=True):
-            number = copied.createElement("float")
+            number = seabed.ownerDocument.createElement("float")
             number.setAttribute("name", name)
             number.setAttribute("value", repr(value))
             seabed.appendChild(number)
-    return changed if placed else document
+    # Settings of the copy are those before its change.
+    return replace(changed) if placed else document
 
 
 def _document(scene: SceneRecord | str | os.PathLike[str], instrument: str | None) -> SceneDocument:

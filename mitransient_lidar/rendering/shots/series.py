@@ -8,7 +8,6 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,8 +22,7 @@ from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import LoadedScene, open_scene, read_record
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
@@ -168,17 +166,15 @@ def render_shots(
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")
-    if sensor and isinstance(scene, (str, os.PathLike)):
-        scene, instrument = read_record(scene, params, instrument), None
-    if sensor and isinstance(scene, SceneRecord):
-        scene = replace(scene, sensor=sensor)
-    session = open_scene(scene, params, instrument=instrument) if given is None or move_target else None
+    source: dict[str, Any] = {"instrument": instrument, "sensor": sensor}
+    session = open_scene(scene, params, **source) if given is None or move_target else None
     target = _target_offset(session) if session is not None and move_target else None
     places = given
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = ShotScene(scene, params, instrument, target, places, axis, bool(components), derivatives=derivatives or ())
+    channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or ()}
+    series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
