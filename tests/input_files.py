@@ -170,7 +170,7 @@ def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
             values = {name: filled(one) if isinstance(one, dict) else one for name, one in part.items()}
             return {name: str(path) if value == "FILE" else value for name, value in values.items()}
 
-        scenes.load({"type": "scene", "part": filled({"type": kind, **parameters})})
+        scenes.open_scene({"type": "scene", "part": filled({"type": kind, **parameters})})
 
     return read
 

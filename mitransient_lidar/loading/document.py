@@ -2,7 +2,7 @@
 
 A scene goes one way: a document is read from a file or a record, an instrument may be mounted (`instruments.mount`),
 its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_record`),
-and Mitsuba loads it (`scenes.load`). Each step takes the document of the step before.
+and Mitsuba loads it (`scenes.open_scene`). Each step takes the document of the step before.
 """
 
 from __future__ import annotations
