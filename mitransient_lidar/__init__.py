@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.plots.publication.figures import figures
     from mitransient_lidar.plots.viewer import view
     from mitransient_lidar.rendering.render import render
-    from mitransient_lidar.rendering.shot_series import render_shots
+    from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.studies.bounds import bounds
     from mitransient_lidar.studies.depth_bias import depth_bias
     from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
@@ -88,7 +88,7 @@ _FUNCTIONS = {
     "read_instrument": ("loading.instruments", "read_instrument"),
     "record": ("analysis.receiver", "detect_waveforms"),
     "render": ("rendering.render", "render"),
-    "render_shots": ("rendering.shot_series", "render_shots"),
+    "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),

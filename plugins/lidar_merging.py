@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
@@ -104,8 +105,12 @@ class LidarMerging(PassIntegrator):
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
         connections: bool = True,
+        axis: TimeAxis | None = None,
     ) -> PassRenderer:
         """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
+
+        Where the film leaves start or number of the time bins to the scene, they are those of `axis`, or hold all light
+        (`find_lidar_scene`).
 
         `layout_of` is the renderer of another scene whose time bins, points and cells are used, so that the same seeds
         make the same paths in scenes that differ by a target, or a little in a parameter. Without `connections` paths
@@ -117,7 +122,7 @@ class LidarMerging(PassIntegrator):
         UserError
             When the scene lacks a part or has one that is not supported.
         """
-        axis = None if layout_of is None else layout_of.scene.axis
+        axis = axis if layout_of is None else layout_of.scene.axis
         lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
         classes = classes or PathClasses()
         if lidar.water is None:

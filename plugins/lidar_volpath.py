@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import LIDAR_VOLPATH
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -67,9 +68,10 @@ class LidarVolpath(VolpathIntegrator):
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
         connections: bool = True,
+        axis: TimeAxis | None = None,
     ) -> VolpathRenderer:
         """Return the renderer of passes of a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
-        axis = None if layout_of is None else layout_of.scene.axis
+        axis = axis if layout_of is None else layout_of.scene.axis
         lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
 

@@ -62,36 +62,15 @@ class TimeGatedFilm(mi.Film):
         self.time_start_ns = None if start == AUTO else start
         self.bin_width_ns = props.read("bin_width_ns")
         self.bin_count = None if count == AUTO else count
-        #: Time bins of the record, None until `fit`; whether `fit` leaves them as they are.
+        #: Time bins that are given; None where an integrator chooses start or number for the scene.
         self.axis: TimeAxis | None = None
-        self.is_fixed = False
-        #: What the last light of the record comes from where its end is chosen.
-        self.end = ""
         if self.time_start_ns is not None and self.bin_count is not None:
-            self.axis, self.is_fixed = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count), True
+            self.axis = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count)
         #: Gates of the scene, or None.
         self.gates = _gate_plan(props)
         props["width"], props["height"] = self.bin_count or 1, 1
         super().__init__(props)
         self._pass: TransientHistogram | None = None
-
-    def fit(self, axis: TimeAxis, end: str = "") -> None:
-        """Set the time bins of a record of automatic start or length, and the reason for its end."""
-        if not self.is_fixed:
-            self.axis, self.end = axis, end if self.bin_count is None else ""
-
-    def share(self, axis: TimeAxis) -> None:
-        """Use the time bins of other records, from now on, where start or length are automatic."""
-        if self.time_start_ns is None or self.bin_count is None:
-            self.axis, self.end, self.is_fixed = axis, "", True
-
-    @property
-    def used_values(self) -> dict[str, float]:
-        """Values used for the parameters that are automatic, once they are known."""
-        if self.axis is None:
-            return {}
-        start = {} if self.time_start_ns is not None else {"time_start_ns": self.axis.start_ns}
-        return {**start, **({} if self.bin_count is not None else {"bin_count": self.axis.bin_count})}
 
     def store(self, histogram: TransientHistogram) -> None:
         """Keep the histogram of the last pass, for `develop`, `bitmap` and `write`."""

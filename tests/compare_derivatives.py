@@ -21,7 +21,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.parameters import parameter_of, with_value
 from mitransient_lidar.rendering.derivatives import RIPPLES, known_names, path_parameters
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 
 #: Parts of scenes: one pixel on a sea without waves, whose ripples have a variance that is known, and their focusing,
 #: of which there is no derivative by this variance, left out.

@@ -118,7 +118,7 @@ def scene(folder: Path) -> Path:
 
 def load(path: Path) -> None:
     """Load a scene, and plan the record of its lidar."""
-    from mitransient_lidar.rendering.session import open_scene
+    from mitransient_lidar.loading.scenes import open_scene
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(path, None)
@@ -170,7 +170,7 @@ def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
             values = {name: filled(one) if isinstance(one, dict) else one for name, one in part.items()}
             return {name: str(path) if value == "FILE" else value for name, value in values.items()}
 
-        scenes.load({"type": "scene", "part": filled({"type": kind, **parameters})})
+        scenes.open_scene({"type": "scene", "part": filled({"type": kind, **parameters})})
 
     return read
 

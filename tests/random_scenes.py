@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm, t
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 
 #: Scenes: a flat bottom alone, with a sphere, and with a plate above it.
 SCENES = "table1", "fig02_mine", "fig13_2x2"

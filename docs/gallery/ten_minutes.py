@@ -18,9 +18,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.drawing import pixel_colours
-from mitransient_lidar.rendering.sea_map import SeaMap
+from mitransient_lidar.rendering.shots.truth import SeaMap
 
 shot = mitransient_lidar.render("fig09_2x2", passes=8, seed=1)
 print("dimensions:", dict(shot.sizes))
@@ -128,7 +128,7 @@ plt.show()
 # mean slope of the waves over the footprint.
 
 found = mitransient_lidar.retrieve(shot)
-sea = SeaMap.of_scene(load_scene("fig09_2x2")[0])
+sea = SeaMap.of_scene(open_scene("fig09_2x2").scene)
 along, across = sea.slope_at(0.0, 0.0)
 names = ("bottom_depth", "bottom_reflectance", "attenuation", "scattering", "backscattering")
 depth, rho, c, b, bb = (float(shot.attrs[f"scene.{name}"]) for name in names)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import xarray as xr
 
 import mitransient_lidar
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 
 HERE = Path(__file__).parent
 #: Independent passes of a case, of which `waves` has one for each sea.

@@ -20,11 +20,10 @@ from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import read_record
+from mitransient_lidar.loading.scenes import open_scene, read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
-from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 
 #: Half of the side of the square of the places of a sea [m].
 _REACH = 256.0

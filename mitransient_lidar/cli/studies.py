@@ -126,9 +126,9 @@ def shots(
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
-    from mitransient_lidar.rendering import shot_series as study
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.render import render_again
+    from mitransient_lidar.rendering.shots import series as study
 
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:

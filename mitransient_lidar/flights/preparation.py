@@ -17,14 +17,14 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray
 from mitransient_lidar.flights.plan import SAME_PLACE_M, FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses, poses_of
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.rendering.shot_series import FARTHEST
+from mitransient_lidar.rendering.shots.series import FARTHEST
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import ShotPoses
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
         arrives after the record.
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
-    from mitransient_lidar.rendering.shot_truth import solids_below
+    from mitransient_lidar.rendering.shots.truth import solids_below
     from mitransient_lidar.transport.plugin_types import SeabedShape
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -138,19 +138,18 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
     depths = np.argsort(bottom)
     chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
     shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
-    film = session.sensor.film()
-    if not film.is_fixed:
+    fixed: TimeAxis | None = session.sensor.film().axis
+    if fixed is None:
         own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
         return TimeAxis.covering(first, last, own.bin_width_ns), beyond
     way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
     arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
-    if arrival > film.axis.end_ns:
+    if arrival > fixed.end_ns:
         raise UserError(
             f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "
-            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
+            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {fixed.end_ns:.0f} ns"
         )
-    fixed: TimeAxis = film.axis
     return fixed, beyond
 
 
@@ -245,7 +244,7 @@ def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
 
 def shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
     """Return the poses of pulses of one group."""
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import ShotPoses
 
     return ShotPoses.of_receiver(lidar, poses_of(inputs.__getitem__))
 

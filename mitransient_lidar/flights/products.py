@@ -255,8 +255,8 @@ def describe_points(points: xr.Dataset) -> list[str]:
 @alone
 def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]:
     """Return what is known of points: height of the sea in the beam or of the highest solid there, and of the pulse."""
-    from mitransient_lidar.rendering.session import open_scene
-    from mitransient_lidar.rendering.shot_truth import solids_below
+    from mitransient_lidar.loading.scenes import open_scene
+    from mitransient_lidar.rendering.shots.truth import solids_below
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(flown.store.renderer().scene, dict(plan.parameters))

@@ -50,8 +50,8 @@ from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
 
 if TYPE_CHECKING:
-    from mitransient_lidar.rendering.shot_batches import ShotBatches
-    from mitransient_lidar.rendering.shot_scene import ShotScene
+    from mitransient_lidar.rendering.shots.batches import ShotBatches
+    from mitransient_lidar.rendering.shots.scene import ShotScene
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
@@ -237,7 +237,7 @@ class FlightRenderer:
 
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
-        from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, share_for_error
+        from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
 
         error = self.plan.target_error
         share = share_for_error(error)
@@ -250,8 +250,6 @@ class FlightRenderer:
 
         Each part has the processor time of a pulse with as many passes as its error needs [s].
         """
-        from mitransient_lidar.rendering.shot_batches import relative_errors
-
         count = len(columns["pulse"])
         rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
         found: list[tuple[xr.Dataset, float]] = []
@@ -265,7 +263,7 @@ class FlightRenderer:
                 power, stderr = (
                     series[name].transpose("shot", "pixel", "time").values for name in ("waveform", "waveform_stderr")
                 )
-                error = float(np.median(relative_errors(power, stderr, window)))
+                error = float(np.median(window.relative_errors(power, stderr)))
                 found.append((series, took * max((error / self.plan.target_error) ** 2, 1.0)))
                 if progress is not None:
                     done = sum(one.sizes["shot"] for one, _ in found)
@@ -296,7 +294,8 @@ class FlightRenderer:
         self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
     ) -> tuple[xr.Dataset, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
-        from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
+        from mitransient_lidar.rendering.shots.batches import ShotRecord
+        from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan
         scene = self._scene_of(inputs)
@@ -317,12 +316,9 @@ class FlightRenderer:
             batches.render(poses.part(part), [plan.seed * 2**20 + int(pulse) for pulse in pulses[part]])
             for part in batches.parts(len(poses))
         ]
-        joined = [
-            np.concatenate([getattr(record, name) for record in records])
-            for name in ("energy", "energy_stderr", "power", "power_stderr")
-        ]
-        attributes = scene.attributes(used=batches.used_values, passes=max(record.passes for record in records))
-        series = scene.dataset(joined, [], attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
+        joined = ShotRecord.joined(records)
+        attributes = scene.attributes(used=batches.used_values, passes=int(joined.passes.max()))
+        series = scene.dataset(joined, attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
         return series, 1e9 / C0 * (further - further % width)
 
 
@@ -346,10 +342,10 @@ def _shot_scene(
     renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis
 ) -> ShotScene:
     """Return the loaded scene of the lidar of a group."""
-    from mitransient_lidar.rendering.shot_scene import ShotScene
+    from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
-    return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
+    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False)
 
 
 @functools.lru_cache(maxsize=256)

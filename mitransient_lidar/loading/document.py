@@ -2,16 +2,17 @@
 
 A scene goes one way: a document is read from a file or a record, an instrument may be mounted (`instruments.mount`),
 its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_record`),
-and Mitsuba loads it (`scenes.load`). Each step takes the document of the step before.
+and Mitsuba loads it (`scenes.open_scene`). Each step takes the document of the step before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.dom import minidom
 from xml.sax.saxutils import quoteattr
 
@@ -78,13 +79,17 @@ class SceneDocument:
     instrument: str = ""
     source: str | None = None
 
+    def copied(self) -> SceneDocument:
+        """Return a scene whose root is a copy, to be changed."""
+        assert self.root.ownerDocument is not None
+        document = self.root.ownerDocument.cloneNode(True)
+        assert isinstance(document, minidom.Document)
+        assert document.documentElement is not None
+        return replace(self, root=document.documentElement, source=None)
+
     @cached_property
     def text(self) -> str:
-        """Text of the scene; of a changed one or one with includes, indented XML with parameters before objects.
-
-        Each parameter has one ``<default>``: at the place of its last declaration, with the value of its first one,
-        which is the one that Mitsuba uses, and with the first comment on the line of any of them.
-        """
+        """Text of the scene, with included files as they are in place, but for parameters that are repeated."""
         return text_of(self.root) if self.source is None else self.source
 
     @cached_property
@@ -137,32 +142,12 @@ class SceneDocument:
         refused.
         """
         _refuse_includes(self.root, self.name)
-        values: dict[int, list[str]] = {}
-        for setting in self.settings:
-            pair = f" {setting.attribute}={quoteattr(replaced(setting).replace('$', DOLLAR))}"
-            values.setdefault(id(setting.element), []).append(pair)
-
-        def written(node: minidom.Node) -> str:
-            if not isinstance(node, minidom.Element):
-                return "\n" * (node.nodeValue or "").count("\n")
-            if node.tagName == "default":
-                return ""
-            attributes, content = "".join(values.get(id(node), ())), "".join(map(written, node.childNodes))
-            return f"<{node.tagName}{attributes}>{content}</{node.tagName}>"
-
         # The root's own attributes have no parameters.
-        version = "".join(f" {name}={quoteattr(value)}" for name, value in self.root.attributes.items())
-        content = "".join(map(written, self.root.childNodes))
-        return f"<{self.root.tagName}{version}>{content}</{self.root.tagName}>"
-
-
-@dataclass
-class _Default:
-    """The ``<default>`` of a parameter with the comments above it ("" for a blank line) and on its line."""
-
-    element: minidom.Element
-    above: list[str]
-    same_line: str = ""
+        values = {id(self.root): dict(self.root.attributes.items())}
+        for setting in self.settings:
+            value = replaced(setting).replace("$", DOLLAR)
+            values.setdefault(id(setting.element), {})[setting.attribute] = value
+        return _written(self.root, values)
 
 
 def read_document(path: Path) -> SceneDocument:
@@ -177,7 +162,9 @@ def read_document(path: Path) -> SceneDocument:
     """
     text = read_text(path)
     if parse_part(text, path).getElementsByTagName("include"):
-        text = text_of(_expanded(path))
+        root = _expanded(path)
+        _drop_repeated(root)
+        text = text_of(root)
     return parse_document(path.stem, text, path)
 
 
@@ -201,6 +188,46 @@ def parameters_of(root: minidom.Element) -> dict[str, str]:
     for tag in root.getElementsByTagName("default"):
         parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
     return parameters
+
+
+def comment_on_line(element: minidom.Element) -> minidom.Comment | None:
+    """Return the comment behind an element on its line."""
+    node = element.nextSibling
+    if isinstance(node, minidom.Text) and "\n" not in node.data:
+        node = node.nextSibling
+    return node if isinstance(node, minidom.Comment) else None
+
+
+def drop_line(element: minidom.Element) -> None:
+    """Remove an element, the comment on its line, and the space before both."""
+    parent: Any = element.parentNode
+    space = element.previousSibling
+    for node in (comment_on_line(element), space if isinstance(space, minidom.Text) else None, element):
+        if node is not None:
+            parent.removeChild(node)
+
+
+def _drop_repeated(root: minidom.Element) -> None:
+    """Leave one ``<default>`` of each parameter, with its first value, which Mitsuba uses, and its first comment.
+
+    It is the last one, or where a value refers to another parameter, which must be known before, the first one.
+    """
+    values, kept = parameters_of(root), dict[str, minidom.Element]()
+    defaults = list(root.getElementsByTagName("default"))
+    in_order = any("$" in value for value in values.values())
+    for default in defaults if in_order else reversed(defaults):
+        name = default.getAttribute("name")
+        if (one := kept.setdefault(name, default)) is default:
+            default.setAttribute("value", values[name])
+            continue
+        comment, own = comment_on_line(default), comment_on_line(one)
+        drop_line(default)
+        if comment is not None and own is None:
+            parent: Any = one.parentNode
+            for node in (comment, parent.ownerDocument.createTextNode("  ")):
+                parent.insertBefore(node, one.nextSibling)
+        elif comment is not None and own is not None and not in_order:
+            own.data = comment.data
 
 
 def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
@@ -235,17 +262,23 @@ def parse_part(text: str, place: Path | str) -> minidom.Element:
 
 
 def text_of(root: minidom.Element) -> str:
-    """Return the text of a scene without includes in the format of `SceneDocument.text`."""
+    """Return the text of a scene, with the comments above it, and single blank lines."""
     assert root.parentNode is not None
     head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
-    defaults: list[_Default] = []
-    objects = _content(root, defaults)
-    parameters: list[str] = []
-    for default in _unique(defaults):
-        parameters += [*default.above, _element(default.element)[0] + default.same_line]
-    if objects[:1] != [""]:
-        objects.insert(0, "")
-    return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
+    return re.sub(r"[ \t]*\n(?:[ \t]*\n)+", "\n\n", "\n".join([*head, _written(root), ""]))
+
+
+def _written(node: minidom.Node, values: Mapping[int, Mapping[str, str]] | None = None) -> str:
+    """Return the XML of a node; with the attributes of elements by their ids, without parameters and comments."""
+    if not isinstance(node, minidom.Element):
+        text: str = node.toxml() if values is None else "\n" * (node.nodeValue or "").count("\n")
+        return text
+    if values is not None and node.tagName == "default":
+        return ""
+    attributes = node.attributes if values is None else values.get(id(node), {})
+    start = f"<{node.tagName}" + "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
+    content = "".join(_written(child, values) for child in node.childNodes)
+    return f"{start}>{content}</{node.tagName}>" if content else f"{start}/>"
 
 
 def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | None = None) -> minidom.Element:
@@ -279,60 +312,3 @@ def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | N
             parent.insertBefore(node, include)
         parent.removeChild(include)
     return root
-
-
-def _content(parent: minidom.Element, defaults: list[_Default]) -> list[str]:
-    """Return the lines within an element, "" for a blank one, and append its parameters to ``defaults`` instead."""
-    lines: list[str] = []
-    above: list[str] = []
-    latest: _Default | None = None
-    line_breaks = 0
-    for node in parent.childNodes:
-        if not isinstance(node, (minidom.Comment, minidom.Element)):
-            line_breaks += (node.nodeValue or "").count("\n")
-            continue
-        if line_breaks > 1:
-            above.append("")
-        if isinstance(node, minidom.Comment) and line_breaks == 0 and not above and (latest or lines):
-            if latest:
-                latest.same_line += f"  {node.toxml()}"
-            else:
-                lines[-1] += f"  {node.toxml()}"
-        elif isinstance(node, minidom.Comment):
-            above.append(node.toxml())
-        else:
-            latest = None
-            if node.tagName == "default":
-                latest = _Default(node, above)
-                defaults.append(latest)
-            else:
-                lines += [*above, *_element(node, _content(node, defaults))]
-            above = []
-        line_breaks = 0
-    return lines + above
-
-
-def _unique(defaults: list[_Default]) -> list[_Default]:
-    """Return one default per parameter; see `SceneDocument.text` for its place, value and comment."""
-    # A value that refers to another parameter must stay behind the first declaration of that one.
-    in_order = any("$" in item.element.getAttribute("value") for item in defaults)
-    declarations: dict[str, list[_Default]] = {}
-    for item in defaults:
-        name = item.element.getAttribute("name")
-        earlier = declarations.get(name, []) if in_order else declarations.pop(name, [])
-        declarations[name] = [*earlier, item]
-    kept = []
-    for same in declarations.values():
-        first, last = same[0], same[-1]
-        same_line = next((item.same_line for item in same if item.same_line), "")
-        above = first.above if first is last or in_order else [*last.above, *filter(None, first.above)]
-        kept.append(_Default(first.element, above, same_line))
-    return kept
-
-
-def _element(element: minidom.Element, content: Sequence[str] = ()) -> list[str]:
-    """Return the lines of an element with its content indented."""
-    start = f"<{element.tagName}" + "".join(f" {name}={quoteattr(value)}" for name, value in element.attributes.items())
-    if not content:
-        return [f"{start}/>"]
-    return [f"{start}>", *(line and f"    {line}" for line in content), f"</{element.tagName}>"]

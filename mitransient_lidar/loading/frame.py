@@ -74,9 +74,6 @@ def move_to_aim(parsed: Any) -> None:
         elif number in on_seabeds:
             # Texture coordinates of a seabed are its x and y.
             node.props["to_uv"] = _wrapped(_transform(node, "to_uv") @ to_scene, node)
-        # Mitsuba refuses parameters that no plugin has read.
-        for name in list(node.props.keys()):
-            node.props.mark_queried(name, False)
 
 
 def frame_origin(scene: Any) -> FloatArray:

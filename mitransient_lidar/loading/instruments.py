@@ -18,7 +18,15 @@ from xml.dom import minidom
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.document import SceneDocument, parameters_of, parse_part, read_document, text_of
+from mitransient_lidar.loading.document import (
+    SceneDocument,
+    comment_on_line,
+    drop_line,
+    parameters_of,
+    parse_part,
+    read_document,
+    text_of,
+)
 from mitransient_lidar.loading.parameters import without_alternatives
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
@@ -107,11 +115,8 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     """
     path = _path(name)
     own, part = _own_part(path), read_document(path).root
-    assert scene.root.ownerDocument is not None
-    copied = scene.root.ownerDocument.cloneNode(True)
-    assert isinstance(copied, minidom.Document)
-    root = copied.documentElement
-    assert root is not None
+    scene = scene.copied()
+    root = scene.root
     shared = parameters_of(part)
     former = parameters_of(root)
     values = {record: shared[record] for record in _RECORD}
@@ -133,8 +138,10 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
         default = document.createElement("default")
         default.setAttribute("name", key)
         default.setAttribute("value", value)
+        root.insertBefore(document.createTextNode("\n    "), first)
         root.insertBefore(default, first)
         if sources.get(key):
+            root.insertBefore(document.createTextNode("  "), first)
             root.insertBefore(document.createComment(f" {sources[key]} "), first)
     has_integrator = any(tag.parentNode is root for tag in root.getElementsByTagName("integrator"))
     for child in list(part.childNodes):
@@ -142,7 +149,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
             root.appendChild(child)
     _drop_unused(root)
     known = {key: scene.parameters.get(key, value) for key, value in parameters_of(root).items()} | values
-    return replace(scene, root=root, parameters=without_alternatives(known, values), instrument=name, source=None)
+    return replace(scene, parameters=without_alternatives(known, values), instrument=name)
 
 
 def _own_part(path: Path) -> minidom.Element:
@@ -175,17 +182,9 @@ def _named(parent: minidom.Element, name: str) -> list[minidom.Element]:
 def _parameters(root: minidom.Element) -> Iterator[InstrumentParameter]:
     """Yield the parameters of an instrument's file, with the comments on their lines."""
     for default in root.getElementsByTagName("default"):
-        comment = _comment(default)
+        comment = comment_on_line(default)
         text = "" if comment is None else " ".join(comment.data.split())
         yield InstrumentParameter(default.getAttribute("name"), default.getAttribute("value"), text)
-
-
-def _comment(element: minidom.Element) -> minidom.Comment | None:
-    """Return the comment behind an element on its line."""
-    node = element.nextSibling
-    if isinstance(node, minidom.Text) and "\n" not in node.data:
-        node = node.nextSibling
-    return node if isinstance(node, minidom.Comment) else None
 
 
 def _drop_unused(root: minidom.Element) -> None:
@@ -193,10 +192,7 @@ def _drop_unused(root: minidom.Element) -> None:
     used = SceneDocument("", root, parameters=parameters_of(root)).used
     for default in root.getElementsByTagName("default"):
         if default.getAttribute("name") not in used:
-            assert default.parentNode is not None
-            if (comment := _comment(default)) is not None:
-                default.parentNode.removeChild(comment)
-            default.parentNode.removeChild(default)
+            drop_line(default)
 
 
 def _path(name: str) -> Path:

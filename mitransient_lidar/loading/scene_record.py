@@ -213,28 +213,27 @@ def json_attribute(attributes: Mapping[str, Any], name: str) -> Any:
     return parse_json(attributes[name], f"the attribute {name} of the result")
 
 
-def plugin_values(scene: mi.Scene, integrator: Any = None, used: Mapping[str, float] | None = None) -> str:
-    """Return the attribute ``plugin_parameters`` of a loaded scene, with another integrator than its own.
+#: Objects, and the values that were chosen for their automatic parameters.
+Used = Sequence[tuple[Any, Mapping[str, float]]]
 
-    `used` are the values that were chosen for automatic parameters of the integrator.
-    """
+
+def plugin_values(scene: mi.Scene, integrator: Any = None, used: Used = ()) -> str:
+    """Return the attribute ``plugin_parameters`` of a loaded scene, with another integrator than its own."""
     from mitransient_lidar.plugins.bases import exposed
 
     own = scene.integrator()
     integrator = own if integrator is None else integrator
     origin = frame_origin(scene)
-    described = {} if integrator is None else {"integrator": object_values(integrator)}
-    if used:
-        described["integrator"]["used"] = dict(used)
+    described = {} if integrator is None else {"integrator": object_values(integrator, used=used)}
     objects = [(name, part) for name, part in exposed(scene)[1] if part is not own]
-    return json.dumps({**described, **_named(objects, origin)})
+    return json.dumps({**described, **_named(objects, origin, used)})
 
 
-def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray) -> dict[str, Any]:
+def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray, used: Used) -> dict[str, Any]:
     """Return the parameters of objects by their ids or names, else by the names of their plugins."""
     described: dict[str, Any] = {}
     for given, part in objects:
-        values = object_values(part, origin)
+        values = object_values(part, origin, used)
         name = str(part.id() or given)
         # Mitsuba numbers objects without a name: _arg_0, object_1398.
         name = str(values.get("type", values.get("class"))) if re.match(r"_|object_\d", name) else name
@@ -243,7 +242,7 @@ def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray) -> dict
     return described
 
 
-def object_values(part: mi.Object, origin: FloatArray = _ORIGIN) -> dict[str, Any]:
+def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()) -> dict[str, Any]:
     """Return the parameters of an object, and its nested objects, in types of JSON.
 
     `origin` is the place of the frame's origin in the scene [m]: places are in the scene.
@@ -261,13 +260,14 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN) -> dict[str, An
             small = {name: _in_scene(name, value, origin) for name, value in small.items()}
         # Members of a group lie about their instances.
         inner = _ORIGIN if part.class_name() == "ShapeGroup" else origin
-        return {"class": part.class_name(), **small, **_named(objects, inner)}
+        return {"class": part.class_name(), **small, **_named(objects, inner, used)}
     own = part.parameters
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known = ["type", *(each.name for each in PLUGINS[str(own["type"])] if each.name.isidentifier())]
-    used = {"used": part.used_values} if isinstance(part, Automatic) and part.used_values else {}
-    return {**dict.fromkeys(known), **plain, **used, **_named(objects, origin)}
+    values = part.used_values if isinstance(part, Automatic) else next((two for one, two in used if one is part), {})
+    chosen = {"used": dict(values)} if values else {}
+    return {**dict.fromkeys(known), **plain, **chosen, **_named(objects, origin, used)}
 
 
 def _in_scene(name: str, value: Any, origin: FloatArray) -> Any:

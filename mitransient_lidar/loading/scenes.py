@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from xml.dom import minidom
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
 from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
@@ -21,40 +23,79 @@ from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+    from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
+    from mitransient_lidar.transport.scene import LidarScene
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class LoadedScene:
     """A loaded scene, its name, the parameters of an XML scene with their values as text, and what loads it again.
 
-    The record is None for a scene from loaded objects.
+    The record is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
     """
 
     scene: mi.Scene
     name: str
     parameters: dict[str, str]
-    record: SceneRecord | None
+    record: SceneRecord | None = None
+    sensor_id: str = ""
 
+    @cached_property
+    def sensor(self) -> mi.Sensor:
+        """The receiver; raise UserError if the scene has none, or none of that id."""
+        from mitransient_lidar.transport.scene_parts import lidar_sensor
 
-def load_scene(
-    scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None
-) -> tuple[mi.Scene, str, dict[str, str]]:
-    """Return scene, name and parameters of `load`, which also gives parameters and errors."""
-    loaded = load(scene, params, instrument)
-    return loaded.scene, loaded.name, loaded.parameters
+        return lidar_sensor(self.scene, self.sensor_id or (self.record.sensor if self.record else ""))
+
+    def attributes(
+        self,
+        lidar: LidarScene | None = None,
+        integrator: LidarIntegrator | DaylightIntegrator | None = None,
+        used: Mapping[str, float] | None = None,
+        **others: Any,
+    ) -> dict[str, Any]:
+        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
+
+        ``record_end`` is what the last light of a record of automatic length comes from. `used` are the values that
+        were chosen for automatic parameters of the integrator.
+        """
+        recorded = {} if self.record is None else self.record.attributes()
+        own = {} if integrator is None else {"integrator": integrator.plugin}
+        chosen: list[Any] = [(integrator or self.scene.integrator(), used or {})]
+        if lidar is not None:
+            film = self.sensor.film()
+            bins = {"time_start_ns": lidar.axis.start_ns, "bin_count": lidar.axis.bin_count}
+            chosen.append((film, {name: value for name, value in bins.items() if getattr(film, name) is None}))
+            own |= {"record_end": lidar.record_end} if lidar.record_end else {}
+        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, chosen)
+        return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
+
+    def tell_axis(self, axis: TimeAxis, end: str) -> None:
+        """Log time bins, and what ends them, where the film leaves their start or number to the scene."""
+        if self.sensor.film().axis is None:
+            text = f"record: {axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
+            logger.info("%s%s", text, f"; it ends {end}" if end else "")
 
 
 @alone_with_scene
-def load(
+def open_scene(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
+    *,
+    variant: str | None = None,
     model: mi.Scene | None = None,
+    sensor: str | None = None,
 ) -> LoadedScene:
     """Load a scene.
 
@@ -62,28 +103,35 @@ def load(
     ----------
     scene
         Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
-        scene.
+        scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
     params
         Values for the ``<default>`` parameters of an XML scene, and of the instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
+    variant
+        Mitsuba variant, as for `variants.set_variant`.
     model
         Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
+    sensor
+        Id of a receiver, by default that of a record, or the first one.
 
     Raises
     ------
     UserError
-        If there is no such scene or instrument, a parameter is unknown, not used or empty, a value is invalid, a part
-        is missing, or a file of a record is missing or has changed.
+        If there is no such scene, instrument or receiver, a parameter is unknown, not used or empty, a value is
+        invalid, a part is missing, or a file of a record is missing or has changed.
     """
+    if isinstance(scene, LoadedScene) and not params and not sensor:
+        return scene
+    variants.set_variant(variant)
     import mitsuba as mi
 
-    from mitransient_lidar.transport.scene_parts import fit_seas
+    from mitransient_lidar.transport.scene_parts import fit_seas, lidar_sensor
 
     check_params(params)
     if isinstance(scene, mi.Scene):
         _no_parameters(params, instrument, "a loaded scene")
-        loaded = LoadedScene(scene, scene.id() or "scene", {}, None)
+        loaded = LoadedScene(scene, scene.id() or "scene", {})
     elif isinstance(scene, Mapping) or (isinstance(scene, SceneRecord) and not scene.is_xml):
         _no_parameters(params, instrument, "a dict")
         loaded = _load_dict(scene)
@@ -92,7 +140,59 @@ def load(
     else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     fit_seas(loaded.scene, model)
+    if sensor:
+        record = loaded.record and replace(loaded.record, sensor=sensor)
+        loaded = replace(loaded, record=record, sensor_id=lidar_sensor(loaded.scene, sensor).id())
     return loaded
+
+
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[False] = False) -> LidarIntegrator: ...
+
+
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[True]) -> DaylightIntegrator: ...
+
+
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator | DaylightIntegrator:
+    """Return an integrator from its name, a dict or itself, by default that of the scene.
+
+    For `passive` the default is ``passive_volpath`` if that of the scene is not one for daylight.
+
+    Raises
+    ------
+    UserError
+        If it is not a lidar integrator, or for `passive`, not one for daylight.
+    """
+    import mitsuba as mi
+
+    from mitransient_lidar.transport.passes import LidarIntegrator
+
+    own = scene.integrator()
+    if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):
+        wanted = "passive_volpath"
+    if wanted is None:
+        chosen = own
+    elif isinstance(wanted, mi.Integrator):
+        chosen = wanted
+    else:
+        if not isinstance(wanted, (str, Mapping)):
+            raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
+        given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
+        check_dict(given)
+        # The files of objects in it, which no integrator of ours has, are checked as well.
+        SceneRecord.of_dict(given)
+        with as_user_error():
+            chosen = mi.load_dict(given, parallel=False)
+    if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
+        raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
+    if not isinstance(chosen, LidarIntegrator):
+        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
+    if passive and not chosen.passive:
+        raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")
+    if chosen.passive and not passive:
+        raise UserError(f"integrator: {chosen.plugin} has no laser; use a lidar integrator, or render_passive")
+    return chosen
 
 
 def read_record(
@@ -105,7 +205,7 @@ def read_record(
 
     Its parameters have the values of the scene and the instrument. Where the scene has an origin in map coordinates
     [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments, and
-    errors, are those of `load`, but for what only loading finds.
+    errors, are those of `open_scene`, but for what only loading finds.
     """
     check_params(params)
     document = _document(scene, instrument)
@@ -116,31 +216,25 @@ def read_record(
 
 def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> SceneDocument:
     """Return a scene whose seabeds with a map in map coordinates have an ``origin_x`` and ``origin_y`` [m]."""
-    assert document.root.ownerDocument is not None
-    copied = document.root.ownerDocument.cloneNode(True)
-    assert isinstance(copied, minidom.Document)
-    assert copied.documentElement is not None
-    changed = replace(document, root=copied.documentElement, source=None)
+    changed, placed = document.copied(), False
     seabeds = {id(one.element) for one in changed.settings if one.attribute == "type" and one.value == "seabed"}
-    maps = [
-        one.element.parentNode
-        for one in changed.settings
-        if one.owner == "filename" and Path(one.value).suffix.lower() in IN_MAP_COORDINATES
-    ]
-    placed = False
-    for seabed in maps:
-        if not isinstance(seabed, minidom.Element) or id(seabed) not in seabeds:
+    for setting in changed.settings:
+        seabed: Any = setting.element.parentNode
+        if setting.owner != "filename" or Path(setting.value).suffix.lower() not in IN_MAP_COORDINATES:
+            continue
+        if id(seabed) not in seabeds:
             continue
         names = [child.getAttribute("name") for child in seabed.getElementsByTagName("float")]
         if "origin_x" in names or "origin_y" in names:
             continue
         placed = True
         for name, value in zip(("origin_x", "origin_y"), origin, strict=True):
-            number = copied.createElement("float")
+            number = seabed.ownerDocument.createElement("float")
             number.setAttribute("name", name)
             number.setAttribute("value", repr(value))
             seabed.appendChild(number)
-    return changed if placed else document
+    # Settings of the copy are those before its change.
+    return replace(changed) if placed else document
 
 
 def _document(scene: SceneRecord | str | os.PathLike[str], instrument: str | None) -> SceneDocument:
@@ -180,7 +274,7 @@ def _load_xml(
     record = SceneRecord.of_document(document, scene if isinstance(scene, SceneRecord) else None)
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
-        loaded = _instantiate(lambda config: _with_dollars(mi.parser.parse_string(config, text)))
+        loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, dict(document.parameters), record)
@@ -210,26 +304,22 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     config.merge_equivalent = config.merge_meshes = config.parallel = False
     parsed = parse(config)
     for node in parsed.nodes:
-        for name in FILE_PARAMETERS:
-            if name in node.props and isinstance(node.props[name], (bool, int, float)):
-                raise UserError(f"{name} = {node.props[name]} must be a text, the name of a file")
-        if node.props.plugin_name() == "ocean_surface":
-            node.props[WAITS] = True
+        props = node.props
+        for name in list(props.keys()):
+            value = props[name]
+            if name in FILE_PARAMETERS and isinstance(value, (bool, int, float)):
+                raise UserError(f"{name} = {value} must be a text, the name of a file")
+            if isinstance(value, str) and DOLLAR in value:
+                props[name] = value.replace(DOLLAR, "$")
+        if props.plugin_name() == "ocean_surface":
+            props[WAITS] = True
     mi.parser.transform_all(config, parsed)
     move_to_aim(parsed)
-    return mi.parser.instantiate(config, parsed)
-
-
-def _with_dollars(parsed: Any) -> Any:
-    """Return a scene that is parsed, with dollar signs in its texts in place of `DOLLAR`."""
+    # Mitsuba refuses parameters that no plugin has read.
     for node in parsed.nodes:
         for name in list(node.props.keys()):
-            value = node.props[name]
-            if isinstance(value, str) and DOLLAR in value:
-                node.props[name] = value.replace(DOLLAR, "$")
-            # Mitsuba refuses parameters that no plugin has read.
             node.props.mark_queried(name, False)
-    return parsed
+    return mi.parser.instantiate(config, parsed)
 
 
 @contextlib.contextmanager

@@ -116,7 +116,7 @@ def truth_statistics(one: Estimate) -> str:
 def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the estimates of a series of shots against the truth, with their standard errors if known.
 
-    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series of `rendering.shot_series.render_shots`.
+    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series of `rendering.shots.series.render_shots`.
 
     Raises
     ------

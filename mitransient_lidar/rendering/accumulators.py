@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -14,8 +14,13 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.physics.lidar.pulse import waveform
-from mitransient_lidar.rendering.accuracy import ErrorCorrelation, ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.accuracy import (
+    ErrorCorrelation,
+    ErrorWindow,
+    LightStatistics,
+    PassStatistics,
+    received_power,
+)
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
 
@@ -43,33 +48,139 @@ _ERROR_PIXELS = 4096
 _LIT = 0.05
 
 
-class PassAccumulator(ABC):
-    """Means and standard errors over the passes of a render, with gates or without."""
+class Light:
+    """Light of passes: the whole, its parts by origin, and perturbed by parameters.
 
-    #: Gates that a pass accumulates instead of time bins, or None.
-    gate_weights: GateWeights | None = None
+    Energies have the shape (pixels, origins, bins), or of several shots (shots, pixels, origins, bins).
+    """
 
-    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
-        self.scene, self.window, self.train = scene, window, train
-        self.gates = PassStatistics()
+    def __init__(self, scene: LidarScene, separate: bool) -> None:
+        self._scene, self._separate = scene, separate
+        self.whole, self.parts, self.perturbed = LightStatistics(), LightStatistics(), LightStatistics()
+
+    def add(self, energy: FloatArray, perturbed: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Add the energies [J] of one pass, and of perturbations with one axis more; return the whole and its power."""
+        whole = energy.sum(axis=-2)
+        if self._separate:
+            power_of_parts = self._power_of(energy)
+            self.parts.add(energy, power_of_parts)
+        # Many shots share the convolutions of their parts.
+        shared = self._separate and energy.ndim > 3
+        power = power_of_parts.sum(axis=-2) if shared else self._power_of(whole)
+        self.whole.add(whole, power)
+        if perturbed is not None:
+            changed = perturbed.sum(axis=-2)
+            self.perturbed.add(changed, self._power_of(changed))
+        return whole, power
+
+    @functools.cached_property
+    def _power_of(self) -> Callable[[FloatArray], FloatArray]:
+        """Power [W] of energies [J per bin], after the pulse and the receiver's response."""
+        return received_power(self._scene)
 
     @property
-    @abstractmethod
+    def arrays(self) -> tuple[FloatArray, ...]:
+        """Mean energy [J] and power [W] of the whole, each with its standard error, as of `LightStatistics`."""
+        mean, error, power, power_error = self.whole.arrays
+        if self._separate:
+            # The whole is the sum of its parts to the bit.
+            mean, power = (part.mean.sum(axis=-2) for part in (self.parts.energy, self.parts.power))
+        return mean, error, power, power_error
+
+
+class PassAccumulator:
+    """Means and standard errors over the passes of a render: of all light, or of gates alone.
+
+    Parameters
+    ----------
+    scene, window
+        The scene, and the bins whose errors count.
+    train
+        Gates at their times, or None.
+    origins
+        Names of the origins of light that is separated.
+    parameters, differences
+        Parameters by which light is differentiated, and those of them that are from central differences.
+    batches
+        Number of batches of passes whose power is kept.
+    kept
+        Whether ``histograms`` are kept, ``gates`` are cut from the histogram of each pass, or ``direct``: accumulated
+        in the pass.
+    """
+
+    def __init__(
+        self,
+        scene: LidarScene,
+        window: ErrorWindow,
+        train: GateTrain | None = None,
+        origins: Sequence[str] = (),
+        parameters: Sequence[Parameter] = (),
+        differences: Differences | None = None,
+        batches: int = 0,
+        kept: Literal["histograms", "gates", "direct"] = "histograms",
+    ) -> None:
+        self.scene, self.window, self.train, self._kept = scene, window, train, kept
+        self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
+        self._origins, self._parameters = list(origins), list(parameters)
+        self._scores = sum(one.perturbation is not None for one in self._parameters)
+        self._differences = differences
+        self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
+        self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
+        #: Gates that a pass accumulates instead of time bins, or None.
+        self.gate_weights: GateWeights | None = None
+        self._weights: FloatArray | None = None
+        if train is None:
+            return
+        pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
+        if kept == "direct":
+            from mitransient_lidar.transport.histogram import GateWeights
+
+            self.gate_weights = GateWeights(train, train.response_weights(pulse, response), scene.reference_length)
+        else:
+            # Weights of the bins in gates, shape (bin, gate).
+            weights = train.bin_weights(pulse, response, scene.axis)
+            self._weights = weights if kept == "histograms" else weights.astype(np.float32)
+        if differences is not None:
+            differences.cut(train)
+
+    @property
+    def _received(self) -> PassStatistics:
+        """Statistics of all energy that is kept; that in gates is added up where they overlap."""
+        return self._light.whole.energy if self._kept == "histograms" else self.gates
+
+    @property
     def received(self) -> float:
-        """Energy received in all passes [J]."""
+        """Energy received in all passes, or in their gates [J]."""
+        return float(np.nansum(self._received.mean)) * self._received.count
 
-    @property
-    @abstractmethod
-    def is_empty(self) -> bool:
-        """Whether no light was received in any pass; values that are not finite count as light."""
-
-    @abstractmethod
     def add(self, histogram: TransientHistogram) -> None:
         """Add the histogram of a pass."""
+        pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
+        if self._kept == "direct":
+            self.gates.add(histogram.energy().reshape(pixels, -1))
+            return
+        if self._kept == "gates":
+            assert self._weights is not None
+            # The sums of one pass in 32 bits, those over the passes in 64.
+            self.gates.add((histogram.rounded_energy().reshape(pixels, -1) @ self._weights).astype(np.float64))
+            return
+        perturbed = None
+        if self._scores:
+            perturbed = histogram.perturbed()
+            perturbed = perturbed.reshape(len(perturbed), pixels, classes, -1)
+            if self._weights is not None:
+                self._gate_slopes.add(perturbed[: self._scores].sum(axis=2) @ self._weights)
+        energy, power = self._light.add(histogram.energy().reshape(pixels, classes, -1), perturbed)
+        self._correlation.add(power)
+        if self._batches:
+            number = (self._light.whole.power.count - 1) % len(self._batches)
+            self._batches[number] = self._batches[number] + power
+        if self._weights is not None:
+            self.gates.add(energy @ self._weights)
 
     def require_light(self, passes: int) -> None:
-        """Raise UserError if the record of all passes is empty."""
-        if self.is_empty:
+        """Raise UserError if the record of all passes is empty; values that are not finite count as light."""
+        if not np.any(self._received.mean):
             axis = self.scene.axis
             raise UserError(
                 f"no light returned between {axis.start_ns:g} and {axis.end_ns:g} ns in {passes} passes: beam and "
@@ -77,12 +188,14 @@ class PassAccumulator(ABC):
             )
 
     def errors(self) -> FloatArray:
-        """Return the relative standard errors of which the 95th percentile is compared with the target.
+        """Return the relative standard errors whose quantile is compared with the target, of bins or gates.
 
         That of a gate is the median over its lit pixels, for gates with their middle between the surface echo and the
         end of the bottom echo of a pixel.
         """
-        middles = self._train.middles_ns
+        if self.train is None:
+            return self.window.relative_errors(self._light.whole.power.mean, self._light.whole.power.stderr)
+        middles = self.train.middles_ns
         start, end = float(self.window.start_ns.min()), float(self.window.end_ns.max())
         chosen = np.flatnonzero((middles >= start) & (middles <= end))
         found: list[float] = []
@@ -95,108 +208,15 @@ class PassAccumulator(ABC):
             found.append(float(np.median(stderr[lit] / energy[lit])) if lit.any() else np.inf)
         return np.array(found)
 
-    @abstractmethod
     def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
-        """Return the labelled result."""
-
-    @property
-    def _train(self) -> GateTrain:
-        assert self.train is not None
-        return self.train
-
-    def _gate_stack(self, coords: Mapping[Any, Any], attributes: dict[str, Any]) -> xr.Dataset:
-        """Return the labelled gates."""
+        """Return the labelled result; gates are two more variables, or all."""
         pixels = self.scene.receiver.pixels
-        shape = (*(pixels.grid or (pixels.count,)), self._train.count)
-        mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
-        if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
-            logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
-        return build_gates(mean, stderr, self._train, coords=coords, attributes=attributes)
-
-
-class WaveformAccumulator(PassAccumulator):
-    """Statistics of energy and power in every bin, and of the gates cut from them."""
-
-    def __init__(
-        self,
-        scene: LidarScene,
-        window: ErrorWindow,
-        train: GateTrain | None,
-        origins: Sequence[str] = (),
-        parameters: Sequence[Parameter] = (),
-        differences: Differences | None = None,
-        batches: int = 0,
-    ) -> None:
-        super().__init__(scene, window, train)
-        response = scene.receiver.optics.response_time_ns
-        self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
-        self._energy, self._power, self._correlation = PassStatistics(), PassStatistics(), ErrorCorrelation()
-        self._origins, self._parameters = list(origins), list(parameters)
-        self._perturbed, self._differences = (PassStatistics(), PassStatistics()), differences
-        self._scores = sum(one.perturbation is not None for one in self._parameters)
-        self._parts = PassStatistics(), PassStatistics()
-        self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
-        self._weights = None if train is None else _weights(scene, train)
-        self._gate_slopes = PassStatistics()
-        if differences is not None and train is not None:
-            differences.cut(train)
-
-    @property
-    def received(self) -> float:
-        """Energy received in all passes [J]."""
-        return float(np.nansum(self._energy.mean)) * self._energy.count
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no light was received in any pass."""
-        return not np.any(self._energy.mean)
-
-    def add(self, histogram: TransientHistogram) -> None:
-        """Add the histogram of a pass."""
-        energy = histogram.energy()
-        if self._origins:
-            parts = energy.reshape(self.scene.receiver.pixels.count, len(self._origins), -1)
-            self._parts[0].add(parts)
-            self._parts[1].add(waveform(parts, self.scene.axis.bin_width_ns, self._kernel))
-            energy = parts.sum(axis=1)
-        if self._scores:
-            perturbed, classes = histogram.perturbed(), max(len(self._origins), 1)
-            shape = len(perturbed), self.scene.receiver.pixels.count, classes, -1
-            perturbed = perturbed.reshape(shape).sum(axis=2)
-            self._perturbed[0].add(perturbed)
-            self._perturbed[1].add(waveform(perturbed, self.scene.axis.bin_width_ns, self._kernel))
-            if self._weights is not None:
-                self._gate_slopes.add(perturbed @ self._weights)
-        energy = energy.reshape(self.scene.receiver.pixels.count, -1)
-        power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
-        self._energy.add(energy)
-        self._power.add(power)
-        self._correlation.add(power)
-        if self._batches:
-            number = (self._power.count - 1) % len(self._batches)
-            self._batches[number] = self._batches[number] + power
-        if self._weights is not None:
-            self.gates.add(energy @ self._weights)
-
-    def errors(self) -> FloatArray:
-        """Return the relative standard errors of the gates, or without gates of the bins in the window."""
-        if self.train is not None:
-            return super().errors()
-        return self.window.relative_errors(self._power.mean, self._power.stderr)
-
-    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
-        """Return the labelled result; gates are two more variables."""
-        axis, pixels = self.scene.axis, self.scene.receiver.pixels
-        means = self._energy.mean, self._power.mean
-        if self._origins:
-            # The whole is the sum of its parts to the bit.
-            means = tuple(part.mean.sum(axis=1) for part in self._parts)
+        if self._kept != "histograms":
+            coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
+            return self._gate_stack(coords, results.provenance(attributes))
         built = results.build(
-            means[0],
-            self._energy.stderr,
-            means[1],
-            self._power.stderr,
-            time=axis,
+            *self._light.arrays,
+            time=self.scene.axis,
             pixel_names=pixels.names,
             pixel_centres_mrad=1e3 * pixels.centres(),
             grid=pixels.grid,
@@ -205,13 +225,14 @@ class WaveformAccumulator(PassAccumulator):
         if (measured := self._correlation.over(built["time"].values)) is not None:
             built = with_correlation(built, *measured)
         if self._origins:
-            arrays = (values for part in self._parts for values in (part.mean, part.stderr))
-            built = results.add_components(built, self._origins, *arrays)
+            built = results.add_components(built, self._origins, *self._light.parts.arrays)
+        perturbed = self._light.perturbed.arrays
         if self._parameters:
-            about = ([getattr(one, name) for one in self._parameters] for name in ("name", "value", "units", "method"))
-            built = results.add_derivatives(built, *about, *self._derivatives())
+            of_paths = [values[: self._scores] for values in perturbed] if self._scores else []
+            others = () if self._differences is None else self._differences.light.arrays
+            built = results.add_derivatives(built, *described(self._parameters), *self._joined(of_paths, others))
         if self._batches:
-            count, batches = self._power.count, len(self._batches)
+            count, batches = self._light.whole.power.count, len(self._batches)
             passes = [len(range(number, count, batches)) for number in range(min(batches, count))]
             batch_means = [total / number for total, number in zip(self._batches, passes, strict=False)]
             built = results.add_batches(built, passes, batch_means)
@@ -219,22 +240,21 @@ class WaveformAccumulator(PassAccumulator):
             return built
         stack = self._gate_stack(built.coords, dict(built.attrs))
         if self._parameters:
-            stack = add_gate_derivatives(stack, *self._gate_derivatives())
+            of_paths = [self._gate_slopes.mean, self._gate_slopes.stderr] if self._scores else []
+            differences = self._differences
+            others = () if differences is None else (differences.gates.mean, differences.gates.stderr)
+            stack = add_gate_derivatives(stack, *self._joined(of_paths, others))
         return built.merge(stack, combine_attrs="override").assign_attrs(stack.attrs)
 
-    def _derivatives(self) -> list[FloatArray]:
-        """Return derivatives of energy and power and their standard errors, in the order of the parameters."""
-        of_paths = [values for part in self._perturbed for values in (part.mean, part.stderr)] if self._scores else []
-        one = self._differences
-        others = [] if one is None else [one.impulse_response, one.impulse_response_stderr]
-        others += [] if one is None else [one.waveform, one.waveform_stderr]
-        return self._joined(of_paths, others)
-
-    def _gate_derivatives(self) -> list[FloatArray]:
-        """Return derivatives of the energy in gates and their standard errors, in the order of the parameters."""
-        of_paths = [self._gate_slopes.mean, self._gate_slopes.stderr] if self._scores else []
-        one = self._differences
-        return self._joined(of_paths, [] if one is None else [one.gates, one.gates_stderr])
+    def _gate_stack(self, coords: Mapping[Any, Any], attributes: dict[str, Any]) -> xr.Dataset:
+        """Return the labelled gates."""
+        assert self.train is not None
+        pixels = self.scene.receiver.pixels
+        shape = (*(pixels.grid or (pixels.count,)), self.train.count)
+        mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
+        if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
+            logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
+        return build_gates(mean, stderr, self.train, coords=coords, attributes=attributes)
 
     def _joined(self, of_paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> list[FloatArray]:
         """Return arrays of the parameters with scores and of the others in the order of the parameters."""
@@ -244,43 +264,9 @@ class WaveformAccumulator(PassAccumulator):
         return [np.concatenate([part for part in pair if part is not None])[order] for pair in pairs]
 
 
-class GateAccumulator(PassAccumulator):
-    """Statistics of gates only, cut from the histogram of each pass or accumulated in the pass."""
-
-    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain, direct: bool) -> None:
-        super().__init__(scene, window, train)
-        self._weights = None if direct else _weights(scene, train).astype(np.float32)
-        if direct:
-            from mitransient_lidar.transport.histogram import GateWeights
-
-            response = scene.receiver.optics.response_time_ns
-            table = train.response_weights(scene.transmitter.pulse, response)
-            self.gate_weights = GateWeights(train, table, scene.reference_length)
-
-    @property
-    def received(self) -> float:
-        """Energy in the gates of all passes [J], added up where gates overlap."""
-        return float(np.nansum(self.gates.mean)) * self.gates.count
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no light was received in the gates."""
-        return not np.any(self.gates.mean)
-
-    def add(self, histogram: TransientHistogram) -> None:
-        """Add the histogram of a pass."""
-        count = self.scene.receiver.pixels.count
-        if self._weights is None:
-            self.gates.add(histogram.energy().reshape(count, -1))
-        else:
-            # The sums of one pass in 32 bits, those over the passes in 64.
-            self.gates.add((histogram.rounded_energy().reshape(count, -1) @ self._weights).astype(np.float64))
-
-    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
-        """Return the labelled gates."""
-        pixels = self.scene.receiver.pixels
-        coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
-        return self._gate_stack(coords, results.provenance(attributes))
+def described(parameters: Sequence[Parameter]) -> list[list[Any]]:
+    """Return names, values, units and methods of parameters, as `results.add_derivatives` takes them."""
+    return [[getattr(one, name) for one in parameters] for name in ("name", "value", "units", "method")]
 
 
 def choose_accumulator(
@@ -315,25 +301,22 @@ def choose_accumulator(
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
-        return WaveformAccumulator(scene, window, train, origins, parameters, differences, batches)
-    size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
+        return PassAccumulator(scene, window, train, origins, parameters, differences, batches)
+    cure = "take fewer of them"
     if origins:
-        size = size.replace(" takes", f" x {len(origins)} components takes")
-        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer bins or pixels")
-    if batches:
-        size = size.replace(" takes", f" with {batches} batches of passes takes")
-        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer of them")
-    if channels > 1:
-        size = size.replace(" takes", f" x {channels} with derivatives takes")
-        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer of them")
-    if train is None:
-        raise UserError(
-            f"{size}: more than max_memory = {max_memory:g} GB allows; "
-            "take fewer bins or pixels, or gates (gate_count), which do not need it"
-        )
+        of_what, cure = f" x {len(origins)} components", "take fewer bins or pixels"
+    elif batches:
+        of_what = f" with {batches} batches of passes"
+    elif channels > 1:
+        of_what = f" x {channels} with derivatives"
+    else:
+        of_what, cure = "", "take fewer bins or pixels, or gates (gate_count), which do not need it"
+    size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins{of_what} takes {1e-9 * everything:.2g} GB"
+    if of_what or train is None:
+        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; {cure}")
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit:
         logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
-        return GateAccumulator(scene, window, train, direct=False)
+        return PassAccumulator(scene, window, train, kept="gates")
     each = (per_bin + _BYTES_PER_KEPT_GATE) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
@@ -343,7 +326,7 @@ def choose_accumulator(
             f"{1e-9 * each * train.count:.2g} GB, so allow that much, or fewer gates or pixels"
         )
     logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
-    return GateAccumulator(scene, window, train, direct=True)
+    return PassAccumulator(scene, window, train, kept="direct")
 
 
 def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
@@ -361,8 +344,3 @@ def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -
     echo = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": start_ns}
     check_train(train, echo, scene.axis)
     return train
-
-
-def _weights(scene: LidarScene, train: GateTrain) -> FloatArray:
-    """Return the weights of the bins of a scene in gates, shape (bin, gate)."""
-    return train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pulse import waveform
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.scene import LidarScene
 
 #: Pixels darker than this fraction of the median are excluded from the errors of radiance.
 _DARK_PIXEL = 1e-2
@@ -45,6 +52,32 @@ class PassStatistics:
         if self.count < 2:
             return np.full_like(self._squares[part], np.nan)
         return np.asarray(np.sqrt(self._squares[part] / (self.count - 1) / self.count))
+
+
+class LightStatistics:
+    """Means and standard errors of the energy [J per bin] and the power [W] of light; bins are the last axis."""
+
+    def __init__(self) -> None:
+        self.energy, self.power = PassStatistics(), PassStatistics()
+
+    def add(self, energy: FloatArray, power: FloatArray) -> None:
+        """Add the light of one pass."""
+        self.energy.add(energy)
+        self.power.add(power)
+
+    @property
+    def arrays(self) -> tuple[FloatArray, ...]:
+        """Mean energy, its standard error, mean power, and its standard error; none before the first pass."""
+        if self.energy.count == 0:
+            return ()
+        return self.energy.mean, self.energy.stderr, self.power.mean, self.power.stderr
+
+
+def received_power(scene: LidarScene) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from energies [J per bin] to powers [W], after the pulse and the receiver's response."""
+    width_ns = scene.axis.bin_width_ns
+    kernel = scene.transmitter.pulse.kernel(width_ns, scene.receiver.optics.response_time_ns)
+    return functools.partial(waveform, bin_width_ns=width_ns, kernel=kernel)
 
 
 class RatioStatistics:
@@ -162,13 +195,17 @@ class ErrorWindow:
     time_ns: FloatArray
 
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
-        """Return the relative standard errors of a waveform, shape (pixels, time), infinite where it is 0.
+        """Return the relative standard errors of a waveform, infinite where it is 0.
 
-        Pixels with less than a thousandth of the energy of the brightest one are excluded.
+        Waveform and standard error have the shape (pixels, time), or of several shots (shots, pixels, time). Pixels
+        with less than a thousandth of the energy of the brightest one are excluded.
         """
+        shots = 1 if waveform.ndim == 2 else len(waveform)
+        waveform, stderr = (values.reshape(-1, values.shape[-1]) for values in (waveform, stderr))
+        start_ns, end_ns = (np.tile(limit, shots)[:, None] for limit in (self.start_ns, self.end_ns))
         energy = waveform.sum(axis=1)
         lit = energy > 1e-3 * energy.max(initial=0.0)
-        inside = (self.time_ns >= self.start_ns[:, None]) & (self.time_ns <= self.end_ns[:, None])
+        inside = (self.time_ns >= start_ns) & (self.time_ns <= end_ns)
         chosen = inside & lit[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = stderr[chosen] / waveform[chosen]

@@ -71,7 +71,7 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     Parameters
     ----------
     result
-        Dataset of `render.render`, `passive.render_passive` or `shot_series.render_shots`, or its file.
+        Dataset of `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
     options
         Options of that function which replace those of the result, unless they are None; its parameters are added to
         those of the scene.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,14 +11,11 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
-from mitransient_lidar.core.validation import FloatArray, integer, positive
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.physics.lidar.pulse import waveform
-from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import Session, open_scene
+from mitransient_lidar.rendering.accuracy import LightStatistics, PassStatistics, received_power
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import LidarIntegrator, PassRenderer
@@ -41,27 +38,24 @@ _NO_QUANTITIES = ("time_start_ns", "bin_width_ns", "bin_count", "pulses")
 _NO_QUANTITY_STARTS, _NO_QUANTITY_ENDS = ("gate_",), ("_seed", "_count")
 
 
-@dataclass(frozen=True)
 class _Side:
-    """A scene with a parameter beside its value: renderer, kernel of pulse and response, weights of bins in gates."""
+    """A scene with a parameter beside its value."""
 
-    renderer: PassRenderer
-    kernel: tuple[int, FloatArray]
-    weights: FloatArray | None = None
+    def __init__(self, renderer: PassRenderer) -> None:
+        self._renderer, self._power_of = renderer, received_power(renderer.scene)
+        self._weights: FloatArray | None = None
 
-    def with_gates(self, train: GateTrain) -> _Side:
-        """Return the scene with the weights of its bins in gates."""
-        scene = self.renderer.scene
-        pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
-        return replace(self, weights=train.bin_weights(pulse, response, scene.axis))
+    def cut(self, train: GateTrain) -> None:
+        """Return the energy in gates from now on, too."""
+        scene = self._renderer.scene
+        self._weights = train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)
 
     def render(self, seed: int, share: float) -> list[FloatArray]:
         """Return energy [J] and power [W] of one pass, shape (pixel, time), and that in gates [J], (pixel, gate)."""
-        scene = self.renderer.scene
-        fitted = self.renderer if share == 1 else self.renderer.scaled(share)
-        energy = fitted.render_pass(seed).histogram.energy().reshape(scene.receiver.pixels.count, -1)
-        found = [energy, waveform(energy, scene.axis.bin_width_ns, self.kernel)]
-        return found if self.weights is None else [*found, energy @ self.weights]
+        fitted = self._renderer if share == 1 else self._renderer.scaled(share)
+        energy = fitted.render_pass(seed).histogram.energy().reshape(fitted.scene.receiver.pixels.count, -1)
+        found = [energy, self._power_of(energy)]
+        return found if self._weights is None else [*found, energy @ self._weights]
 
 
 class Differences:
@@ -79,7 +73,7 @@ class Differences:
     Parameters
     ----------
     session
-        Session of an XML scene.
+        LoadedScene of an XML scene.
     integrator
         Lidar integrator.
     names
@@ -95,6 +89,11 @@ class Differences:
         Names of the parameters.
     values, steps
         Values and steps of the parameters, in their units, shape (parameter,).
+    light
+        Derivatives of the energy of bins [J per unit of the parameter] and of the received power [W per unit], shape
+        (parameter, pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
+    gates
+        Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate).
 
     Raises
     ------
@@ -105,7 +104,7 @@ class Differences:
 
     def __init__(
         self,
-        session: Session,
+        session: LoadedScene,
         integrator: LidarIntegrator,
         names: Sequence[str],
         *,
@@ -132,11 +131,12 @@ class Differences:
             (self._side(name, value, step), self._side(name, value, -step))
             for name, value, step in zip(self.names, self.values.tolist(), self.steps.tolist(), strict=True)
         ]
-        self._energy, self._power, self._gates = PassStatistics(), PassStatistics(), PassStatistics()
+        self.light, self.gates = LightStatistics(), PassStatistics()
 
     def cut(self, train: GateTrain) -> None:
         """Differentiate the energy in gates, too, before the first pass; the gates stay at their times."""
-        self._pairs = [(above.with_gates(train), below.with_gates(train)) for above, below in self._pairs]
+        for side in itertools.chain(*self._pairs):
+            side.cut(train)
 
     def _side(self, name: str, value: float, step: float) -> _Side:
         """Return the scene with a parameter beside its value."""
@@ -149,77 +149,18 @@ class Differences:
             raise UserError(
                 f"the derivative by {name} = {value:g} needs values {abs(step):.3g} below and above, and {error}"
             ) from error
-        scene = renderer.scene
-        kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, scene.receiver.optics.response_time_ns)
-        return _Side(renderer, kernel)
+        return _Side(renderer)
 
     def add_pass(self, seed: int, share: float = 1.0) -> None:
         """Render and add one pass of every parameter, with a share of the paths of a full one."""
         slopes = []
-        for (above, below), step in zip(self._pairs, self.steps, strict=True):
-            sides = zip(*(side.render(seed, share) for side in (above, below)), strict=True)
+        for pair, step in zip(self._pairs, self.steps, strict=True):
+            sides = zip(*(side.render(seed, share) for side in pair), strict=True)
             slopes.append([(high - low) / (2 * step) for high, low in sides])
-        kept = [self._energy, self._power, self._gates][: len(slopes[0])]
-        for statistics, one in zip(kept, zip(*slopes, strict=True), strict=True):
-            statistics.add(np.array(one))
-
-    @property
-    def passes(self) -> int:
-        """Number of passes."""
-        return self._energy.count
-
-    @property
-    def impulse_response(self) -> FloatArray:
-        """Derivatives of the energy of bins [J per unit of the parameter], shape (parameter, pixel, time)."""
-        return self._energy.mean
-
-    @property
-    def impulse_response_stderr(self) -> FloatArray:
-        """Their standard errors, without the bias by the step; NaN before the second pass."""
-        return self._energy.stderr
-
-    @property
-    def waveform(self) -> FloatArray:
-        """Derivatives of the received power [W per unit of the parameter], shape (parameter, pixel, time)."""
-        return self._power.mean
-
-    @property
-    def waveform_stderr(self) -> FloatArray:
-        """Their standard errors, without the bias by the step; NaN before the second pass."""
-        return self._power.stderr
-
-    @property
-    def gates(self) -> FloatArray:
-        """Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate)."""
-        return self._gates.mean
-
-    @property
-    def gates_stderr(self) -> FloatArray:
-        """Their standard errors, without the bias by the step; NaN before the second pass."""
-        return self._gates.stderr
-
-
-@alone
-def differences(
-    session: Session,
-    integrator: LidarIntegrator,
-    names: Sequence[str],
-    *,
-    steps: Mapping[str, float] | None = None,
-    passes: int = 32,
-    seed: int = 0,
-    share: float = 1.0,
-    progress: ProgressCallback | None = None,
-) -> Differences:
-    """Return derivatives from a number of passes (2 to 10^6); other arguments and errors as for `Differences`."""
-    found = Differences(session, integrator, names, steps=steps)
-
-    def render_pass(number: int, seed: int) -> float:
-        found.add_pass(seed, share)
-        return 0.0
-
-    run_passes(render_pass, Goal(passes=integer("passes", passes, 2, 10**6)), seed=seed, progress=progress)
-    return found
+        energy, power, *gates = (np.array(one) for one in zip(*slopes, strict=True))
+        self.light.add(energy, power)
+        for one in gates:
+            self.gates.add(one)
 
 
 def default_step(name: str, value: float, renderer: PassRenderer) -> float:

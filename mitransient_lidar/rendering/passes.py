@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.rendering.options import RenderOptions
 
 logger = logging.getLogger(__name__)
+
+#: Share of the energy lost at the edge of the surface mesh above which a warning is given.
+TOLERATED_LOSS = 1e-3
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
@@ -138,6 +142,22 @@ class PassLog:
         """Return the share of the energy lost at the edge of the surface mesh; `received` by all passes [J]."""
         return self.edge_loss / (self.edge_loss + received) if self.edge_loss > 0 else 0.0
 
+    def attributes(self, seed: int) -> dict[str, Any]:
+        """Return the attributes of a result that describe its passes.
+
+        With a requested error: the error and its quantile, the error that was reached, and an estimate of the time that
+        was still needed [s], 0 if the request was met and NaN if unknown.
+        """
+        attributes = {"seed": int(seed), "passes": self.count, "interrupted": int(self.interrupted)}
+        if self.goal.target_error is None:
+            return attributes
+        return attributes | {
+            "target_error": self.goal.target_error,
+            "target_quantile": self.goal.target_quantile,
+            "error_at_quantile": self.error,
+            "target_missing_s": self.needed_s,
+        }
+
 
 def run_passes(
     render_pass: Callable[[int, int], float],
@@ -233,6 +253,16 @@ def run_passes(
     elif goal.target_error is None and goal.passes is not None and count < goal.passes and not interrupted:
         logger.warning("max_time = %g s ended after %d of %d passes", goal.max_time, count, goal.passes)
     return log
+
+
+def warn_of_edge_loss(share: float) -> None:
+    """Warn when a large share of the energy is lost at the edge of the surface mesh."""
+    if share > TOLERATED_LOSS:
+        logger.warning(
+            "the surface is smaller than the spread of the light in the water: about %.2g %% of the received energy is "
+            "lost at its edge; enlarge the surface's size",
+            100 * share,
+        )
 
 
 def describe_quantile(quantile: float, errors_of: str) -> str:

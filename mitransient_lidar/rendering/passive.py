@@ -19,14 +19,16 @@ from mitransient_lidar.core.validation import FloatArray, integer, positive, req
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, pass_seed, run_passes
-from mitransient_lidar.rendering.session import (
+from mitransient_lidar.rendering.passes import (
     TOLERATED_LOSS,
-    choose_integrator,
-    open_scene,
-    pass_attributes,
+    Goal,
+    PassLog,
+    ProgressCallback,
+    pass_seed,
+    run_passes,
     warn_of_edge_loss,
 )
 from mitransient_lidar.results.radiance import build_radiance
@@ -120,7 +122,7 @@ def render_passive(
     start, lost = time.perf_counter(), 0.0
     for frame in range(frames):
         moved = _moved(scene, params, frame * step) if frames > 1 else (scene, params)
-        session = open_scene(*moved, variant, sensor=sensor)
+        session = open_scene(*moved, variant=variant, sensor=sensor)
         chosen = choose_integrator(session.scene, integrator, passive=True)
         renderer = chosen.prepare(session.scene, session.sensor)
         if frame == 0:
@@ -145,7 +147,7 @@ def render_passive(
     warn_of_edge_loss(lost)
     attributes = first.attributes(
         integrator=chosen,
-        **{**pass_attributes(last, seed), "interrupted": int(interrupted)},
+        **{**last.attributes(seed), "interrupted": int(interrupted)},
         **described,
         elapsed_s=time.perf_counter() - start,
         error_median=last.error_median,

@@ -8,19 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import (
-    TOLERATED_LOSS,
-    Session,
-    check_components,
-    choose_integrator,
-    open_scene,
-    pass_attributes,
-    warn_of_edge_loss,
-)
+from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -40,7 +32,7 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 
 @alone
 def render(
-    scene: str | Path | Mapping[str, Any] | mi.Scene | Session | SceneRecord | xarray.Dataset,
+    scene: str | Path | Mapping[str, Any] | mi.Scene | LoadedScene | SceneRecord | xarray.Dataset,
     *,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
@@ -117,7 +109,7 @@ def render(
     progress
         Called with a `passes.Progress` after every pass.
     **others
-        Options of `shot_series.render_shots` or `passive.render_passive`, for results of these.
+        Options of `shots.series.render_shots` or `passive.render_passive`, for results of these.
 
     Returns
     -------
@@ -150,7 +142,7 @@ def render(
         given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
         return render_again(result, **given, progress=progress, **options, **others)
     chosen = RenderOptions(**options, **others)
-    session = open_scene(scene, params, chosen.variant, instrument, sensor=sensor)
+    session = open_scene(scene, params, instrument, variant=chosen.variant, sensor=sensor)
     return _render(session, integrator, chosen, progress)
 
 
@@ -160,7 +152,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     Parameters
     ----------
     result
-        Dataset of `render`, `passive.render_passive` or `shot_series.render_shots`, or its file. Of one that was
+        Dataset of `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. Of one that was
         computed from a result, as gates or signals of a receiver, that result is rendered. Of a series, all shots, or
         those that were completed before Ctrl-C.
     options
@@ -179,7 +171,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         option is invalid.
     """
     from mitransient_lidar.rendering.passive import render_passive
-    from mitransient_lidar.rendering.shot_series import render_shots
+    from mitransient_lidar.rendering.shots.series import render_shots
 
     functions: dict[str, Callable[..., xarray.Dataset]] = {
         "render": render,
@@ -191,7 +183,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
 
 
 def _render(
-    session: Session,
+    session: LoadedScene,
     integrator: str | Mapping[str, Any] | mi.Integrator | None,
     options: RenderOptions,
     progress: ProgressCallback | None,
@@ -199,8 +191,10 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
+    from mitransient_lidar.transport.path_classes import check_solids
+
     if components:
-        check_components(session.scene)
+        check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     if components:
@@ -212,7 +206,7 @@ def _render(
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]
     differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
-    session.tell_record()
+    session.tell_axis(lidar.axis, lidar.record_end)
     if changes := perturbations(parameters):
         renderer = renderer.perturbed(changes)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
@@ -264,9 +258,10 @@ def _render(
     lost = log.edge_loss_share(accumulator.received)
     warn_of_edge_loss(lost)
     attributes = session.attributes(
-        integrator=chosen,
-        used=renderer.used_values,
-        **pass_attributes(log, seed),
+        lidar,
+        chosen,
+        renderer.used_values,
+        **log.attributes(seed),
         pass_share=share,
         max_memory_gb=max_memory,
         components=int(components),

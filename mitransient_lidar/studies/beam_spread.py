@@ -13,10 +13,10 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import TOLERATED_LOSS, open_scene, pass_attributes
+from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.plane_crossings import PlaneCrossings
@@ -160,7 +160,7 @@ def beam_spread(
             100 * missed,
         )
     described = {"photons_per_pass": photons, "beam_outside_surface": missed, **_describe(lidar)}
-    return _dataset(measured, wanted, axes, session.attributes(**pass_attributes(log, seed), **described))
+    return _dataset(measured, wanted, axes, session.attributes(lidar, **log.attributes(seed), **described))
 
 
 def _planes(lidar: LidarScene, depths: FloatArray) -> FloatArray:

@@ -179,8 +179,8 @@ def measure(
     Rates and times are those of the passes after the first one, which also compiles. The figure of merit is
     1 / (median relative variance x CPU time) of the waveform's bins.
     """
+    from mitransient_lidar.loading.scenes import choose_integrator
     from mitransient_lidar.rendering.render import render
-    from mitransient_lidar.rendering.session import choose_integrator
     from mitransient_lidar.transport.scene_parts import lidar_sensor
 
     marks: list[tuple[float, float]] = []
@@ -216,17 +216,17 @@ def measure(
 def _load(case: str) -> mi.Scene:
     """Load the scene of a case."""
     from mitransient_lidar.loading.catalogue import scene_text
-    from mitransient_lidar.loading.scenes import load_scene
+    from mitransient_lidar.loading.scenes import open_scene
 
     if case not in CASES:
-        return load_scene(*INSTRUMENT_CASE, case)[0]
+        return open_scene(*INSTRUMENT_CASE, case).scene
     name, parameters = CASES[case]
     if case != "target":
-        return load_scene(name, parameters)[0]
+        return open_scene(name, parameters).scene
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "target.xml"
         path.write_text(scene_text(name).replace("</scene>", _TARGET))
-        return load_scene(path, parameters)[0]
+        return open_scene(path, parameters).scene
 
 
 def _plain_ray_rate(renderer: PassRenderer) -> float:

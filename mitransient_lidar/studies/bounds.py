@@ -21,11 +21,11 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import in_range, integer, non_negative, positive, shown
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
-from mitransient_lidar.rendering.session import open_scene
 
 _LOG = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, integer,
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 
 _LOG = logging.getLogger(__name__)
 

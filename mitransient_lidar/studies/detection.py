@@ -18,14 +18,15 @@ from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
@@ -131,6 +132,8 @@ def detect(
     if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
     limit = RenderOptions(max_time=max_time).max_time or math.inf
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
+
     session = open_scene(scene, params)
     for option, wanted, key in (("depths", depths, "target_depth"), ("clutter", clutter, "surface_seed")):
         if wanted and key not in session.parameters:
@@ -155,14 +158,13 @@ def detect(
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
         fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
-        seas: Session | None = None
+        axis: TimeAxis | None = None
         for i in range(renders):
             if clutter:
                 number = int(float(session.parameters["surface_seed"])) + 1 + i
                 sea = open_scene(scene, {**moved, "surface_seed": number})
-                if seas is not None:
-                    sea.share_record(seas.sensor.film().axis)
-                seas = seas or sea
+                # The records of all seas have the bins of the first one.
+                axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
             found.append(
                 target_signal(
                     sea if clutter else fixed,
@@ -170,6 +172,7 @@ def detect(
                     target_id=target_id,
                     passes=passes,
                     integrator=integrator,
+                    axis=axis,
                 )
             )
             if found[-1].attrs.get("interrupted"):

@@ -14,6 +14,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.sea.double_passage import (
@@ -22,8 +23,7 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_spread,
     slope_structures,
 )
-from mitransient_lidar.rendering.accumulators import WaveformAccumulator
-from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.rendering.accumulators import PassAccumulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -113,16 +113,16 @@ def estimate(
 
     lidar = find_lidar_scene(session.scene, session.sensor)
     model = _model(lidar)
-    session.tell_record()
+    session.tell_axis(lidar.axis, lidar.record_end)
     sampler = SensorSampler(lidar.receiver, lidar.transmitter)
     probe = probe_echoes(lidar, sampler)
     window = error_window(lidar, probe)
-    accumulator = WaveformAccumulator(lidar, window, None, _ORIGINS)
+    accumulator = PassAccumulator(lidar, window, origins=_ORIGINS)
     for generator in np.random.SeedSequence(seed).spawn(_PARTS):
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)
     described = describe_scene(lidar, probe, window, RippleFocusing.of_scene(lidar))
-    attributes = session.attributes(model="estimate", paths=paths, seed=seed, **described)
+    attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
 
 

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
-from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.rendering.shots.truth import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -116,7 +116,7 @@ def render_found_shots(
     waveforms
         Whether to render the shots.
     max_time, progress
-        As for `rendering.shot_series.render_shots`: `results` may hold the first shots alone.
+        As for `rendering.shots.series.render_shots`: `results` may hold the first shots alone.
 
     Raises
     ------

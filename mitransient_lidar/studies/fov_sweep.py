@@ -19,12 +19,12 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene
@@ -147,6 +147,7 @@ def fov_sweep(
         "time": ("time", lidar.axis.centres_ns, {"units": "ns"}),
     }
     attributes = session.attributes(
+        lidar,
         seed=seed,
         passes=passes,
         interrupted=int(log.interrupted),
@@ -228,7 +229,7 @@ def _check_solids(lidar: LidarScene, geometry: LidarGeometry, edge: float, max_d
 
 
 def _render(
-    session: Session, fields: FloatArray, of_field: Goal, seed: int, progress: ProgressCallback | None
+    session: LoadedScene, fields: FloatArray, of_field: Goal, seed: int, progress: ProgressCallback | None
 ) -> tuple[FloatArray, PassLog]:
     """Return the energy [J] in circles of full angles [mrad], shape (fields, passes, bins), and the log.
 

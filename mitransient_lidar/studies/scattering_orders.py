@@ -10,11 +10,11 @@ import xarray as xr
 
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
 
 _REVERSALS = ("one", "several")
@@ -105,7 +105,7 @@ def scattering_orders(
         "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
         "time": ("time", axis.centres_ns, {"units": "ns"}),
     }
-    attributes = session.attributes(integrator=chosen, **pass_attributes(log, seed))
+    attributes = session.attributes(lidar, chosen, **log.attributes(seed))
     return xr.Dataset(data, coords=coords, attrs=attributes)
 
 

@@ -13,7 +13,7 @@ from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefracti
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.geometry import lidar_geometry
 
 _PASSES = 8

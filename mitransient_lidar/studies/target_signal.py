@@ -14,12 +14,12 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes
-from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -39,6 +39,7 @@ def target_signal(
     max_time: float | None = None,
     seed: int = 0,
     integrator: Any = None,
+    axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render a scene with and without a target, and measure their difference.
@@ -57,6 +58,8 @@ def target_signal(
         Number of passes of each render, 16 to 100 000.
     max_time
         Time after which no pass begins [s], above 0; at least 16 passes are made.
+    axis
+        Time bins instead of automatic ones.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -87,13 +90,13 @@ def target_signal(
     session = open_scene(scene, params)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
-    with_target = chosen.prepare(session.scene, session.sensor, connections=False)
+    with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)
     without = chosen.prepare(bare, session.sensor, layout_of=with_target, connections=False)
     lidar = with_target.scene
-    axis, pixels, pulse = lidar.axis, lidar.receiver.pixels, lidar.transmitter.pulse
+    pixels, pulse = lidar.receiver.pixels, lidar.transmitter.pulse
     if pixels.grid is not None:
         raise UserError(f"layout = {pixels.layout!r} is an imager: the target's signal needs at most 16 pixels")
-    kernel = pulse.kernel(axis.bin_width_ns, lidar.receiver.optics.response_time_ns)
+    kernel = pulse.kernel(lidar.axis.bin_width_ns, lidar.receiver.optics.response_time_ns)
     pairs: list[tuple[FloatArray, FloatArray]] = []
 
     def render_pass(number: int, seed: int) -> float:
@@ -103,9 +106,9 @@ def target_signal(
 
     goal = Goal(passes=passes, max_time=options.max_time)
     log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)
-    result = _measure(np.array(pairs), axis, kernel, pulse.fwhm_ns)
+    result = _measure(np.array(pairs), lidar.axis, kernel, pulse.fwhm_ns)
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
-    attributes = session.attributes(target=target_id, integrator=chosen, **pass_attributes(log, seed), **result.attrs)
+    attributes = session.attributes(lidar, chosen, target=target_id, **log.attributes(seed), **result.attrs)
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 

@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
@@ -182,5 +183,6 @@ class LidarIntegrator(Protocol):
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
         connections: bool = True,
+        axis: TimeAxis | None = None,
     ) -> PassRenderer:
         """Return the renderer of passes of a scene, as `LidarMerging.prepare`."""

@@ -156,15 +156,10 @@ class SeabedShape(Protocol):
 
 @runtime_checkable
 class GatedFilm(Protocol):
-    """The film ``time_gated_film``."""
+    """The film ``time_gated_film``; its time bins are None where start or number are chosen for the scene."""
 
-    is_fixed: bool
-    end: str
     bin_width_ns: float
     time_start_ns: float | None
     bin_count: int | None
-    axis: TimeAxis
+    axis: TimeAxis | None
     gates: GatePlan | None
-
-    def fit(self, axis: TimeAxis, end: str) -> None:
-        """Set the time bins of an automatic record, and what ends it."""

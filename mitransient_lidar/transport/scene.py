@@ -378,6 +378,8 @@ class LidarScene(WaterScene):
         The ``lidar_transmitter``.
     axis
         Time bins of the record.
+    record_end
+        What the last light of the record comes from, where the scene decides its end.
     gates
         Gates of the ``time_gated_film``, or None.
     transmitter_poses
@@ -387,6 +389,7 @@ class LidarScene(WaterScene):
     transmitter: Transmitter
     axis: TimeAxis
     gates: GatePlan | None
+    record_end: str = ""
     transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
 
     def of(self, lanes: Lanes) -> LidarScene:

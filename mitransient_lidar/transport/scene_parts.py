@@ -54,8 +54,8 @@ def find_lidar_scene(
 ) -> LidarScene:
     """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
 
-    A record of automatic time bins is that of `axis`, or holds the light of all positions of the lidar, above water
-    displaced by `shifts` (x, y) [m].
+    Time bins that the film does not give are those of `axis`, or hold the light of all positions of the lidar, above
+    water displaced by `shifts` (x, y) [m].
 
     Raises
     ------
@@ -79,12 +79,13 @@ def find_lidar_scene(
     submerged = _check_place(parts, transmitters[0])
     if not submerged:
         _check_cells(parts.surfaces, transmitters[0])
-    if axis is None and not film.is_fixed:
-        # The record is that of the sensor, whatever replaces its receiver; the scene may have been edited.
-        own = replace(parts, receiver=find_receiver(sensor))
-        found = (own, transmitters[0], film)
-        film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
-    return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis or film.axis, gates=film.gates)
+    axis, end = film.axis or axis, ""
+    if axis is None:
+        # The bins are those of the sensor, whatever replaces its receiver.
+        found = replace(parts, receiver=find_receiver(sensor)), transmitters[0], film
+        axis, end = submerged_record(*found) if submerged else fitted_record(*found, shifts)
+    end = end if film.bin_count is None else ""
+    return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis, gates=film.gates, record_end=end)
 
 
 def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:

@@ -9,7 +9,7 @@ import pytest
 import significance
 
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.transport.path_classes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
@@ -329,6 +329,6 @@ def test_integrators_agree_in_shipped_scenes(name):
     bins = dict(SHORT_BINS if "shot" in name else BINS)
     if name.startswith("gated"):
         bins["layout"] = "2x2"
-    scene, _, _ = load_scene(name, bins)
+    scene = open_scene(name, bins).scene
     merged, reference = (energy.sum(axis=1, keepdims=True) for energy in pair(scene, None, 10))
     assert_same_light(merged, reference, 0.1)

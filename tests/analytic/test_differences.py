@@ -8,9 +8,10 @@ import significance
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.parameters import with_value
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.differences import Differences
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +28,7 @@ def each_slope(session, name, integrator=SMALL, steps=None):
     sums = [np.zeros(())]
     for number in range(PASSES):
         found.add_pass(pass_seed(0, number))
-        sums.append(found.passes * found.impulse_response[0])
+        sums.append(found.light.energy.count * found.light.energy.mean[0])
     return np.array([after - before for before, after in itertools.pairwise(sums)])
 
 
@@ -37,16 +38,21 @@ def slopes(name, params, steps=None):
     return each_slope(session, name, steps=steps).sum(axis=1), session
 
 
-def each_energy(session, integrator=SMALL, seed=OTHERS):
-    """Return energies [J] with the time bins of a session, shape (passes, pixels, bins)."""
-    renderer = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor)
+def axis_of(session):
+    """Return the time bins of a scene."""
+    return find_lidar_scene(session.scene, session.sensor).axis
+
+
+def each_energy(session, integrator=SMALL, seed=OTHERS, axis=None):
+    """Return energies [J], by default with the scene's own time bins, shape (passes, pixels, bins)."""
+    renderer = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor, axis=axis)
     passes = (renderer.render_pass(pass_seed(seed, number)) for number in range(PASSES))
     return np.array([one.histogram.energy() for one in passes])
 
 
-def energies(session, seed=OTHERS):
-    """Return energies [J], a row for each pass, with the time bins of a session."""
-    return each_energy(session, seed=seed).sum(axis=1)
+def energies(session, seed=OTHERS, axis=None):
+    """Return energies [J], a row for each pass."""
+    return each_energy(session, seed=seed, axis=axis).sum(axis=1)
 
 
 def in_bins(samples, bins=8):
@@ -61,8 +67,7 @@ def test_bottom_reflectance_against_the_scene_without_its_light():
     dark = 0.02
     found, session = slopes("bottom_reflectance", {"bottom_reflectance": dark})
     bare = open_scene("table1", {**LEVEL, "bottom_reflectance": 0})
-    bare.share_record(session.sensor.film().axis)
-    wanted = (energies(session) - energies(bare, OTHERS + 1)) / dark
+    wanted = (energies(session) - energies(bare, OTHERS + 1, axis_of(session))) / dark
     echo = slice(*np.flatnonzero(found.mean(axis=0) > 0.01 * found.mean(axis=0).max())[[0, -1]])
     significance.assert_same(in_bins(found[:, echo]), in_bins(wanted[:, echo]), error=0.02, bias=0.002)
 
@@ -74,7 +79,7 @@ def test_attenuation_of_water_that_only_absorbs():
     water = {"scattering": 0, "backscattering": 0, "bottom_depth": depth}
     found, session = slopes("attenuation", {**water, **view})
     surface = 2 * 200.0 / (C0 * 1e-9)
-    bottom = session.sensor.film().axis.centres_ns > surface + depth * 2 / (C0 * 1e-9)
+    bottom = axis_of(session).centres_ns > surface + depth * 2 / (C0 * 1e-9)
     wanted = -2 * depth * energies(session)[:, bottom].sum(axis=1)
     significance.assert_same(-found[:, bottom].sum(axis=1)[:, None], -wanted[:, None], error=0.02, bias=0.002)
     # No echo of the surface depends on the water.
@@ -85,7 +90,7 @@ def test_bottom_depth_moves_its_echo_in_time():
     """The mean time of the echo grows by 2 n / (c cos(angle in water)); the sum over all ways changes it by 0.5 %."""
     water = {"scattering": 0, "backscattering": 0}
     found, session = slopes("bottom_depth", water)
-    axis = session.sensor.film().axis
+    axis = axis_of(session)
     record = energies(session)
     bottom = axis.centres_ns > 2 * 200.0 / np.cos(np.deg2rad(20)) / (C0 * 1e-9) + 30.0
     energy, times = record[:, bottom].mean(axis=0), axis.centres_ns[bottom]
@@ -159,8 +164,7 @@ def test_geometry_against_scenes_beside_it(scene, params, name, step, integrator
     for number, sign in enumerate((1, -1)):
         moved = with_value(session.parameters, name, value + sign * step)
         other = open_scene(scene, {**LEVEL, **params, **{name.split("[")[0]: moved[name.split("[")[0]]}})
-        other.share_record(session.sensor.film().axis)
-        sides.append(in_bins(each_energy(other, small, OTHERS * (number + 1)), 5))
+        sides.append(in_bins(each_energy(other, small, OTHERS * (number + 1), axis_of(session)), 5))
     wanted = (sides[0] - sides[1]) / (2 * step)
     (a, da), (b, db) = (significance.mean_and_error(values) for values in (found, wanted))
     scale = np.abs(b).max(axis=1, keepdims=True)
@@ -183,7 +187,7 @@ def test_slopes_of_the_sea_along_and_across_are_mirror_images_at_nadir():
     far_first, left_first = each_energy(along), each_energy(across, seed=2 * OTHERS)
     # Far left, far right, near left, near right: the mirror at x = y exchanges far right and near left.
     significance.assert_same(far_first, left_first[:, [0, 2, 1, 3]], error=0.02, bias=0.002)
-    times = along.sensor.film().axis.centres_ns
+    times = axis_of(along).centres_ns
     surface = times < times[np.argmax(far_first.mean(axis=0).sum(axis=0))] + 8
     energy = left_first.mean(axis=0)[:, surface]
     arrival = energy @ times[surface] / energy.sum(axis=1)

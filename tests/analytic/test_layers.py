@@ -15,7 +15,7 @@ from scipy.special import ndtr
 import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
@@ -37,7 +37,7 @@ FLAT = {"spectrum": "flat", "slope_variance": "1e-4"}
 def shoot(name, params, count, start_ns, bins, cell_size=0.0):
     """Render passes of a scene over deep water, in bins of 0.5 ns: energies [J], shape (passes, pixels, bins)."""
     record = {"time_start_ns": start_ns, "bin_width_ns": BIN_NS, "bin_count": bins}
-    scene, _, _ = load_scene(name, {**params, **record, "bottom_depth": 40})
+    scene = open_scene(name, {**params, **record, "bottom_depth": 40}).scene
     engine = mi.load_dict({"type": "lidar_merging", "cell_size": cell_size})
     renderer = engine.prepare(scene, scene.sensors()[0])
     return np.array([renderer.render_pass(seed).histogram.energy() for seed in range(count)])

@@ -7,7 +7,7 @@ import pytest
 from significance import largest_chi2, largest_error, largest_z, mean_and_error
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries

@@ -11,7 +11,7 @@ from oracles.refracted_path import refracted_path
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -264,7 +264,7 @@ def echo_of_target(passes):
     bins = {"time_start_ns": 1440.0, "bin_width_ns": 20.0, "bin_count": 3}
 
     def measure(name):
-        scenes = [load_scene(name, {**bins, "target_x": place})[0] for place in (0.0, 60.0)]
+        scenes = [open_scene(name, {**bins, "target_x": place}).scene for place in (0.0, 60.0)]
         here, away = (passes(scene, 8, first_seed=40) for scene in scenes)
         return here[..., 2] - away[..., 2], away[..., 0]
 
@@ -299,7 +299,7 @@ def test_figure_14_black_is_nearly_as_strong_as_blue_in_less_backscatter(echo_of
 def test_mine_echoes_at_its_depth_and_casts_a_shadow(passes):
     """Echo from 8.5 m, the top of the sphere, on the axis; of the bottom at 12 m a part is in its shadow."""
     bins = {"time_start_ns": 1490.0, "bin_width_ns": 2.0, "bin_count": 30}
-    scenes = [load_scene("fig02_mine", {**bins, "target_x": place})[0] for place in (2.4, 60.0)]
+    scenes = [open_scene("fig02_mine", {**bins, "target_x": place}).scene for place in (2.4, 60.0)]
     here, away = (passes(scene, 12)[:, 0] for scene in scenes)
     difference, error = mean_and_error(here - away)
     peak = 1491 + 2 * np.argmax(difference)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from significance import assert_equal, assert_same
 
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
@@ -310,7 +310,7 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
     before = next(shape for shape in automatic.shapes() if hasattr(shape, "sea")).sea.cell_size
     parts = []
     for loaded in (automatic, explicit):
-        load_scene(loaded)
+        open_scene(loaded)
         shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
         parameters = mi.traverse(shape)
         names = ("vertex_positions", "vertex_texcoords", "faces", "bsdf.alpha_u.value", "bsdf.alpha_v.value")
@@ -326,5 +326,5 @@ def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
     loaded = lidar_scene(sea={**own, "shortest_wave": 1.0, "size": 50.0})
     shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
     sea = shape.sea
-    load_scene(loaded)
+    open_scene(loaded)
     assert shape.sea is sea

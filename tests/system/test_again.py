@@ -15,7 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.gate_files import save_sequence, save_stack
 from mitransient_lidar.results.radiance import save_radiance
 

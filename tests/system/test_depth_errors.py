@@ -16,9 +16,9 @@ import mitransient_lidar
 from mitransient_lidar.analysis.gates.range_images import depth_image
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.gates.images import reached_by_surface
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 
 pytestmark = pytest.mark.long
 
@@ -52,7 +52,7 @@ def rms(values):
 
 def traced(scene, params, dataset):
     pose = dataset.attrs["receiver_pose"]
-    return depths_under_beam(load_scene(scene, params)[0], dataset, pose)
+    return depths_under_beam(open_scene(scene, params).scene, dataset, pose)
 
 
 def survey(folder):
@@ -138,7 +138,7 @@ def test_twenty_shots_at_6_m_s():
         for number in range(10):
             shot = series.isel(shot=number)
             place = {**params, "aim_x": float(shot["aim_x"]), "aim_y": float(shot["aim_y"])}
-            scene = load_scene("fig09_2x2", place)[0]
+            scene = open_scene("fig09_2x2", place).scene
             pose = scene.emitters()[0].pose
             pose = np.concatenate([pose.origin, pose.axis, pose.far, pose.left])
             truth = depths_under_beam(scene, shot, pose, rays=100_000)

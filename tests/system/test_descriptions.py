@@ -11,7 +11,7 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.passive import render_passive
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.gate_files import open_stack, save_stack
 
 FLAT = {"spectrum": "flat", "wind_speed": 5}

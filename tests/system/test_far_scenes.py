@@ -10,8 +10,8 @@ from same_bits import assert_same_bits
 
 import mitransient_lidar
 from mitransient_lidar.loading import catalogue, frame
-from mitransient_lidar.loading.scenes import load_scene
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.studies.find_shots import find_shots
 from mitransient_lidar.transport.scene_parts import find_receiver, lidar_sensor
 
@@ -132,7 +132,8 @@ def shapes_at(place, folder):
 @pytest.mark.parametrize("place", [FAR, BETWEEN])
 def test_every_shape_lies_in_the_frame(place, tmp_path):
     near, far = (
-        load_scene(scene_at(*at, **shapes_at(at, tmp_path)))[0] for at in (np.subtract(place, np.round(place)), place)
+        open_scene(scene_at(*at, **shapes_at(at, tmp_path))).scene
+        for at in (np.subtract(place, np.round(place)), place)
     )
     np.testing.assert_array_equal(frame.frame_origin(far), [*np.round(place), 0])
     for one, other in zip(near.shapes(), far.shapes(), strict=True):
@@ -169,7 +170,7 @@ def test_texture_of_a_far_seabed_stays_in_place():
     colours = []
     for x, y in ((0.0, 0.0), (1.4 * 357143, -1.4 * 642857)):
         bed = {"type": "seabed", "centre_x": x, "centre_y": y, "bsdf": {"type": "diffuse", "reflectance": pattern}}
-        scene = load_scene(scene_at(x, y, bottom=bed))[0]
+        scene = open_scene(scene_at(x, y, bottom=bed)).scene
         bottom = next(shape for shape in scene.shapes() if shape.id() == "bottom")
         east, north = (mi.Float(each.ravel()) for each in np.meshgrid(*2 * [np.linspace(-3.03, 2.98, 41)]))
         at = [float(each) for each in np.subtract((x, y), frame.frame_origin(scene)[:2])]
@@ -185,6 +186,6 @@ def test_near_scenes_and_those_of_unknown_places_stay(stays):
     x, y = (240.0, -60.0) if stays == "near" else FAR
     sphere = ball(x, y)
     parts = {"near": sphere, "loaded": mi.load_dict(sphere), "unknown": {"type": "point", "position": [x, y, 9.0]}}
-    scene = load_scene(scene_at(x, y, part=parts[stays]))[0]
+    scene = open_scene(scene_at(x, y, part=parts[stays])).scene
     assert not frame.frame_origin(scene).any()
     assert find_receiver(lidar_sensor(scene)).pose.ground_point()[0] == pytest.approx(x)

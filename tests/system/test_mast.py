@@ -38,7 +38,7 @@ def test_target_echoes_at_its_distance_and_no_light_leaks_past_the_sea(height):
 @pytest.mark.slow
 def test_waves_hide_what_geometry_says():
     """Rays from the sea to the mast against the horizon of height profiles in plain NumPy, towards -x."""
-    scene, _, _ = scenes.load_scene("fig04_mast", {"wind_speed": 6})
+    scene = scenes.open_scene("fig04_mast", {"wind_speed": 6}).scene
     sea = next(shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
     mast = scene.sensors()[0].receiver.pose.origin
     rows = np.arange(-20, 20) * 4 * sea.cell_size

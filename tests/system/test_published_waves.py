@@ -10,7 +10,7 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import scenes as loading
-from mitransient_lidar.rendering import sea_map
+from mitransient_lidar.rendering.shots import truth as sea_map
 from mitransient_lidar.studies.shot_statistics import highest_points
 
 pytestmark = pytest.mark.long
@@ -55,7 +55,7 @@ def test_echoes_are_closest_in_shot_1_and_furthest_apart_in_shot_3(surface_echoe
 
 def test_red_comes_before_green_as_the_sideways_slope_says(surface_echoes):
     """The sea rises to the left, where red looks: red's face is higher, and nearer."""
-    scene, _, _ = loading.load_scene("fig10_shot1")
+    scene = loading.open_scene("fig10_shot1").scene
     along, across = sea_map.SeaMap.of_scene(scene).slope_at(-59.52, 57.68)
     assert np.degrees(np.arctan([along, across])) == pytest.approx([1.9, 2.8], abs=0.1)
     red, green = surface_echoes[0][1][:2]

@@ -11,9 +11,9 @@ from significance import largest_z, mean_and_error
 import mitransient_lidar
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.echo_window import probe_echoes
-from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 

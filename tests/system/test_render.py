@@ -73,7 +73,7 @@ def test_parameters_have_the_same_names_in_every_scene():
 
 @pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])
 def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(phase):
-    scene, _, parameters = loading.load_scene(
+    opened = loading.open_scene(
         "table1",
         {
             "phase": phase,
@@ -84,6 +84,7 @@ def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(p
             "attenuation": [0.3, 0.4],
         },
     )
+    scene, parameters = opened.scene, opened.parameters
     (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
     assert surface.slope_variance == pytest.approx(0.02)
     assert surface.ripple_variance[0] == surface.ripple_variance[1]
@@ -102,7 +103,7 @@ def test_result_says_how_it_was_made_also_of_a_loaded_scene():
     assert shot.waveform.attrs["units"] == "W"
     # The depth axis' zero: 2 H / (c0 cos 20 deg) = 1419.886 ns on a flat mean surface; waves move it by centimetres.
     assert shot.attrs["surface_time_ns"] == pytest.approx(1419.886, abs=1.0)
-    scene, _, _ = loading.load_scene("table1", params)
+    scene = loading.open_scene("table1", params).scene
     loaded = small(scene, seed=11)
     np.testing.assert_allclose(loaded.impulse_response, shot.impulse_response, rtol=1e-10)
     with pytest.raises(UserError, match="params"):
@@ -207,7 +208,7 @@ def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, count, fast
     for paths in (2**11, 2**14):
         photons = {"photons_per_pass": paths} if integrator == "lidar_merging" else {}
         engine = mi.load_dict({"type": integrator, "paths_per_pass": paths, **photons})
-        scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
+        scene = loading.open_scene("table1", {"spectrum": "flat"}).scene
         renderer = engine.prepare(scene, scene.sensors()[0])
         # Late light only: surface echo and early column are stratified and fall faster.
         energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(count * groups)])
@@ -353,4 +354,4 @@ def test_mesh_without_faces_is_refused(tmp_path):
     path = tmp_path / "empty.ply"
     path.write_text("\n".join([*header, *faces, "0 0 0", "1 0 0", "0 1 0", ""]))
     with pytest.raises(UserError, match="a shape of type ply has no faces"):
-        loading.load_scene({"target": {"type": "ply", "filename": str(path)}})
+        loading.open_scene({"target": {"type": "ply", "filename": str(path)}})

@@ -64,7 +64,8 @@ def test_scene(name, tmp_path, caplog):
             assert again[coordinate].values.tolist() == kept[coordinate].values.tolist()
     assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))
     # Its lidar may be another one.
-    mounted, _, parameters = scenes.load_scene(name, instrument="riegl_vq840g")
+    opened = scenes.open_scene(name, instrument="riegl_vq840g")
+    mounted, parameters = opened.scene, opened.parameters
     assert mounted.sensors()[0].receiver.pixels.names == list(instruments.read_instrument("riegl_vq840g").channels)
     assert parameters["altitude"] == "150"
 

@@ -10,12 +10,11 @@ import pytest
 from scipy.stats import t
 from significance import assert_same, largest_z
 
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.render import render
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
-from mitransient_lidar.rendering.shot_batches import ShotBatches
-from mitransient_lidar.rendering.shot_poses import ShotPoses
-from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes
 
@@ -120,8 +119,7 @@ def alone_at(scene, params, pose, record, integrator):
     session = open_scene(scene, params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]})
     session.scene.emitters()[0].pose = pose
     session.sensor.receiver = replace(session.sensor.receiver, pose=pose)
-    session.share_record(record)
-    return choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor)
+    return choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor, axis=record)
 
 
 @pytest.mark.slow

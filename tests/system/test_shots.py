@@ -22,7 +22,7 @@ WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
 
 @pytest.fixture(scope="module")
 def sea():
-    return shots.SeaMap.of_scene(scenes.load_scene("fig09_2x2", WAVES)[0])
+    return shots.SeaMap.of_scene(scenes.open_scene("fig09_2x2", WAVES).scene)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.rendering import shot_series
+from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
 TILTS = ((-0.15, 0.0), (0.0, 0.07), (0.15, -0.07))

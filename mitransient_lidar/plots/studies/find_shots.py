@@ -13,7 +13,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.rendering.sea_map import Shot
+from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
 
 #: Share of a pixel's peak that counts as an echo.

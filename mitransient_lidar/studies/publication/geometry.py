@@ -10,7 +10,7 @@ import numpy as np
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
-from mitransient_lidar.rendering.sea_map import Shot
+from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.statements import Statement
 from mitransient_lidar.studies.shot_statistics import depth_bias

@@ -16,11 +16,11 @@ from mitransient_lidar.core.validation import integer, relative_error
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.exclusive import alone, alone_with_scene
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.session import Session, open_scene
-from mitransient_lidar.rendering.shot_series import random_places, render_shots
+from mitransient_lidar.rendering.shots.series import random_places, render_shots
+from mitransient_lidar.rendering.shots.truth import SeaMap
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.studies.publication.measures import Series
 
@@ -68,7 +68,7 @@ class Renders:
     seed: int = 0
     progress: ProgressCallback | None = None
     _results: dict[tuple[Any, ...], xr.Dataset] = field(default_factory=dict)
-    _sessions: dict[tuple[str, int], Session] = field(default_factory=dict)
+    _sessions: dict[tuple[str, int], LoadedScene] = field(default_factory=dict)
     _seas: dict[tuple[str, int], SeaMap] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class Renders:
         return [joined(parts) for parts in found]
 
     @alone_with_scene
-    def session(self, scene: str, sea: int = 0) -> Session:
+    def session(self, scene: str, sea: int = 0) -> LoadedScene:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
         # Series of its shots are rendered later.

@@ -28,7 +28,7 @@ from mitransient_lidar.campaigns.sweep import describe_campaign
 from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 CAMPAIGN = Campaign.of(
@@ -398,4 +398,4 @@ def test_an_include_in_the_scene_of_a_store_is_refused(store, path):
     attributes["scene"]["scene_xml"] = '<scene version="3.0.0"><include filename="part.xml"/></scene>'
     group.attrs.update({"scene": attributes["scene"], "sha256": seal(attributes)})
     with pytest.raises(UserError, match=r"includes 'part.xml': only the file of a scene may include others"):
-        load_scene(Store(path).renderer().scene)
+        open_scene(Store(path).renderer().scene)

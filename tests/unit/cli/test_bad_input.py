@@ -144,7 +144,7 @@ def shows(sentence, value):
 @pytest.mark.parametrize(("scene", "name", "value", "part"), PARAMETERS)
 def test_parameters_of_scenes(scene, name, value, part):
     with pytest.raises(UserError, match=re.escape(part)) as caught:
-        scenes.load_scene(scene, {name: value})
+        scenes.open_scene(scene, {name: value})
     sentence = str(caught.value)
     assert name in sentence
     assert "\n" not in sentence

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.water.water_types import water_of
 
 FLAT = {"spectrum": "flat"}
@@ -12,7 +12,8 @@ FLAT = {"spectrum": "flat"}
 
 def load(scene="table1", **params):
     """Return the water, the transmitter and the parameters of a shipped scene."""
-    loaded, _, parameters = load_scene(scene, {**FLAT, **params})
+    opened = open_scene(scene, {**FLAT, **params})
+    loaded, parameters = opened.scene, opened.parameters
     water = next(shape.interior_medium().water for shape in loaded.shapes() if hasattr(shape, "sea"))
     return water, next(each for each in loaded.emitters() if hasattr(each, "pulse")), parameters
 

@@ -13,8 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import load_scene
-from mitransient_lidar.rendering.session import choose_integrator
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 
 #: A library outside, reached from each folder in which Mitsuba looks for plugins.
 PATH = "../" * 12 + "elsewhere/evil"
@@ -31,16 +30,16 @@ def scene_file(folder, old, new):
 def test_types_that_are_paths_are_refused(tmp_path, value):
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', f'<integrator type="{value}"/>')
     with pytest.raises(UserError, match="must be the name of a plugin"):
-        load_scene(written)
+        open_scene(written)
     with pytest.raises(UserError, match="must be the name of a plugin"):
-        load_scene({"sea": {"type": "ocean_surface", "interior": {"type": value}}})
+        open_scene({"sea": {"type": "ocean_surface", "interior": {"type": value}}})
 
 
 def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
     """Mitsuba looks for files, and for libraries of plugins, in all folders that it knows."""
     before = [str(path) for path in mi.file_resolver()]
     part = f'<path value="{tmp_path}"/><integrator type="lidar_merging"/>'
-    load_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', part))
+    open_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', part))
     assert [str(path) for path in mi.file_resolver()] == before
 
 
@@ -60,7 +59,7 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
 )
 def test_damaged_records_are_refused(attributes, message):
     with pytest.raises(UserError, match=message):
-        load_scene(SceneRecord.from_attributes(attributes))
+        open_scene(SceneRecord.from_attributes(attributes))
 
 
 def stranger(folder, name, text):
@@ -79,7 +78,7 @@ def test_an_entity_that_becomes_an_include_is_refused(tmp_path):
     stranger(tmp_path, "part.xml", PART)
     entity = """<!DOCTYPE scene [<!ENTITY e "&#60;include filename='part.xml'/>">]>"""
     with pytest.raises(UserError, match="holds a DOCTYPE: it must hold elements, attributes and comments only"):
-        load_scene(stranger(tmp_path, "a.xml", f'{entity}<scene version="3.0.0">&e;</scene>'))
+        open_scene(stranger(tmp_path, "a.xml", f'{entity}<scene version="3.0.0">&e;</scene>'))
 
 
 @pytest.mark.parametrize("tag", ["include", "default name='a' value='b'/><include"])
@@ -87,7 +86,7 @@ def test_includes_in_results_are_refused(tmp_path, tag):
     part = stranger(tmp_path, "part.xml", PART)
     text = f'<scene version="3.0.0"><{tag} filename="{part}"/></scene>'
     with pytest.raises(UserError, match=r"includes .*part.xml': only the file of a scene may include others"):
-        load_scene(SceneRecord.from_attributes({"scene_xml": text}))
+        open_scene(SceneRecord.from_attributes({"scene_xml": text}))
 
 
 def test_a_part_that_is_an_include_is_refused(tmp_path):
@@ -95,13 +94,13 @@ def test_a_part_that_is_an_include_is_refused(tmp_path):
     stranger(tmp_path, "deep.xml", PART)
     stranger(tmp_path, "part.xml", '<include version="3.0.0" filename="deep.xml"/>')
     with pytest.raises(UserError, match=r"includes 'deep.xml': only the file of a scene may include others"):
-        load_scene(stranger(tmp_path, "a.xml", '<scene version="3.0.0"><include filename="part.xml"/></scene>'))
+        open_scene(stranger(tmp_path, "a.xml", '<scene version="3.0.0"><include filename="part.xml"/></scene>'))
 
 
 @pytest.mark.parametrize("root", ['<shape version="3.0.0" type="../evil"/>', '<scene version="3.0.0" type="../evil"/>'])
 def test_the_type_of_the_root_is_checked(tmp_path, root):
     with pytest.raises(UserError, match=r"has a root element .*: it must be <scene>"):
-        load_scene(stranger(tmp_path, "a.xml", root))
+        open_scene(stranger(tmp_path, "a.xml", root))
 
 
 def test_a_path_within_another_path_is_refused(tmp_path):
@@ -109,7 +108,7 @@ def test_a_path_within_another_path_is_refused(tmp_path):
     stranger(tmp_path / "a" / "b", "x", "")
     text = '<scene version="3.0.0"><path value="a"/><path value="b"/><shape type="evil"/></scene>'
     with pytest.raises(UserError, match="path = 'b' is no folder in"):
-        load_scene(stranger(tmp_path, "a.xml", text))
+        open_scene(stranger(tmp_path, "a.xml", text))
 
 
 def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
@@ -119,9 +118,9 @@ def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
     record = SceneRecord.from_attributes({"scene_dict": json.dumps(scene)})
     for one in (scene, record):
         with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
-            load_scene(one)
+            open_scene(one)
     with pytest.raises(UserError, match="path = 'nowhere' of resources must be a folder"):
-        load_scene({**scene, "folder": {"type": "resources", "path": "nowhere"}})
+        open_scene({**scene, "folder": {"type": "resources", "path": "nowhere"}})
 
 
 def test_libraries_in_the_current_folder_of_a_script_are_refused(tmp_path, monkeypatch):
@@ -130,13 +129,13 @@ def test_libraries_in_the_current_folder_of_a_script_are_refused(tmp_path, monke
     (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
-        load_scene({"type": "scene", "shape": {"type": "evil"}})
+        open_scene({"type": "scene", "shape": {"type": "evil"}})
 
 
 @pytest.mark.parametrize("plugin", ["blender", "serialized"])
 def test_plugins_that_trust_what_they_are_given_are_refused(plugin):
     with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
-        load_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
+        open_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
 
 
 @pytest.mark.parametrize(
@@ -166,33 +165,33 @@ def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
         text = f'<scene version="3.0.0"><path value="other"/>{part.format(f"pipe{folder}")}</scene>'
         (tmp_path / "a.xml").write_text(text)
         with pytest.raises(UserError, match=f"pipe{folder}: it is a named pipe"):
-            load_scene(tmp_path / "a.xml")
+            open_scene(tmp_path / "a.xml")
     given = {"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}}
     for one in (given, SceneRecord.from_attributes({"scene_dict": json.dumps(given)})):
         with pytest.raises(UserError, match="pipehere: it is a named pipe"):
-            load_scene(one)
+            open_scene(one)
     with pytest.raises(UserError, match="pipehere: it is a named pipe"):
-        choose_integrator(load_scene({"type": "scene"})[0], {**given, "type": "lidar_merging"})
+        choose_integrator(open_scene({"type": "scene"}).scene, {**given, "type": "lidar_merging"})
 
 
 def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
     path = tmp_path / "a\x1b]0;title\x07.ply"
     path.write_text("ply\n")
     with pytest.raises(UserError, match="its name must have no control characters") as caught:
-        load_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
+        open_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
     assert str(caught.value).isprintable()
 
 
 def test_names_of_files_are_texts():
     with pytest.raises(UserError, match=r"profile_file = 1.0 must be a text, the name of a file"):
-        load_scene({"type": "scene", "laser": {"type": "lidar_transmitter", "profile_file": 1.0}}, None)
+        open_scene({"type": "scene", "laser": {"type": "lidar_transmitter", "profile_file": 1.0}}, None)
 
 
 def test_types_are_checked_with_parameters_in_place(tmp_path):
     text = '<default name="kind" value="lidar_merging"/><integrator type="$kind"/>'
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', text)
     with pytest.raises(UserError, match=NOT_A_NAME):
-        load_scene(written, {"kind": PATH})
+        open_scene(written, {"kind": PATH})
 
 
 @pytest.mark.slow
@@ -209,7 +208,7 @@ def test_types_of_results_are_checked(tmp_path):
 
 
 def test_integrators_of_a_command_are_names():
-    scene = load_scene("table1")[0]
+    scene = open_scene("table1").scene
     for wanted in (PATH, {"type": PATH}, {"type": "lidar_volpath", "nested": {"type": PATH}}):
         with pytest.raises(UserError, match=NOT_A_NAME):
             choose_integrator(scene, wanted)
@@ -225,10 +224,10 @@ def test_libraries_of_plugins_beside_a_scene_are_refused(tmp_path, place, librar
     written = scene_file(tmp_path / "scene", "</scene>", '<path value="../other"/></scene>')
     if place == "beside the scene":
         written = scene_file(tmp_path / "scene", "", "")
-    load_scene(written)
+    open_scene(written)
     (folder / "plugins" / library).write_bytes(b"")
     with pytest.raises(UserError, match=rf"{library} would run as a plugin of Mitsuba; remove it"):
-        load_scene(written)
+        open_scene(written)
 
 
 @pytest.mark.slow

@@ -64,18 +64,16 @@ FLAT = """<!-- A level sea -->
   Over a bottom.
 -->
 <scene version="3.0.0">
+    <!-- Chosen here -->
 
     <!-- All parameters -->
 
     <!-- Ball -->
     <default name="radius" value="2"/>  <!-- m -->
     <default name="depth" value="3"/>
-    <!-- Chosen here -->
     <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
 
     <default name="power" value="7"/>
-    <!-- Matt -->
-    <default name="gain" value="1"/>
 
     <shape type="sphere" id="ball">
         <!-- Nearly "round" -->
@@ -87,11 +85,12 @@ FLAT = """<!-- A level sea -->
     <!-- Below -->
     <shape type="rectangle" id="floor">
         <bsdf type="diffuse" name="bsdf">
-            <spectrum name="reflectance" value="$grey"/>
-        </bsdf>
+  <!-- Matt -->
+  <default name="gain" value="1"/>
+  <spectrum name="reflectance" value="$grey"/>
+</bsdf>
     </shape>
     <!-- The end -->
-
 </scene>
 """
 
@@ -136,11 +135,12 @@ def test_scene_with_includes_loads(scene):
     unused = POINT.replace("power", "depth")
     (scene.parent / "parts" / "point.xml").write_text(unused, "utf-8")
     (scene.parent / "parts" / "matt.xml").write_text(MATT.replace('"gain" value="1"', '"radius" value="1"'), "utf-8")
-    loaded, name, parameters = scenes.load_scene(scene, {"depth": 4})
+    opened = scenes.open_scene(scene, {"depth": 4})
+    loaded, name, parameters = opened.scene, opened.name, opened.parameters
     assert (name, parameters) == ("own", {"depth": "4", "radius": "2", "grey": "0.5"})
     assert [shape.id() for shape in loaded.shapes()] == ["ball", "floor"]
     with pytest.raises(UserError, match="parameter 'dept' is not one of scene own: did you mean depth"):
-        scenes.load_scene(scene, {"dept": 4})
+        scenes.open_scene(scene, {"dept": 4})
 
 
 def test_value_that_refers_to_a_parameter_follows_it(scene):
@@ -191,7 +191,7 @@ def test_part_beside_the_including_file_is_found(scene):
 )
 def test_wrong_includes(scene, part, text, sentence):
     (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
-    for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.load_scene):
+    for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.open_scene):
         with pytest.raises(UserError, match=sentence):
             use(scene)
 
@@ -202,7 +202,7 @@ def test_includes_that_double_are_refused_at_once(tmp_path):
         part = f'<include filename="{number + 1}.xml"/>'
         (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
     (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
-    for use in (read_document, catalogue.scene_parameters, scenes.load_scene):
+    for use in (read_document, catalogue.scene_parameters, scenes.open_scene):
         with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
             use(tmp_path / "0.xml")
 
@@ -215,7 +215,7 @@ def test_parameters_that_double_are_refused_at_once(tmp_path):
     path = tmp_path / "bomb.xml"
     path.write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
     with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
-        scenes.load_scene(path)
+        scenes.open_scene(path)
 
 
 @pytest.mark.parametrize("folder", ["maps", "$x"])
@@ -230,11 +230,11 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
         <string name="filename" value="$file"/><float name="map_size" value="$x"/></shape></scene>"""
     own.write_text(text)
     for given in (path.name, str(path)):
-        loaded = scenes.load(own, {"file": given})
-        for again in (loaded, scenes.load(loaded.record)):
+        loaded = scenes.open_scene(own, {"file": given})
+        for again in (loaded, scenes.open_scene(loaded.record)):
             assert again.scene.shapes()[0].parameters["filename"] == str(path)
             assert again.scene.bbox().max.z == pytest.approx(-6)
             assert again.record.parameters["file"] == given
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
     with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
-        scenes.load(own)
+        scenes.open_scene(own)

@@ -79,7 +79,7 @@ def test_needed_parameters(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_loaded_lidar_has_the_values_of_the_file(name):
     given = {key: float(value) for key, value in values(name).items() if key != "layout"}
-    transmitter, receiver = parts(scenes.load_scene("table1", FLAT, name)[0])
+    transmitter, receiver = parts(scenes.open_scene("table1", FLAT, name).scene)
     assert transmitter.pulse_energy == pytest.approx(1e-3 * given["pulse_energy_mj"])
     assert transmitter.wavelength_nm == given["wavelength_nm"]
     assert transmitter.pulse.fwhm_ns == pytest.approx(given["pulse_fwhm_ns"])
@@ -100,7 +100,8 @@ def test_segments_of_czmil_have_equal_areas():
 
 def test_values_of_the_user_win():
     own = {**FLAT, "altitude": 90, "divergence_mrad": 3, "shallow_view_mrad": 10}
-    loaded, _, parameters = scenes.load_scene("table1", own, "teledyne_czmil")
+    opened = scenes.open_scene("table1", own, "teledyne_czmil")
+    loaded, parameters = opened.scene, opened.parameters
     transmitter, receiver = parts(loaded)
     assert transmitter.divergence == pytest.approx(3e-3)
     assert parameters["divergence_1e2_mrad"] == ""
@@ -110,7 +111,7 @@ def test_values_of_the_user_win():
 
 def test_the_scene_keeps_gates_integrator_place_and_target():
     params = {"aim_y": 3, "target_depth": 5, **FLAT}
-    loaded = scenes.load("gated_mine", params, "riegl_vq840g")
+    loaded = scenes.open_scene("gated_mine", params, "riegl_vq840g")
     assert loaded.parameters["gate_count"] == "20"
     assert loaded.parameters["aim_y"] == "3"
     assert loaded.record.instrument == "riegl_vq840g"
@@ -122,8 +123,8 @@ def test_the_scene_keeps_gates_integrator_place_and_target():
 
 
 def test_a_scene_fitted_to_its_own_lidar_returns_to_defaults():
-    parameters = scenes.load_scene("passive_sea", FLAT, "riegl_vq840g")[2]
-    shared = scenes.load_scene("table1", FLAT, "riegl_vq840g")[2]
+    parameters = scenes.open_scene("passive_sea", FLAT, "riegl_vq840g").parameters
+    shared = scenes.open_scene("table1", FLAT, "riegl_vq840g").parameters
     for name in ("time_start_ns", "bin_count", "surface_refined_size", "surface_cell_size", "surface_shortest_wave"):
         assert parameters[name] == shared[name]
     assert parameters["wind_speed"] == "6"
@@ -132,7 +133,8 @@ def test_a_scene_fitted_to_its_own_lidar_returns_to_defaults():
 def test_a_scene_without_a_lidar_gets_one(tmp_path):
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar=""))
-    loaded, _, parameters = scenes.load_scene(path, {"wind_speed": 4}, "usgs_eaarl_b")
+    opened = scenes.open_scene(path, {"wind_speed": 4}, "usgs_eaarl_b")
+    loaded, parameters = opened.scene, opened.parameters
     assert parameters["wind_speed"] == "4"
     assert parts(loaded)[1].pixels.names == ["shallow", "deep"]
     assert loaded.integrator().plugin == "lidar_merging"
@@ -141,7 +143,7 @@ def test_a_scene_without_a_lidar_gets_one(tmp_path):
 def test_a_camera_of_the_scene_is_replaced(tmp_path):
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<sensor type="perspective"><film type="hdrfilm"/></sensor>'))
-    (sensor,) = scenes.load_scene(path, None, "riegl_vq840g")[0].sensors()
+    (sensor,) = scenes.open_scene(path, None, "riegl_vq840g").scene.sensors()
     assert sensor.film().parameters["type"] == "time_gated_film"
 
 
@@ -151,8 +153,8 @@ def test_the_printed_xml_is_included_by_a_scene(name, tmp_path):
     (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
-    ours, plain = scenes.load_scene(path)[0], mi.load_file(str(path), optimize=False)
-    mounted = scenes.load_scene("table1", FLAT, name)[0]
+    ours, plain = scenes.open_scene(path).scene, mi.load_file(str(path), optimize=False)
+    mounted = scenes.open_scene("table1", FLAT, name).scene
     for loaded in (ours, plain):
         for part, expected in zip(parts(loaded), parts(mounted), strict=True):
             assert part.pose.origin == pytest.approx(expected.pose.origin)
@@ -167,7 +169,7 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     path = tmp_path / "own" / "sea.xml"
     path.write_text(SEA.format(lidar=rock))
     monkeypatch.chdir(tmp_path)
-    loaded = scenes.load_scene(path, None, "riegl_vq840g")[0]
+    loaded = scenes.open_scene(path, None, "riegl_vq840g").scene
     assert "rock" in [shape.id() for shape in loaded.shapes()]
 
 
@@ -185,20 +187,20 @@ def test_unknown_instruments_are_refused(name, sentence):
         with pytest.raises(UserError, match=sentence):
             call(name)
     with pytest.raises(UserError, match=sentence):
-        scenes.load_scene("table1", None, name)
+        scenes.open_scene("table1", None, name)
 
 
 def test_parameters_that_the_instrument_replaces_are_refused():
     sentence = "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"
     with pytest.raises(UserError, match=sentence):
-        scenes.load_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
+        scenes.open_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
 
 
 def test_scenes_of_python_take_no_instrument():
     with pytest.raises(UserError, match="instrument = 'riegl_vq840g' needs an XML scene, not a dict"):
-        scenes.load_scene({"type": "scene"}, None, "riegl_vq840g")
+        scenes.open_scene({"type": "scene"}, None, "riegl_vq840g")
     with pytest.raises(UserError, match="not a loaded scene"):
-        scenes.load_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
+        scenes.open_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
 
 
 def table():

@@ -11,7 +11,7 @@ from array_inputs import mesh
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.mesh_files import check_ply
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import load
+from mitransient_lidar.loading.scenes import open_scene
 
 
 @pytest.fixture(params=["a.ply", "a_binary.ply"])
@@ -36,7 +36,7 @@ def with_index(path, index):
 
 def test_a_good_mesh_is_loaded(square):
     check_ply(square)
-    shape = load({"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}).scene.shapes()[0]
+    shape = open_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}).scene.shapes()[0]
     assert (shape.vertex_count(), shape.face_count()) == (4, 2)
 
 
@@ -46,7 +46,7 @@ def test_faces_without_a_vertex_are_refused(square, index):
     with_index(square, index)
     scene = {"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}
     with pytest.raises(UserError, match=f"has a face with the vertex {index}, and the vertices 0 to 3 alone"):
-        load(scene)
+        open_scene(scene)
 
 
 def test_the_mesh_of_a_result_is_checked(square):
@@ -58,7 +58,7 @@ def test_the_mesh_of_a_result_is_checked(square):
     rows = [{"plugin": "ply", "name": str(square), "path": str(square), "sha256": digest}]
     changed = {**record.attributes(), "scene_files": json.dumps(rows)}
     with pytest.raises(UserError, match="has a face with the vertex 4"):
-        load(SceneRecord.from_attributes(changed))
+        open_scene(SceneRecord.from_attributes(changed))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_message_that_quotes_other_bytes_than_text_is_a_sentence(tmp_path):
     path = mesh("a.obj")(tmp_path)
     path.write_bytes(path.read_bytes() + b"v 1 \xf6 2\n")
     with pytest.raises(UserError, match="could not parse line") as caught:
-        load({"type": "scene", "mesh": {"type": "obj", "filename": str(path)}})
+        open_scene({"type": "scene", "mesh": {"type": "obj", "filename": str(path)}})
     assert "\n" not in str(caught.value)
 
 

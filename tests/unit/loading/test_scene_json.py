@@ -8,7 +8,7 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import load
+from mitransient_lidar.loading.scenes import open_scene
 
 NUMBERS = np.random.default_rng(1).random((4, 4, 4, 1), np.float32)
 COLOURS = np.uint8(255 * NUMBERS[..., 0].reshape(8, 2, 4)[..., :3])
@@ -37,8 +37,8 @@ def volume(**given):
 def test_textures_of_python_are_restored(texture):
     """They were not stored, so that no result of such a scene was rendered again."""
     solid = {"type": "cube", "to_world": BOX, "bsdf": {"type": "diffuse", "reflectance": texture}}
-    loaded = load({"solid": solid})
-    again = load(SceneRecord.from_attributes(loaded.record.attributes()))
+    loaded = open_scene({"solid": solid})
+    again = open_scene(SceneRecord.from_attributes(loaded.record.attributes()))
     values = [dict(mi.traverse(one.scene)) for one in (loaded, again)]
     assert list(values[0]) == list(values[1])
     for name, value in values[0].items():
@@ -47,8 +47,8 @@ def test_textures_of_python_are_restored(texture):
 
 def test_a_grid_of_distances_is_restored():
     grid = {"type": "sdfgrid", "grid": mi.TensorXf(NUMBERS - 0.5), "to_world": BOX}
-    loaded = load({"solid": grid})
-    again = load(SceneRecord.from_attributes(loaded.record.attributes()))
+    loaded = open_scene({"solid": grid})
+    again = open_scene(SceneRecord.from_attributes(loaded.record.attributes()))
     found = [np.array(mi.traverse(one.scene)["solid.grid"]) for one in (loaded, again)]
     np.testing.assert_array_equal(*found)
 
@@ -62,4 +62,4 @@ def test_large_images_and_damaged_ones_are_refused():
     for damage in ({"data": "AAAA"}, {"shape": [5, 5, 1]}, {"dtype": "O"}, {"pixel_format": "None"}, {"data": "*"}):
         text = json.dumps({"image": {**scene, "bitmap": {**stored["image"]["bitmap"], **damage}}})
         with pytest.raises(UserError, match="the scene of the result is damaged"):
-            load(SceneRecord.from_attributes({"scene_dict": text}))
+            open_scene(SceneRecord.from_attributes({"scene_dict": text}))

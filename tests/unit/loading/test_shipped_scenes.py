@@ -167,8 +167,10 @@ def test_text_equals_the_file_with_its_includes(name):
 @pytest.mark.parametrize("name", ["fig04_mast", "gated_mine", "ship_wake"])
 def test_copy_loads_to_the_same_scene(name, tmp_path):
     image = {"layout": "2x2", "surface_cell_size": "0.5"} if OWN[name].get("layout") == "128x128" else {}
-    included, _, parameters = scenes.load_scene(name, image)
-    flat, _, again = scenes.load_scene(catalogue.copy_scene(name, tmp_path), image)
+    opened = scenes.open_scene(name, image)
+    included, parameters = opened.scene, opened.parameters
+    opened = scenes.open_scene(catalogue.copy_scene(name, tmp_path), image)
+    flat, again = opened.scene, opened.parameters
     assert list(tmp_path.iterdir()) == [tmp_path / f"{name}.xml"]
     assert again == parameters
     for kind in ("shapes", "emitters", "sensors"):

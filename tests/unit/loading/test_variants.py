@@ -12,7 +12,7 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import variants
-from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.studies.find_shots import find_shots
 
 

@@ -6,9 +6,9 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
 from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
 LAYERS = {

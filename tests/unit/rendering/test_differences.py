@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.differences import Differences, default_step, differences
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.rendering.differences import Differences, default_step
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
 
 
 @pytest.fixture(scope="module")
 def level():
-    """Session of a level sea, and an integrator of few paths."""
+    """A level sea, and an integrator of few paths."""
     session = open_scene("fig15_2x2", {"spectrum": "flat", "surface_size": 1000})
     return session, choose_integrator(session.scene, FEW)
 
@@ -23,13 +23,15 @@ def level():
 @pytest.mark.slow
 def test_the_scene_and_its_parameters_stay(level):
     session, integrator = level
-    parameters, axis = dict(session.parameters), session.sensor.film().axis
+    parameters = dict(session.parameters)
     renderer = integrator.prepare(session.scene, session.sensor)
     before = renderer.render_pass(5).histogram.energy()
-    found = differences(session, integrator, ["bottom_depth", "layer_tops[1]"], passes=2)
-    assert found.waveform.shape == found.impulse_response_stderr.shape == (2, *before.shape)
+    found = Differences(session, integrator, ["bottom_depth", "layer_tops[1]"])
+    for seed in range(2):
+        found.add_pass(seed)
+    assert found.light.power.mean.shape == found.light.energy.stderr.shape == (2, *before.shape)
     assert found.values.tolist() == [8.0, 3.0]
-    assert (session.parameters, session.sensor.film().axis or axis) == (parameters, renderer.scene.axis)
+    assert session.parameters == parameters
     assert np.array_equal(renderer.render_pass(5).histogram.energy(), before)
 
 
@@ -41,22 +43,23 @@ def test_a_pass_is_the_difference_of_two_renders(level):
     train = GateTrain(1430.0, 8.0, 5.0, 6)
     found.cut(train)
     found.add_pass(3)
-    energy = integrator.prepare(session.scene, session.sensor).for_differences().render_pass(3).histogram.energy()
+    renderer = integrator.prepare(session.scene, session.sensor)
+    energy = renderer.for_differences().render_pass(3).histogram.energy()
     quantum = np.abs(energy).max() * 1e-6
-    assert found.impulse_response[0] == pytest.approx(energy / 5.0, rel=1e-4, abs=quantum)
+    assert found.light.energy.mean[0] == pytest.approx(energy / 5.0, rel=1e-4, abs=quantum)
     # The width of the pulse moves power in time, and no energy between ideal echoes.
-    assert not found.impulse_response[1].any()
-    assert found.waveform[1].sum() == pytest.approx(0, abs=1e-3 * np.abs(found.waveform[1]).sum())
-    assert np.isnan(found.waveform_stderr).all()
+    assert not found.light.energy.mean[1].any()
+    assert found.light.power.mean[1].sum() == pytest.approx(0, abs=1e-3 * np.abs(found.light.power.mean[1]).sum())
+    assert np.isnan(found.light.power.stderr).all()
     # Gates collect the power, also where a longer pulse moves it.
-    axis = session.sensor.film().axis
+    axis = renderer.scene.axis
     for gate in range(train.count):
         first, weights = train.gate_bins(gate, axis.start_ns, axis.bin_width_ns, axis.bin_count)
-        collected = 1e-9 * axis.bin_width_ns * found.waveform[..., first : first + weights.size] @ weights
-        largest = np.abs(found.gates).max(axis=(1, 2))[:, None]
-        assert np.all(np.abs(found.gates[..., gate] - collected) < 0.01 * largest)
+        collected = 1e-9 * axis.bin_width_ns * found.light.power.mean[..., first : first + weights.size] @ weights
+        largest = np.abs(found.gates.mean).max(axis=(1, 2))[:, None]
+        assert np.all(np.abs(found.gates.mean[..., gate] - collected) < 0.01 * largest)
     found.add_pass(4, share=0.5)
-    assert np.isfinite(found.waveform_stderr).all()
+    assert np.isfinite(found.light.power.stderr).all()
 
 
 @pytest.mark.parametrize(
@@ -203,5 +206,5 @@ def test_most_light_stays_in_its_cell():
     times = renderer.scene.axis.centres_ns
     column = (times > 1440) & (times < 1480)
     independent = np.sqrt(2) * renders.stderr[:, column]
-    for step, error, most in zip(found.steps, found.impulse_response_stderr, (0.25, 0.06), strict=True):
+    for step, error, most in zip(found.steps, found.light.energy.stderr, (0.25, 0.06), strict=True):
         assert np.median(2 * step * error[:, column] / independent) < most

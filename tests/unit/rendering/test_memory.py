@@ -14,11 +14,11 @@ import mitransient_lidar
 from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.catalogue import scene_text
+from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices
 from mitransient_lidar.rendering.passive import render_passive
-from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.rendering.shot_batches import check_size
+from mitransient_lidar.rendering.shots.batches import check_size
 from mitransient_lidar.transport.merging.renderer import MergingRenderer
 from mitransient_lidar.transport.rng import Shots
 

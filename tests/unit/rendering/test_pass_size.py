@@ -78,7 +78,7 @@ def test_small_passes_have_the_mean_of_full_ones(integrator):
 
     A share that is left out of the photons' or the paths' weights is a factor of 64.
     """
-    scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
+    scene = loading.open_scene("table1", {"spectrum": "flat"}).scene
     photons = {"photons_per_pass": 2**14} if integrator == "lidar_merging" else {}
     engine = mi.load_dict({"type": integrator, "paths_per_pass": 2**14, **photons})
     renderer = engine.prepare(scene, scene.sensors()[0])
@@ -112,7 +112,7 @@ def test_a_dense_plume_ends_within_seconds():
 def test_default_renders_of_shipped_scenes_have_full_passes_without_a_trial(monkeypatch, names):
     monkeypatch.setattr(pass_size, "timed_pass", None)
     for name in names:
-        scene, _, _ = loading.load_scene(name)
+        scene = loading.open_scene(name).scene
         renderer = scene.integrator().prepare(scene, scene.sensors()[0])
         goal = DEFAULT_GOAL if renderer.scene.gates is None else DEFAULT_GATE_GOAL
         start_ns = renderer.scene.axis.start_ns

@@ -13,10 +13,12 @@ from same_bits import assert_same_bits
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.rendering.shot_poses import ShotPoses
-from mitransient_lidar.rendering.shot_scene import ShotScene
+from mitransient_lidar.rendering.shots import batches as shot_batches
+from mitransient_lidar.rendering.shots import series as shot_series
+from mitransient_lidar.rendering.shots import truth as shot_truth
+from mitransient_lidar.rendering.shots.batches import ShotPoses
+from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -158,7 +160,7 @@ def rendered(monkeypatch):
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
-        return shot_batches.ShotRecord(power, 0.1 * power, power, 0.1 * power, 0.0, batches.passes)
+        return shot_batches.ShotRecord(2 * (power, 0.1 * power), 0.0, np.full(len(places), batches.passes))
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", render)
     return asked
@@ -255,7 +257,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 @pytest.mark.slow
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = ShotScene("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
+    series = ShotScene("fig13_2x2", params, np.array(PLACES), target=(0.3, 0.0))
     (target,) = series.companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.

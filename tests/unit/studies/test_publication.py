@@ -13,7 +13,7 @@ from scipy.special import erf
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.publication import figures as publication
-from mitransient_lidar.rendering.sea_map import SeaMap
+from mitransient_lidar.rendering.shots.truth import SeaMap
 from mitransient_lidar.studies.publication import echoes, layers, measures, renders, targets
 from mitransient_lidar.studies.publication.measures import Series, Waveform
 from mitransient_lidar.studies.publication.renders import Renders, joined

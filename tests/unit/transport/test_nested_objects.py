@@ -4,7 +4,7 @@ import mitsuba as mi
 import pytest
 
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.scenes import load
+from mitransient_lidar.loading.scenes import open_scene
 
 SEABED = {"type": "seabed", "depth": 8.0, "size": 20.0}
 WATER = {"type": "ocean_surface", "spectrum": "flat", "interior": {"type": "layered_water", "plume_scattering": 1.0}}
@@ -20,7 +20,7 @@ def test_no_plugin_calls_the_loader(monkeypatch, phase):
 
     load_file = mi.load_file
     monkeypatch.setattr(mi, "load_dict", refuse)
-    assert load("table1", {"phase": phase, "spectrum": "flat"}).scene.shapes()
+    assert open_scene("table1", {"phase": phase, "spectrum": "flat"}).scene.shapes()
     assert load_file(str(catalogue.scene_path("ship_wake")), spectrum="flat").shapes()
 
 
@@ -40,5 +40,5 @@ def test_all_loading_is_serial(monkeypatch):
     monkeypatch.setattr(
         mi.parser, "instantiate", lambda config, parsed: asked.append(config.parallel) or instantiate(config, parsed)
     )
-    load("table1", {"spectrum": "flat"})
+    open_scene("table1", {"spectrum": "flat"})
     assert asked == [False]

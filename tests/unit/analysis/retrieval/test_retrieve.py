@@ -35,7 +35,7 @@ from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
 from mitransient_lidar.analysis.retrieval.bottom_errors import COLUMN_GAIN
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import retrieval
-from mitransient_lidar.rendering import shot_series
+from mitransient_lidar.rendering.shots import series as shot_series
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ STRIPS = PixelLight(
 def test_stated_errors_are_those_of_a_rendered_sea(view, light):
     """200 shots each at 6 m/s: times of the surface echoes, and slopes averaged over the beam's footprint.
 
-    The file holds what `shot_series.render_shots` made of fig09_2x2 with 8 passes, and the times that
+    The file holds what `shots.series.render_shots` made of fig09_2x2 with 8 passes, and the times that
     `waveforms.extract` read. Sea slopes differ by 0.055 along and 0.039 across. A spread of 200 is known to 5 %.
     """
     with (Path(__file__).parent / "slope_shots.csv").open(encoding="utf-8") as file:

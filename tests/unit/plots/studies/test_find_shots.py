@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
 
 from mitransient_lidar.plots.studies.find_shots import plot_found_shots
-from mitransient_lidar.rendering.sea_map import SeaMap, Shot
+from mitransient_lidar.rendering.shots.truth import SeaMap, Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
 
 LINES = np.arange(-20, 20, 0.5)

@@ -8,7 +8,6 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,20 +22,17 @@ from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import read_record
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.rendering.options import RenderOptions
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.session import Session, open_scene, warn_of_edge_loss
-from mitransient_lidar.rendering.shot_scene import AIM, TARGET, ShotScene
-from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
+from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
+from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotRecord
+    from mitransient_lidar.rendering.shots.batches import ShotRecord
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,9 +47,6 @@ _LISTED = (
     *(*AIM, "true_slope_along", "true_slope_across", "true_surface_height"),
     *("true_bottom_depth", "true_bottom_depth_below_surface"),
 )
-
-#: Arrays of a series, as of `results.build_series`.
-_ARRAYS = ("energy", "energy_stderr", "power", "power_stderr")
 
 
 def read_places(path: str | os.PathLike[str]) -> FloatArray:
@@ -151,7 +144,7 @@ def render_shots(
         below the mean surface in the footprint, as depths of echoes are, the sum of depth and surface height; of the
         water, whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
         ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
-        bubbles (`shot_truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
+        bubbles (`truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
         those of the first shot; positions are left out. ``series_parameters``: JSON of the scene's parameters that
         shots replace. ``passes`` is the largest number of passes of a shot, of the coordinate ``shot_passes``, and
         ``most_passes`` the option. ``slope_deviation``: standard deviations of the two slopes of a sea with waves.
@@ -162,8 +155,7 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
-    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, ShotPoses, ShotRecord, share_for_error
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
@@ -174,17 +166,15 @@ def render_shots(
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")
-    if sensor and isinstance(scene, (str, os.PathLike)):
-        scene, instrument = read_record(scene, params, instrument), None
-    if sensor and isinstance(scene, SceneRecord):
-        scene = replace(scene, sensor=sensor)
-    session = open_scene(scene, params, instrument=instrument) if given is None or move_target else None
+    source: dict[str, Any] = {"instrument": instrument, "sensor": sensor}
+    session = open_scene(scene, params, **source) if given is None or move_target else None
     target = _target_offset(session) if session is not None and move_target else None
     places = given
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = ShotScene(scene, params, instrument, target, places, axis, bool(components), derivatives=derivatives or ())
+    channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or ()}
+    series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
@@ -206,7 +196,7 @@ def render_shots(
                 batch = batches.limited(int(most[part].max()), seconds)
                 seeds = range(first_seed + part.start, first_seed + part.stop)
                 records.append(batch.render(ShotPoses(places[part]), seeds))
-                errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
+                errors.append(series.window.relative_errors(*records[-1].whole[2:]))
                 done = part.stop
                 if progress is not None:
                     progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], options))
@@ -218,19 +208,14 @@ def render_shots(
             raise KeyboardInterrupt from error
         interrupted = True
     _warn_of_the_end(records, done, len(places), options, interrupted)
-    joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
-    by_origin, changes = (
-        [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-        for parts in ([record.parts for record in records], [record.derivatives for record in records])
-    )
-    found = np.concatenate(errors)
-    median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
-    lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
+    median, p95 = np.quantile(np.concatenate(errors), [0.5, 0.95], method="higher")
+    lost, received = sum(one.lost for one in records), sum(one.whole[0].sum() for one in records)
     lost = lost / (lost + received) if lost > 0 else 0.0
+    record = ShotRecord.joined(records)
     warn_of_edge_loss(lost)
     attributes = series.attributes(
         used=batches.used_values,
-        passes=max(record.passes for record in records),
+        passes=int(record.passes.max()),
         most_passes=passes,
         pass_share=share,
         elapsed_s=time.perf_counter() - began,
@@ -250,9 +235,8 @@ def render_shots(
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
-    rendered = np.repeat([record.passes for record in records], [len(record.power) for record in records])
-    known["shot_passes"] = ("shot", rendered, {"units": "1", "long_name": "number of passes of the shot"})
-    return series.dataset(joined, by_origin, attributes, changes).assign_coords(known)
+    known["shot_passes"] = ("shot", record.passes, {"units": "1", "long_name": "number of passes of the shot"})
+    return series.dataset(record, attributes).assign_coords(known)
 
 
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
@@ -314,11 +298,11 @@ def _warn_of_the_end(
     """Warn of shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
     if done < planned and not interrupted:
         _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
-    if missed := sum(len(record.power) for record in records if record.missed):
+    if missed := sum(record.missed for record in records):
         _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
 
 
-def _target_offset(session: Session) -> tuple[float, float]:
+def _target_offset(session: LoadedScene) -> tuple[float, float]:
     """Return the distance [m] from the aim to the target."""
     for name in ("target_x", "target_y", "aim_x", "aim_y"):
         if name not in session.parameters:

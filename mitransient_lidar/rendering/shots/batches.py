@@ -9,23 +9,28 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.core.errors import raise_if_out_of_memory
-from mitransient_lidar.core.validation import FloatArray, require_memory
-from mitransient_lidar.physics.lidar.pulse import waveform
+from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
-from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.accumulators import Light
+from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
-    from mitransient_lidar.transport.scene import LidarScene
 
 #: Paths of all shots in a launch, and time bins of all their pixels.
 _PATHS, _BINS = 2**17, 2**24
@@ -45,39 +50,164 @@ _KNOWN_SHARE, _KNOWN_ERROR, _ERROR_EXPONENT = 0.05, 0.05, 0.65
 
 
 @dataclass(frozen=True)
-class ShotRecord:
-    """Means over the passes of shots, and their standard errors, shape (shots, pixels, bins).
+class ShotPoses:
+    """Places of shots, and poses that differ from that of the lidar.
 
-    Light that is separated by its origin has the shape (shots, pixels, origins, bins) in `parts`.
+    The frame of a shot is turned about the vertical, so that its receiver differs least from that of the lidar, and
+    displaced, so that the receiver's axis meets the mean sea level where the lidar's does.
 
     Attributes
     ----------
-    energy, energy_stderr
-        Received energy [J per bin].
-    power, power_stderr
-        Received power after the pulse and the receiver's response [W].
+    places
+        Points (x, y) in the scene where the receiver's axes meet the mean sea level [m], shape (shots, 2).
+    turns
+        Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
+    receiver, transmitter
+        Poses in the frame of each shot; None where all are those of the lidar.
+    in_scene
+        Poses of the receiver in the scene; None where they follow from the places.
+    """
+
+    places: FloatArray
+    turns: FloatArray | None = None
+    receiver: KernelPose | None = None
+    transmitter: KernelPose | None = None
+    in_scene: Pose | None = None
+
+    @classmethod
+    def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
+        """Return the poses of shots of a lidar whose receiver has given ones in the scene, arrays of shape (shots, 3).
+
+        The transmitter is fixed to the receiver. All axes must go down.
+        """
+        own = lidar.receiver.pose
+        places = receiver.ground_point()
+        # The rotation from the lidar to each shot, and that about the vertical which is nearest to it.
+        whole = np.swapaxes(receiver.frame, 1, 2) @ own.frame
+        azimuth = whole[:, 0, 0] + whole[:, 1, 1] + 1j * (whole[:, 1, 0] - whole[:, 0, 1])
+        turns = azimuth / np.abs(azimuth)
+        to_frame = _rotations(np.conj(turns))
+        centre = own.ground_point()
+        origin = np.squeeze(to_frame @ (receiver.origin - places)[..., None], -1) + centre
+        rotation = to_frame @ whole
+        shift = origin - rotation @ own.origin
+        own_receiver, own_transmitter = (pose.moved(rotation, shift) for pose in (own, lidar.transmitter.pose))
+        cos_sin = np.stack([turns.real, turns.imag], axis=-1)
+        return cls(places[:, :2], cos_sin, own_receiver, own_transmitter, receiver)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def part(self, rows: slice | IntArray) -> ShotPoses:
+        """Return some of the shots."""
+        turns = None if self.turns is None else self.turns[rows]
+        receiver = None if self.receiver is None else self.receiver.part(rows)
+        transmitter = None if self.transmitter is None else self.transmitter.part(rows)
+        in_scene = None if self.in_scene is None else self.in_scene.part(rows)
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
+
+    def repeated(self, copies: int) -> ShotPoses:
+        """Return each shot several times in turn."""
+        return self.part(np.repeat(np.arange(len(self)), copies))
+
+    def delayed(self, lengths: FloatArray) -> ShotPoses:
+        """Return the shots with a length added to their optical paths [m], shape (shots,)."""
+        return replace(self, receiver=None if self.receiver is None else replace(self.receiver, delay=lengths))
+
+    def scene_part(self, shapes: mi.Scene, positions: FloatArray | None, aim: FloatArray) -> ScenePart:
+        """Return shapes as the shots meet them.
+
+        Parameters
+        ----------
+        shapes
+            The shapes.
+        positions
+            Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
+        aim
+            Place (x, y) of the lidar in its frame [m], shape (2,).
+        """
+        if positions is None:
+            positions = np.broadcast_to(aim, (len(self), 2))
+        if self.turns is None:
+            return ScenePart(shapes, _vectors(positions - aim))
+        turned = (self.turns[:, 0] + 1j * self.turns[:, 1]) * complex(*aim)
+        by = positions - np.stack([turned.real, turned.imag], axis=-1)
+        cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
+        return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
+
+    def water(self, water: Water | None, place: FloatArray, aim: FloatArray) -> Water | None:
+        """Return the water of a lidar at `aim` as a shot at a place meets it, both x, y in the lidar's frame [m]."""
+        if water is None or not isinstance(water.plume, BubblePlume):
+            return water
+        turn = 1 + 0j if self.turns is None else complex(*self.turns[0])
+        return replace(water, plume=water.plume.displaced(place, aim, turn))
+
+    def extra_range(self, lidar: LidarScene) -> FloatArray:
+        """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).
+
+        Times of arrival are relative to it: those of each shot begin later by this length over the speed of light.
+        """
+        if self.receiver is None or self.transmitter is None:
+            return np.zeros(len(self))
+        reference = lidar.receiver.pose.nearby_point()
+        ranges = [np.linalg.norm(pose.origin - reference, axis=1) for pose in (self.receiver, self.transmitter)]
+        return np.asarray(ranges[0] + ranges[1] - lidar.reference_length)
+
+
+def _rotations(turns: npt.NDArray[np.complex128]) -> FloatArray:
+    """Return rotations about the vertical by azimuths, shape (shots, 3, 3)."""
+    found = np.zeros((len(turns), 3, 3))
+    found[:, 0, 0] = found[:, 1, 1] = turns.real
+    found[:, 1, 0], found[:, 0, 1] = turns.imag, -turns.imag
+    found[:, 2, 2] = 1.0
+    return found
+
+
+def _vectors(horizontal: FloatArray) -> mi.Vector3f:
+    """Return horizontal vectors, shape (n, 2)."""
+    x, y = (aligned(mi.Float, column.astype(np.float32)) for column in horizontal.T)
+    return mi.Vector3f(x, y, dr.zeros(mi.Float, len(horizontal)))
+
+
+@dataclass(frozen=True)
+class ShotRecord:
+    """Means over the passes of shots, and their standard errors.
+
+    Attributes
+    ----------
+    whole
+        Mean energy [J per bin], its standard error, mean power after the pulse and the receiver's response [W], and its
+        standard error, shape (shots, pixels, bins).
     lost
         Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
     passes
-        Number of passes.
+        Number of passes of each shot, shape (shots,).
     parts
-        The same four arrays of light by origin; none unless the renderer separates it.
+        The same four arrays of light by origin, (shots, pixels, origins, bins); none unless the renderer separates it.
     derivatives
         The same four arrays of derivatives, of shape (shots, parameters, pixels, bins); none unless the renderer has
         perturbations.
     missed
-        Whether the passes ended before the error that was requested.
+        Number of shots whose passes ended before the error that was requested.
     """
 
-    energy: FloatArray
-    energy_stderr: FloatArray
-    power: FloatArray
-    power_stderr: FloatArray
+    whole: tuple[FloatArray, ...]
     lost: float
-    passes: int
+    passes: IntArray
     parts: tuple[FloatArray, ...] = ()
     derivatives: tuple[FloatArray, ...] = ()
-    missed: bool = False
+    missed: int = 0
+
+    @classmethod
+    def joined(cls, records: Sequence[ShotRecord]) -> ShotRecord:
+        """Return the record of all shots of several ones."""
+        whole, parts, derivatives = (
+            tuple(np.concatenate(arrays) for arrays in zip(*(getattr(one, name) for one in records), strict=True))
+            for name in ("whole", "parts", "derivatives")
+        )
+        passes = np.concatenate([one.passes for one in records])
+        lost, missed = (sum(getattr(one, name) for one in records) for name in ("lost", "missed"))
+        return cls(whole, lost, passes, parts, derivatives, missed)
 
 
 class ShotBatches:
@@ -119,8 +249,6 @@ class ShotBatches:
         self._aim = np.array(aim) - self._frame_origin
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
-        response = lidar.receiver.optics.response_time_ns
-        self._kernel = lidar.transmitter.pulse.kernel(lidar.axis.bin_width_ns, response)
         waves = [sea for sea in lidar.seas if np.isfinite(sea.cell_size)]
         level = [sea for sea in lidar.seas if np.isinf(sea.cell_size)]
         going = [*level, *companions]
@@ -184,7 +312,7 @@ class ShotBatches:
         """Render the shots of a batch, each with its own seed."""
         shots, done, copies, lost, needed = len(poses), 0, 0, 0.0, self._together
         ends = [time.perf_counter()]
-        energy, power, parts, perturbed = PassStatistics(), PassStatistics(), _pair(), _pair()
+        light = Light(self._renderer.scene, self._origins > 1)
         try:
             several = self.at(poses)
             while done < self.passes and needed > 0:
@@ -193,42 +321,26 @@ class ShotBatches:
                 numbers = [pass_seed(seed, done + number) for seed in seeds for number in range(here)]
                 record = renderer.render_pass(numbers)
                 lost += float(record.edge_loss[0])
-                axis = renderer.scene.axis
-                shape = shots, here, -1, self._origins, axis.bin_count
-                found = record.histogram.energy().reshape(shape)
-                changes = None
+                shape = shots, here, -1, self._origins, renderer.scene.axis.bin_count
+                found, changes = record.histogram.energy().reshape(shape), None
                 if self._perturbations:
-                    changes = record.histogram.perturbed().reshape(self._perturbations, *shape)
+                    changes = np.moveaxis(record.histogram.perturbed().reshape(self._perturbations, *shape), 0, 2)
                 for number in range(here):
-                    both = found[:, number], waveform(found[:, number], axis.bin_width_ns, self._kernel)
-                    for whole, part, values in zip((energy, power), parts, both, strict=True):
-                        whole.add(values.sum(axis=2))
-                        if self._origins > 1:
-                            part.add(values)
-                    if changes is not None:
-                        derivatives = np.moveaxis(changes[:, :, number].sum(axis=3), 0, 1)
-                        perturbed[0].add(derivatives)
-                        perturbed[1].add(waveform(derivatives, axis.bin_width_ns, self._kernel))
+                    light.add(found[:, number], None if changes is None else changes[:, number])
                 done += here
                 ends.append(time.perf_counter())
                 if self._goal is not None and done >= _PASSES_FOR_ERROR:
                     target, window = self._goal
-                    error = float(np.median(relative_errors(power.mean, power.stderr, window)))
+                    power = light.whole.power
+                    error = float(np.median(window.relative_errors(power.mean, power.stderr)))
                     needed = 0 if error <= target else math.ceil(done * min((error / target) ** 2 - 1, 1e3))
                 if done >= 2 and 2 * ends[-1] - ends[-2] - ends[0] > self._seconds:
                     break
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
-        means = [energy.mean, power.mean]
-        by_origin: tuple[FloatArray, ...] = ()
-        if self._origins > 1:
-            # The whole is the sum of its parts to the bit.
-            means = [part.mean.sum(axis=2) for part in parts]
-            by_origin = _arrays(parts)
-        missed, derivatives = self._goal is not None and needed > 0, _arrays(perturbed) if self._perturbations else ()
-        arrays = means[0], energy.stderr, means[1], power.stderr
-        return ShotRecord(*arrays, lost / done, done, by_origin, derivatives, missed)
+        missed, passes = shots if self._goal is not None and needed > 0 else 0, np.full(shots, done)
+        return ShotRecord(light.arrays, lost / done, passes, light.parts.arrays, light.perturbed.arrays, missed)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -241,29 +353,9 @@ class ShotBatches:
         return self._renderer.used_values
 
 
-def _pair() -> tuple[PassStatistics, PassStatistics]:
-    """Return statistics of energy and power."""
-    return PassStatistics(), PassStatistics()
-
-
-def _arrays(pair: tuple[PassStatistics, PassStatistics]) -> tuple[FloatArray, ...]:
-    """Return means and standard errors of energy and power."""
-    return tuple(values for part in pair for values in (part.mean, part.stderr))
-
-
 def share_for_error(error: float) -> float:
     """Return the share of the paths of a full pass for passes that are repeated until a relative error is reached."""
     return float(np.clip(_KNOWN_SHARE * (_KNOWN_ERROR / error) ** (1 / _ERROR_EXPONENT), SMALLEST_SHARE, 1.0))
-
-
-def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) -> FloatArray:
-    """Return the relative standard errors of waveforms in a window, infinite where they are 0.
-
-    Power and standard error have the shape (shots, pixels, bins).
-    """
-    shots = len(power)
-    each = replace(window, start_ns=np.tile(window.start_ns, shots), end_ns=np.tile(window.end_ns, shots))
-    return each.relative_errors(*(values.reshape(-1, values.shape[-1]) for values in (power, stderr)))
 
 
 def check_size(shots: int, pixels: int, bins: int, origins: int = 0, parameters: int = 0) -> None:

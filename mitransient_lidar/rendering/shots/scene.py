@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +13,14 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
-from mitransient_lidar.rendering.session import Session, check_components, choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.rendering.accumulators import described
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotBatches
-    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotRecord
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Parameters of the scene that shots replace, and those that they replace to move the target.
@@ -27,7 +28,22 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 
 
 class ShotScene:
-    """The scene of a series of shots, at the place of the first one; its record is told, and it is checked, if wanted.
+    """The scene of a series of shots, at the place of the first one; its time bins are told, and it is checked.
+
+    Parameters
+    ----------
+    scene, params, instrument, sensor
+        As of `loading.scenes.open_scene`, with the parameters ``aim_x`` and ``aim_y``.
+    places
+        Places of the shots [m], shape (shots, 2).
+    target
+        Distance from the aim to the target [m], which goes with the shots; None if it stays.
+    axis
+        Time bins instead of automatic ones.
+    components, derivatives
+        As of `series.render_shots`.
+    check
+        Whether to tell the time bins, and to check the scene.
 
     Attributes
     ----------
@@ -35,6 +51,8 @@ class ShotScene:
         The loaded scene.
     lidar
         Lidar of the first shot, with the time bins of all shots.
+    parameters
+        Parameters by which light is differentiated.
     window
         Bins whose errors count, in each pixel.
     """
@@ -43,61 +61,50 @@ class ShotScene:
         self,
         scene: Any,
         params: Mapping[str, Any] | None,
-        instrument: str | None,
-        target: tuple[float, float] | None,
         places: FloatArray,
-        axis: TimeAxis | None,
-        components: bool,
-        check: bool = True,
+        *,
+        instrument: str | None = None,
+        sensor: str | None = None,
+        target: tuple[float, float] | None = None,
+        axis: TimeAxis | None = None,
+        components: bool = False,
         derivatives: Sequence[str] | str = (),
+        check: bool = True,
     ) -> None:
-        from mitransient_lidar.rendering.derivatives import path_parameters
+        from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
-        from mitransient_lidar.rendering.shot_batches import check_size
+        from mitransient_lidar.rendering.shots.batches import check_size
+        from mitransient_lidar.transport.path_classes import check_solids
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         variants.leave_the_gpu("shots are rendered")
-        self._scene, self._params, self._target, self._components = scene, params, target, components
-        self._derivatives = derivatives
-        self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
+        self._open = functools.partial(open_scene, scene, instrument=instrument, sensor=sensor)
+        self._params, self._target = params, target
+        self._place = float(places[0, 0]), float(places[0, 1])
         self.session = self._open(self._at(*self._place))
+        loaded = self.session.scene, self.session.sensor
         if components:
-            check_components(self.session.scene)
-        self._integrator = choose_integrator(self.session.scene, None)
-        shifts = [(float(x), float(y)) for x, y in places - places[0]]
-        own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
-        self._axis = own if axis is None else _checked_axis(axis, own)
+            check_solids(sum(not shape.is_medium_transition() for shape in loaded[0].shapes()))
+        self._integrator = choose_integrator(loaded[0], None)
+        own = find_lidar_scene(*loaded, shifts=[(float(x), float(y)) for x, y in places - places[0]])
+        axis = own.axis if axis is None else _checked_axis(axis, own.axis)
         if check:
-            self.session.tell_record(self._axis)
-        self._renderer = self._prepare(self.session)
+            self.session.tell_axis(axis, own.record_end)
+        renderer = self._integrator.prepare(*loaded, axis=axis)
+        renderer = renderer.by_origin() if components else renderer
+        self.parameters = path_parameters(renderer, derivatives)
+        self._renderer = renderer.perturbed(perturbations(self.parameters)) if self.parameters else renderer
         self.lidar: LidarScene = self._renderer.scene
         self.companions = self._find_companions()
-        origins = self._renderer.classes.count if components else 0
-        self.parameters = path_parameters(self._renderer, derivatives)
         bins = self.lidar.receiver.pixels.count, self.lidar.axis.bin_count
-        check_size(len(places), *bins, origins, len(self.parameters))
-        probe = probe_echoes(self.lidar, self._renderer.sampler)
+        check_size(len(places), *bins, renderer.classes.count if components else 0, len(self.parameters))
+        probe = probe_echoes(self.lidar, renderer.sampler)
         self.window = error_window(self.lidar, probe)
         if check:
-            check_scene(self.lidar, self._renderer.sampler, probe)
+            check_scene(self.lidar, renderer.sampler, probe)
         self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
-
-    def _open(self, params: Mapping[str, Any]) -> Session:
-        """Load the scene with parameters."""
-        return open_scene(self._scene, params, instrument=self._instrument)
-
-    def _prepare(self, session: Session) -> PassRenderer:
-        """Return the renderer of a loaded scene, with the time bins of all shots."""
-        session.share_record(self._axis)
-        renderer = self._integrator.prepare(session.scene, session.sensor)
-        from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
-
-        renderer = renderer.by_origin() if self._components else renderer
-        if not self._derivatives:
-            return renderer
-        return renderer.perturbed(perturbations(path_parameters(renderer, self._derivatives)))
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""
@@ -116,14 +123,14 @@ class ShotScene:
 
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
         """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
-        from mitransient_lidar.rendering.shot_batches import ShotBatches
+        from mitransient_lidar.rendering.shots.batches import ShotBatches
 
         goal = None if error is None else (error, self.window)
         return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""
-        found = self.session.attributes(integrator=self._integrator, used=used, **self._described, **others)
+        found = self.session.attributes(self.lidar, self._integrator, used, **self._described, **others)
         replaced = (*AIM, *(() if self._target is None else TARGET))
         return {
             name: value
@@ -131,31 +138,25 @@ class ShotScene:
             if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
         }
 
-    def dataset(
-        self,
-        arrays: Sequence[FloatArray],
-        parts: Sequence[FloatArray],
-        attributes: Mapping[str, Any],
-        derivatives: Sequence[FloatArray] = (),
-    ) -> xr.Dataset:
-        """Return the labelled result of arrays as those of a `ShotRecord`."""
+    def dataset(self, record: ShotRecord, attributes: Mapping[str, Any]) -> xr.Dataset:
+        """Return the labelled result."""
         from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
-            *arrays,
+            *record.whole,
             time=self.lidar.axis,
             pixel_names=pixels.names,
             pixel_centres_mrad=1e3 * pixels.centres(),
             grid=pixels.grid,
             attributes=attributes,
         )
-        if parts:
-            dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
-        if derivatives:
-            about = ([getattr(one, name) for one in self.parameters] for name in ("name", "value", "units", "method"))
-            first = (np.moveaxis(values, 1, 0) for values in derivatives)
-            dataset = results.add_derivatives(dataset, *about, *first).transpose("shot", ...)
+        if record.parts:
+            names = self._renderer.classes.names
+            dataset = results.add_components(dataset, names, *record.parts).transpose("shot", ...)
+        if record.derivatives:
+            first = (np.moveaxis(values, 1, 0) for values in record.derivatives)
+            dataset = results.add_derivatives(dataset, *described(self.parameters), *first).transpose("shot", ...)
         return with_lines_of_sight(dataset, self.lidar)
 
 

@@ -1,0 +1,1 @@
+"""Series of shots at several places, rendered together."""
