@@ -166,8 +166,21 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     found = SceneRecord.of_dict(given)
     record = scene if isinstance(scene, SceneRecord) else found
     with as_user_error(), _own_file_resolver():
-        loaded = _instantiate(lambda config: mi.parser.parse_dict(config, {"type": "scene", **given}))
+        described = {"type": "scene", **_with_own_tensors(given)}
+        loaded = _instantiate(lambda config: mi.parser.parse_dict(config, described))
     return LoadedScene(loaded, "scene", {}, record)
+
+
+def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a dict with other tensors of the same numbers: Mitsuba empties those of which it makes textures."""
+    import mitsuba as mi
+
+    def own(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return _with_own_tensors(value)
+        return mi.TensorXf(value) if isinstance(value, mi.TensorXf) else value
+
+    return {name: own(value) for name, value in part.items()}
 
 
 def _load_xml(

@@ -147,7 +147,10 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
         raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
     if not isinstance(chosen, LidarIntegrator):
-        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
+        # Integrators in Python have the class names of their bases.
+        kind = chosen and (type(chosen).__name__ if not hasattr(mi, type(chosen).__name__) else chosen.class_name())
+        found = f"{kind} of the scene is not a lidar integrator" if kind else "the scene has no lidar integrator"
+        raise UserError(f"integrator: {found}; add <integrator type='lidar_merging'/>")
     if passive and not chosen.passive:
         raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")
     if chosen.passive and not passive:
