@@ -93,7 +93,7 @@ def base(**parts):
     film = {"type": "time_gated_film"}
     water = {"attenuation": 0.2, "scattering": 0.1, "backscattering": 0.003}
     return {
-        "tx": {"type": "lidar_transmitter", "divergence_mrad": 40.0, **lidar},
+        "tx": {"type": "lidar_transmitter", "divergence_mrad": 60.0, **lidar},
         "rx": {"type": "multipixel_receiver", "layout": "1x1", "field_of_view_mrad": 120.0, "film": film, **lidar},
         "sea": {"type": "ocean_surface", "spectrum": "flat", "interior": {"type": "layered_water", **water}},
         "bottom": {"type": "seabed", "depth": 6.0},
@@ -288,25 +288,25 @@ def ignored():
     }
 
 
-def energies(scene, integrator, passes):
-    """Return energies of passes by origin [J], shape (passes,) each."""
+def energies(scene, integrator, passes, share):
+    """Return energies of passes by origin [J], shape (passes,) each, of a share of the paths."""
     session = open_scene(scene)
     renderer = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).by_origin()
     rows = []
     for seed in range(passes):
-        energy = renderer.render_pass(seed, paths=PATHS[integrator]).histogram.energy()
+        energy = renderer.render_pass(seed, paths=int(share * PATHS[integrator])).histogram.energy()
         rows.append(energy.reshape(-1, renderer.classes.count, energy.shape[-1]).sum(axis=(0, 2)))
     return dict(zip(renderer.classes.names, np.transpose(rows), strict=True))
 
 
-def working(passes, groups):
-    """Yield the rows of the plugins of groups, which work."""
+def working(groups, passes, share=1.0):
+    """Yield the rows of the plugins of groups, which work, from passes of a share of the paths."""
     found = {}
     for group in groups:
         key = id(group.scene)
         if key not in found:
             counts = {"lidar_merging": group.factor * passes, "lidar_volpath": MORE * group.factor * passes}
-            found[key] = [energies(group.scene, name, count) for name, count in counts.items()]
+            found[key] = [energies(group.scene, name, count, share) for name, count in counts.items()]
         for plugin, told in group.plugins.items():
             yield Row(plugin, "works", told, tuple(one[group.origin.format(plugin)] for one in found[key]))
 
@@ -355,7 +355,7 @@ def rows(passes, wanted=()):
     with tempfile.TemporaryDirectory() as folder:
         groups = [group for builder in GROUPS for group in builder(Path(folder))]
         groups = [group for group in groups if not wanted or set(wanted) & group.plugins.keys()]
-        found = {row.plugin: row for row in working(passes, groups)}
+        found = {row.plugin: row for row in working(groups, passes)}
     if wanted:
         return found
     found |= {row.plugin: row for row in beside()}
