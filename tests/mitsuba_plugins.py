@@ -323,8 +323,9 @@ def beside():
         engine = {"type": "lidar_volpath", "paths_per_pass": 2**12}
         results.append(mitransient_lidar.render(base(**extra), integrator=engine, passes=2))
     assert_same_bits(*results)
-    told = {name: "the shape that carries it is a solid as others" for name in meters}
-    return [Row(name, "ignored", told.get(name, "")) for name in parts]
+    told = {name: "of a camera" if installed()[name] != "Sensor" else "beside the receiver" for name in parts}
+    told |= dict.fromkeys(meters, "beside the receiver; the shape that carries it is a solid as others")
+    return [Row(name, "ignored", told[name]) for name in parts]
 
 
 def refused(plugin, kind):
