@@ -63,7 +63,7 @@ class Group:
     origin
         Origin of the light that shows the plugin; `{}` is its name.
     factor
-        Passes for one of another group.
+        Paths for one of another group.
     """
 
     scene: dict
@@ -305,8 +305,8 @@ def working(groups, passes, share=1.0):
     for group in groups:
         key = id(group.scene)
         if key not in found:
-            counts = {"lidar_merging": group.factor * passes, "lidar_volpath": MORE * group.factor * passes}
-            found[key] = [energies(group.scene, name, count, share) for name, count in counts.items()]
+            counts = {"lidar_merging": passes, "lidar_volpath": MORE * passes}
+            found[key] = [energies(group.scene, name, count, share * group.factor) for name, count in counts.items()]
         for plugin, told in group.plugins.items():
             yield Row(plugin, "works", told, tuple(one[group.origin.format(plugin)] for one in found[key]))
 
