@@ -20,10 +20,26 @@ from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, S
 #: Name of a plugin, and endings of the libraries of plugins.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
 
-#: Plugins of Mitsuba that trust what they are given, and why they are refused.
-_TRUSTING = {
+#: Plugins of Mitsuba that are refused, and why.
+_REFUSED = {
     "blender": "it reads places of the memory",
     "serialized": "its indices are not checked; convert the mesh to PLY or OBJ",
+    "hair": "it needs colours; give fibres a diffuse or roughdielectric bsdf",
+    **dict.fromkeys(
+        ("circular", "measured_polarized", "polarizer", "retarder"), "light of a lidar scene has no polarisation"
+    ),
+    **dict.fromkeys(
+        ("blackbody", "d65", "irregular", "measured", "regular", "specfilm"),
+        "it depends on the wavelength, and a lidar scene has one; give values at that wavelength as numbers",
+    ),
+    **dict.fromkeys(
+        ("heterogeneous", "homogeneous"), "the medium of a lidar scene is layered_water, the interior of its sea"
+    ),
+    **dict.fromkeys(
+        ("area", "constant", "directional", "directionalarea", "envmap", "point", "projector", "spot"),
+        "the light of a lidar scene comes from one lidar_transmitter, and for images by daylight from sun and sky",
+    ),
+    **dict.fromkeys(("sunsky", "timed_sunsky"), "it needs colours; use sun and sky"),
 }
 
 _COORDINATES = ("x", "y", "z", "value")
@@ -40,6 +56,8 @@ _NUMBERS = {
     "look_at": ("origin", "target", "up"),
     "matrix": ("value",),
 }
+#: Rule of spectra, which Mitsuba would replace by their luminance.
+_AT_ONE_WAVELENGTH = "must be one number, the value at the laser's wavelength: others would be averaged by colour"
 #: Parameters of BSDFs that are shares of the light.
 _SHARE = re.compile(r"(^|_)(reflectance|transmittance)$")
 
@@ -79,21 +97,23 @@ def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
         _check_numbers(label, element.tagName, attribute, value)
     elif element.tagName in ("spectrum", "rgb") and attribute == "value":
         _check_spectrum(label, value)
+    elif element.tagName == "spectrum" and attribute == "filename":
+        raise label.refusal(_AT_ONE_WAVELENGTH)
     if attribute == "value" and element.tagName in ("float", "integer", "string"):
         parent: Any = element.parentNode
         for number in _numbers_in(value):
             _check_range(label.name, owner, parent.getAttribute("type"), number)
     if attribute == "value" and _is_share(element):
         for word in re.split(r"[\s,]+", value.strip()):
-            in_range(label.name, word.rpartition(":")[2], 0, 1)
+            in_range(label.name, word, 0, 1)
 
 
 def check_type(plugin: object) -> None:
-    """Raise `UserError` if the type of an object is not the name of a plugin: Mitsuba loads any path as a library."""
+    """Raise `UserError` if an object has a plugin that is refused, or no name of one: Mitsuba loads any path."""
     if not isinstance(plugin, str) or not _TYPE.fullmatch(plugin):
         raise UserError(f"type = {shown(plugin)} must be the name of a plugin, of letters, digits and underscores")
-    if plugin in _TRUSTING:
-        raise UserError(f"type = {plugin!r} is not loaded: {_TRUSTING[plugin]}")
+    if plugin in _REFUSED:
+        raise UserError(f"type = {plugin!r} is not loaded: {_REFUSED[plugin]}")
 
 
 def check_libraries(*folders: Path) -> None:
@@ -145,6 +165,9 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                 check_type(value)
             if isinstance(value, Mapping):
                 pending.append((f"{label}.", value, depth + 1))
+                given = value.get("filename", value.get("value", 0.0))
+                if value.get("type") == "spectrum" and not _is_plain(given):
+                    raise UserError(f"{label} = {shown(given)} {_AT_ONE_WAVELENGTH}")
                 if _SHARE.search(key) and _is_plain(value.get("value")):
                     _check_shares(label, value["value"])
             elif value is None or isinstance(value, (complex, bytes)):
@@ -200,9 +223,10 @@ def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
 
 
 def _check_spectrum(label: _Label, value: str) -> None:
-    """Check a spectrum, one number or ``wavelength:value`` pairs, or a colour, three numbers or ``#rrggbb``."""
-    for word in value.replace(",", " ").split() or [""]:
-        number = word.rpartition(":")[2]
+    """Check a spectrum, one number, or a colour, three numbers or ``#rrggbb``."""
+    for number in value.replace(",", " ").split() or [""]:
+        if ":" in number:
+            raise label.refusal(_AT_ONE_WAVELENGTH)
         if not number.startswith("#") and not is_number(number):
             raise label.refusal("must be a number")
         if is_number(number) and not np.isfinite(float(number)):

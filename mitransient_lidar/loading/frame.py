@@ -38,7 +38,7 @@ _BY_COORDINATES = ("bitmap", "checkerboard")
 #: Plugins of Mitsuba without a place of their own, of kinds that have one.
 _WITHOUT_PLACE = (
     *("area", "batch", "constant", "constvolume", "directional", "directionalarea", "envmap", "heterogeneous"),
-    *("homogeneous", "irradiancemeter", "merge", "shapegroup", "sky", "sun", "sunsky", "timed_sunsky"),
+    *("flat_sensor", "homogeneous", "irradiancemeter", "merge", "shapegroup", "sky", "sun", "sunsky", "timed_sunsky"),
 )
 
 

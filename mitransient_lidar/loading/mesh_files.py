@@ -1,4 +1,4 @@
-"""Check of PLY files before Mitsuba reads them: it trusts their counts and the indices of their faces.
+"""Checks of PLY files and grids before Mitsuba reads them: it trusts their counts and the indices of faces.
 
 A PLY file (Turk, 1994, "The PLY polygon file format") has a header of elements with counts and properties, and their
 values as text or as binary records. Mitsuba reads lists of three alone, so that all records of an element have one
@@ -8,6 +8,8 @@ length, and names the vertices ``vertex`` and the triangles ``face``.
 from __future__ import annotations
 
 import itertools
+import math
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -19,8 +21,11 @@ from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.validation import FloatArray
 
-#: Plugins that read PLY files.
-PLY_PLUGINS = ("ply", "ellipsoids", "ellipsoidsmesh")
+#: Plugins that read PLY files, and those that read grids.
+PLY_PLUGINS, GRID_PLUGINS = ("ply", "ellipsoids", "ellipsoidsmesh"), ("gridvolume", "sdfgrid")
+
+#: Header of a grid: mark and version, type of the numbers, cells along x, y, z, channels, bounding box.
+_GRID_HEADER = struct.Struct("<3sB5i6f")
 
 #: Types of NumPy by the names of those in a header.
 _TYPES = {
@@ -69,6 +74,19 @@ def check_ply(path: Path) -> None:
             for values in _binary(file, element, order) if order else _of_text(words, element):
                 if element.name == "face":
                     _check_faces(path, values[:, element.listed], counts.get("vertex", 0))
+
+
+def check_grid(path: Path) -> None:
+    """Raise `UserError` if a file of Mitsuba's ``gridvolume`` has other than the numbers that its header says."""
+    with damaged_file(f"{path} is damaged, or is not a grid of Mitsuba."), open_file(path) as file:
+        _, _, _, *counts, channels = _GRID_HEADER.unpack(file.read(_GRID_HEADER.size))[:7]
+        size = 4 * math.prod(counts) * channels + _GRID_HEADER.size
+        if min(*counts, channels) < 1 or size != path.stat().st_size:
+            told = " x ".join(map(str, counts))
+            raise UserError(
+                f"{path} has {path.stat().st_size} bytes, and says that it holds {told} cells of {channels} numbers, "
+                f"which would need {size}"
+            )
 
 
 def _check_faces(path: Path, indices: FloatArray, vertices: int) -> None:

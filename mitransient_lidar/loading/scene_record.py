@@ -42,7 +42,7 @@ from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
-from mitransient_lidar.loading.mesh_files import PLY_PLUGINS, check_ply
+from mitransient_lidar.loading.mesh_files import GRID_PLUGINS, PLY_PLUGINS, check_grid, check_ply
 from mitransient_lidar.loading.scene_json import from_json, to_json
 
 if TYPE_CHECKING:
@@ -337,7 +337,7 @@ def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> di
 
 @functools.lru_cache(maxsize=64)
 def _check_file(plugin: str, path: Path, _digest: str) -> None:
-    """Raise UserError if the name of a file has control characters, which Mitsuba would print, or a mesh is damaged.
+    """Raise UserError if the name of a file has control characters, which Mitsuba would print, or is damaged.
 
     A file with the same SHA-256 is checked once for a series of renders.
     """
@@ -345,6 +345,8 @@ def _check_file(plugin: str, path: Path, _digest: str) -> None:
         raise UserError(f"cannot read {path}: its name must have no control characters")
     if plugin in PLY_PLUGINS:
         check_ply(path)
+    if plugin in GRID_PLUGINS:
+        check_grid(path)
 
 
 def _copy_of(path: str, digest: str, folders: Sequence[Path]) -> str:

@@ -187,7 +187,10 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
         raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
     if not isinstance(chosen, LidarIntegrator):
-        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
+        # Integrators in Python have the class names of their bases.
+        kind = chosen and (type(chosen).__name__ if not hasattr(mi, type(chosen).__name__) else chosen.class_name())
+        found = f"{kind} of the scene is not a lidar integrator" if kind else "the scene has no lidar integrator"
+        raise UserError(f"integrator: {found}; add <integrator type='lidar_merging'/>")
     if passive and not chosen.passive:
         raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")
     if chosen.passive and not passive:
@@ -260,8 +263,21 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     found = SceneRecord.of_dict(given)
     record = scene if isinstance(scene, SceneRecord) else found
     with as_user_error(), _own_file_resolver():
-        loaded = _instantiate(lambda config: mi.parser.parse_dict(config, {"type": "scene", **given}))
+        described = {"type": "scene", **_with_own_tensors(given)}
+        loaded = _instantiate(lambda config: mi.parser.parse_dict(config, described))
     return LoadedScene(loaded, "scene", {}, record)
+
+
+def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a dict with other tensors of the same numbers: Mitsuba empties those of which it makes textures."""
+    import mitsuba as mi
+
+    def own(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return _with_own_tensors(value)
+        return mi.TensorXf(value) if isinstance(value, mi.TensorXf) else value
+
+    return {name: own(value) for name, value in part.items()}
 
 
 def _load_xml(

@@ -112,14 +112,19 @@ def _contacts(larger: mi.Shape, others: list[mi.Shape], groups: Sequence[mi.Shap
         return []
     ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
     si = scene_of_shapes(others, groups).ray_intersect(ray)
+    dr.eval(si)
     tolerance = _tolerance(dr.max(dr.abs(si.p)))
     back = mi.Ray3f(dr.fma(2 * tolerance, si.n, si.p), -si.n)
     back.maxt = 4 * tolerance
     on_larger = scene_of_shapes([larger], groups).ray_intersect(back, si.is_valid())
     same = si.is_valid() & on_larger.is_valid() & (dr.abs(on_larger.t - 2 * tolerance) < tolerance)
     same &= dr.abs(dr.dot(si.n, on_larger.n)) > _PARALLEL
-    rows = [np.array(values, np.float64).T[np.array(same)] for values in (si.p, si.n, on_larger.n)]
-    numbers = np.array(dr.reinterpret_array(mi.UInt32, met_shape(si)))[np.array(same)]
+    shape = dr.reinterpret_array(mi.UInt32, met_shape(si))
+    # One by one, each would trace the rays again.
+    dr.eval(same, shape, si.p, si.n, on_larger.n)
+    met = np.array(same)
+    rows = [np.array(values, np.float64).T[met] for values in (si.p, si.n, on_larger.n)]
+    numbers = np.array(shape)[met]
     for other in others:
         own = numbers == int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(other))[0])
         if own.sum() >= _LEAST_RAYS:

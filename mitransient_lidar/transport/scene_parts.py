@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -28,7 +30,7 @@ from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import shape_groups, without_unseen
+from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
 
 logger = logging.getLogger(__name__)
 
@@ -178,7 +180,8 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     Raises
     ------
     UserError
-        As `find_water`, `shape_groups` and `separate_contacts`, and for mirrored spheres.
+        As `find_water`, `shape_groups` and `separate_contacts`, for mirrored spheres, and for BSDFs that Mitsuba cannot
+        evaluate.
     """
     # Mitsuba's own loader joins meshes of equal BSDFs, without a bounding box.
     joined = [shape for shape in scene.shapes() if not shape.bbox().valid()]
@@ -187,6 +190,9 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     if joined:
         scene.parameters_changed([])
     groups = shape_groups(scene)
+    for shape in (*scene.shapes(), *(member for group in groups for member in children(group))):
+        if shape.bsdf() is not None:
+            _check_bsdf(shape)
     seen = without_unseen(scene, groups)
     found = WaterScene(seen, receiver, *find_water(seen), groups=groups)
     for solid in found.solids:
@@ -211,6 +217,28 @@ def _check_mirrored(solid: mi.Shape) -> None:
             f"to_world of sphere {solid.id()!r} mirrors it, which turns it inside out: it returns no light; leave the "
             "negative scale out, or set flip_normals"
         )
+
+
+def _check_bsdf(shape: mi.Shape) -> None:
+    """Refuse a BSDF that raises an error, or with a ``mesh_attribute`` that its shape lacks, which would be 0."""
+    bsdf, point = shape.bsdf(), dr.zeros(mi.SurfaceInteraction3f)
+    up = point.wi = mi.Vector3f(0, 0, 1)
+    try:
+        bsdf.sample(mi.BSDFContext(), point, mi.Float(0.5), mi.Point2f(0.5))
+        bsdf.eval(mi.BSDFContext(), point, up)
+    except RuntimeError as error:
+        reason = re.sub(r"\[[\w.:]+\] ", "", str(error)).splitlines()[0]
+        raise UserError(f"shape {shape.id()!r}: its bsdf {bsdf.class_name()} cannot be used: {reason}") from error
+    pending = [bsdf]
+    while pending:
+        for part in children(pending.pop()):
+            pending.append(part)
+            named = re.search(r'name = "(.*)"', str(part)) if part.class_name() == "MeshAttribute" else None
+            if named and not shape.has_attribute(named[1]):
+                raise UserError(
+                    f"mesh_attribute: shape {shape.id()!r} has no attribute {named[1]!r}, which its bsdf names; "
+                    "allowed are those of its PLY file"
+                )
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:

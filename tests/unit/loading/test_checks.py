@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 import mitransient_lidar
@@ -132,10 +133,40 @@ def test_libraries_in_the_current_folder_of_a_script_are_refused(tmp_path, monke
         open_scene({"type": "scene", "shape": {"type": "evil"}})
 
 
-@pytest.mark.parametrize("plugin", ["blender", "serialized"])
-def test_plugins_that_trust_what_they_are_given_are_refused(plugin):
+@pytest.mark.parametrize("plugin", ["blender", "serialized", "irregular", "polarizer", "homogeneous", "point"])
+def test_plugins_that_a_lidar_scene_cannot_have_are_refused(plugin, tmp_path):
+    """A polariser was left out as if it had no effect."""
     with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
         open_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
+    path = tmp_path / "scene.xml"
+    path.write_text(f'<scene version="3.0.0"><shape type="{plugin}"/></scene>')
+    with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
+        open_scene(path)
+
+
+@pytest.mark.parametrize("given", ['value="400:0.1, 700:0.3"', 'filename="a.spd"'])
+def test_spectra_by_wavelength_are_refused(given, tmp_path):
+    """Mitsuba takes their luminance: 0.204 where the value at 532 nm is 0.188."""
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><shape type="sphere"><bsdf type="diffuse">'
+        f'<spectrum name="reflectance" {given}/></bsdf></shape></scene>'
+    )
+    with pytest.raises(UserError, match="must be one number, the value at the laser's wavelength"):
+        open_scene(path)
+    name, _, value = given.replace('"', "").partition("=")
+    value = [(400.0, 0.1), (700.0, 0.3)] if name == "value" else value
+    reflectance = {"type": "spectrum", name: value}
+    with pytest.raises(UserError, match="must be one number, the value at the laser's wavelength"):
+        open_scene({"shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": reflectance}}})
+
+
+def test_a_dict_with_tensors_is_loaded_twice():
+    """Mitsuba empties the tensors of which it makes textures."""
+    bitmap = {"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 1), 0.5, np.float32)), "raw": True}
+    scene = {"shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": bitmap}}}
+    for _ in range(2):
+        assert open_scene(scene).scene.shapes()
 
 
 @pytest.mark.parametrize(
@@ -149,7 +180,7 @@ def test_the_name_of_the_scene_of_a_result_is_that_of_a_file(name):
 
 
 def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
-    """In the folder of the scene, in one that it names, in the current one, and of a texture, a mesh and a spectrum."""
+    """In the folder of the scene, in one that it names, in the current one, and of a texture and a mesh."""
     (tmp_path / "other").mkdir()
     (tmp_path / "here").mkdir()
     for folder in ("", "other", "here"):
@@ -159,7 +190,6 @@ def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
         '<shape type="ply"><string name="filename" value="{}"/></shape>',
         '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
         "</bsdf>",
-        '<bsdf type="diffuse"><spectrum name="reflectance" filename="{}"/></bsdf>',
     )
     for folder, part in itertools.product(("", "other", "here"), parts):
         text = f'<scene version="3.0.0"><path value="other"/>{part.format(f"pipe{folder}")}</scene>'

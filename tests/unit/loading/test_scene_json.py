@@ -29,8 +29,6 @@ def volume(**given):
         {"type": "checkerboard", "color0": 0.2, "color1": {"type": "bitmap", "bitmap": mi.Bitmap(COLOURS)}},
         volume(grid=mi.VolumeGrid(NUMBERS), to_world=mi.ScalarTransform4f().scale(2)),
         volume(data=mi.TensorXf(NUMBERS)),
-        {"type": "irregular", "wavelengths": "400, 500, 700", "values": "0.1, 0.2, 0.3"},
-        {"type": "spectrum", "value": [(400, 0.1), (700, 0.3)]},
     ],
     ids=lambda texture: "-".join(map(str, texture)),
 )

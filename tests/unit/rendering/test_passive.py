@@ -229,7 +229,7 @@ def test_invalid_options_end_with_one_sentence(arguments, message):
     [
         ({"sun": None, "sky": None}, "needs a sun or a sky"),
         ({"sun2": {"type": "sun"}}, "more than one sun"),
-        ({"lamp": {"type": "point"}}, "allows sun, sky and lidar_transmitter"),
+        ({"lamp": {"type": "point"}}, "type = .point. is not loaded.*from sun and sky"),
         ({"sun": {"type": "sun", "zenith_deg": 20.0}}, "degrees from where it is"),
     ],
 )

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import significance
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.solids import box_rays
 
@@ -84,6 +85,24 @@ def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
     assert shapes.keys() == copy.keys()
     for name, energy in shapes.items():
         assert copy[name] == pytest.approx(energy, rel=0.01), name
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "told"),
+    [
+        (
+            {"type": "bumpmap", "texture": CHECKS, "nested": {"type": "diffuse"}},
+            r"BumpMap cannot be used: .*eval_1_grad",
+        ),
+        ({"type": "diffuse", "reflectance": {"type": "blackbody", "temperature": 5000.0}}, "non-spectral"),
+        ({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_a"}}, "no attribute 'vertex_a'"),
+    ],
+)
+def test_bsdfs_that_cannot_be_evaluated_are_refused(lidar_scene, bsdf, told):
+    """The first two ended in a traceback, and the last one was black."""
+    scene = lidar_scene(extra={"ball": {"type": "sphere", "radius": 0.1, "bsdf": bsdf}})
+    with pytest.raises(UserError, match=f"shape 'ball'.*{told}"):
+        find_lidar_scene(scene, scene.sensors()[0])
 
 
 def test_rays_meet_every_side_of_a_box():
