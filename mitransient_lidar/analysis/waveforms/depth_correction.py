@@ -131,7 +131,7 @@ def correct_depths(
     mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
     interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
     difference over the distance, the mean ratio of both rates in eight tables; one node gives 0, one wind of ripples
-    0.6 cm^2 for each unit of the inverse slope variance, the mean of those of the tables. Rates of winds and ripples are
+    0.6 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates of winds and ripples are
     less the variances of the means of places. Cells in which fewer of the shots have a depth count only where no other
     ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
