@@ -283,10 +283,14 @@ def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
         for axis, nodes in (("depth", calm["depth"]), ("water", calm["attenuation"])):
             if nodes.size < 3:
                 continue
-            whole = bias.where(bias.notnull().all(axis))
+            whole = bias.where((bias.notnull() & nodes.notnull()).all(axis))
+            if whole.isnull().all():
+                continue
             differences = whole.diff(axis) ** 2 / np.abs(nodes.diff(axis))
             ratios.append(float(depth_correction._rate(whole, nodes, axis).mean() / differences.mean()))
-    assert np.mean(ratios) == pytest.approx(depth_correction._OF_TWO, abs=0.005)
+    # Of one table it is from 0.01 to 1.7.
+    assert len(ratios) > 10
+    assert abs(np.mean(ratios) - depth_correction._OF_TWO) < 2 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)) < 0.3
 
 
 def test_unknown_cells_take_the_nearest_known_one():
