@@ -16,6 +16,7 @@ from mitransient_lidar.analysis.waveforms.depth_errors import rendered_bin_ns, r
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_echo
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
+from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.formats import input_format
 from mitransient_lidar.results.geometry import required_number
@@ -27,10 +28,10 @@ _TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
 #: Share of shots with a depth from which a bias counts for the changes between nodes; fewest places of a spread.
 _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
-#: and waters, over a level sea, of the shipped tables.
+#: and waters, over a level sea, of eight tables.
 _OF_TWO = 0.47
-#: Rate of level seas between ripples where a table has those of one wind [m^2 per m/s]: the mean of three tables.
-_OF_RIPPLES = 8.6e-4
+#: Rate of level seas between ripples where a table has those of one wind [m^2 per inverse slope variance], by tables.
+_OF_RIPPLES = 4.4e-5
 _SAME_RING = 0.05  # largest difference of the radii of pixels on a ring, over the largest radius
 _ANGLE_DIGITS = 6  # of angles between pixels [deg]
 _NEAR = 2.0  # largest error of a depth that counts [m]
@@ -100,11 +101,12 @@ def correct_depths(
     -------
     xarray.Dataset
         The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases are
-        interpolated linearly in the angle from nadir, the wind or, of level seas, the wind of the ripples, the
-        attenuation of the column (`usual_attenuation`) among columns as long, and the depth, as are spreads; outside
-        the table they are those of its ends. Where the column has no attenuation, the mean over the waters counts, each
-        with the share of its bottoms at this depth that are found. A bias counts with the share
-        bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        interpolated linearly in the angle from nadir, the wind or, of level seas, the inverse slope variance of the
+        ripples, the attenuation of the column (`usual_attenuation`) among columns as long, and the depth, as are
+        spreads. Outside the table they are those of its ends, but spreads that grow with the angle or the wind go on
+        growing. Where the column has no attenuation, the mean over the waters counts, each with the share of its
+        bottoms at this depth that are found, and depths of the table without attenuation alone; where it has one,
+        those with it. A bias counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
         ``depth_m_method_error`` is the root of the sum of the squares of
 
@@ -123,16 +125,15 @@ def correct_depths(
 
     Notes
     -----
-    The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times
-    g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
-    geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
-    mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
-    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
-    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0, one wind of ripples
-    8.6 cm^2 per m/s, the mean of three instruments. Rates of winds and
-    ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
-    where no other ones do. Without any bias of an estimator in a pixel, depths and
-    errors stay as they are.
+    The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times g h/(g
+    + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of geostatistics,
+    Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the mean over the
+    cells of the lowest wind in which half of the shots have a depth: of the squared differences from the interpolation
+    between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared difference
+    over the distance, the mean ratio of both rates in eight tables (0.57 +- 0.12 in the shipped ones); one node gives
+    0, one wind of ripples 0.44 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates of winds
+    and ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
+    where no other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
     instrument = found.attrs.get("instrument", "")
     if instrument != table.attrs["instrument"]:
@@ -146,20 +147,22 @@ def correct_depths(
             raise UserError(f"the corrections lack the {name} {missing[0]!r}")
     several = "estimator" in found.dims
     names = found["estimator"].values if several else found.attrs["estimators"]
+    depth = found["depth_m"] if several else found["depth_m"].expand_dims(estimator=list(names))
+    arranged = depth.transpose("estimator", "pixel", ..., "echo")
+    opacity, at_depth = _opacity(found, arranged)
     learnt = _learnt(table.sel(pixel=found["pixel"].values, estimator=list(names)))
     if turn_deg != 0:
         learnt = turned_pixels(learnt, found["angle_x"].values, found["angle_y"].values, turn_deg)
+    others = _of_columns(learnt, bool(np.isnan(opacity)))
+    learnt = _of_columns(learnt, bool(np.isfinite(opacity)))
     # Linear are spreads, not their squares: where surface echoes fade with the angle, errors of 22 degrees would be
     # mostly those of 25.
     learnt["deviation"] = learnt["variance"] ** 0.5
     wind, level = _sea(found, wind_speed)
     angle = required_number(found.attrs, "off_nadir_deg")
-    cell, rates = _of_sea(learnt, wind, level), _walks(learnt, angle)
+    cell, rates = _of_sea(learnt, wind, level), _walks(learnt, others, angle)
     nodes = table["off_nadir_deg"].values
     cell = _between(cell, "off_nadir_deg", nodes, angle)
-    depth = found["depth_m"] if several else found["depth_m"].expand_dims(estimator=list(names))
-    arranged = depth.transpose("estimator", "pixel", ..., "echo")
-    opacity, at_depth = _opacity(found, arranged)
     depths = table["depth"].values
     attenuation = _along_depth(cell["attenuation"].transpose("water", "depth").values, depths, np.array(at_depth))
     of_waters = _shares(attenuation, opacity)
@@ -182,7 +185,9 @@ def correct_depths(
         variance[e, p] = deviation[e, p] ** 2
         if np.isnan(opacity):
             variance[e, p] += np.sum(shares * (rows["bias"] - amount[e, p]) ** 2, axis=0)
-        by_depth = np.tensordot(rate["depth"], shares, 1) * _walked(depths, at)
+        known = [np.where(row, depths, np.nan) for row in one["bias"].transpose("water", "depth").notnull().values]
+        walked = np.stack([_walked(depths if np.isnan(nodes).all() else nodes, at) for nodes in known])
+        by_depth = np.tensordot(rate["depth"], shares * walked, 1)
         between = np.tensordot(rate["off_nadir_deg"], shares, 1) * by_angle + float(rate["water"]) * by_water
         between = between + np.tensordot(rate["ripples" if level else "wind_speed"], shares, 1) * by_wind
         variance[e, p] += by_depth + between if one["bias"].notnull().any() else np.nan
@@ -237,6 +242,17 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
     )
 
 
+def _of_columns(learnt: xr.Dataset, known: bool) -> xr.Dataset:
+    """Return a table without the biases of columns whose attenuation is not `known`, or is where it is not.
+
+    Without it the echo of a bottom is not separated from its column, and has another bias, no neighbour in depth.
+    A water without any left stays as it is.
+    """
+    alike = learnt["attenuation"].notnull() == known
+    alike = alike | ~(alike & learnt["bias"].notnull()).any("depth")
+    return learnt.assign({name: learnt[name].where(alike) for name in ("bias", "variance", "noise_share", "uncertain")})
+
+
 def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, turn_deg: float) -> xr.Dataset:
     """Return a table for pixels that are turned about the receiver's axis.
 
@@ -278,19 +294,36 @@ def _of_sea(learnt: xr.Dataset, wind: float, level: bool) -> xr.Dataset:
     waves, ripples = learnt.isel(wind_speed=~rows), learnt["ripples"].values[rows]
     calm = learnt.isel(wind_speed=rows)
     if rows.any():
-        calm = _between(calm, "wind_speed", ripples, np.clip(wind, ripples[0], ripples[-1]))
+        calm = _between(calm, "wind_speed", _calmness(ripples), float(_calmness(wind)[0]))
         if level or rows.all():
             return calm
         waves = xr.concat([calm.expand_dims(wind_speed=[0.0]), waves.drop_vars("ripples")], "wind_speed")
     return _between(waves, "wind_speed", waves["wind_speed"].values, wind)
 
 
+def _calmness(winds: npt.ArrayLike) -> FloatArray:
+    """Return minus the inverse slope variances of ripples of winds [m/s], which ascend with these.
+
+    The logarithm of the echo of a level surface is linear in it, and errors of depths follow this echo.
+    """
+    return np.array([-1 / sum(cox_munk(float(wind))) for wind in np.atleast_1d(winds)])
+
+
 def _between(table: xr.Dataset, axis: str, nodes: FloatArray, value: float) -> xr.Dataset:
-    """Return a table between the nodes of an axis, linearly; a cell that one of both lacks is that of the other."""
+    """Return a table between the nodes of an axis, linearly; a cell that one of both lacks is that of the other.
+
+    Beyond its ends values are those of the ends, but ``deviation`` goes on linearly where it ascends outwards.
+    """
     place = float(np.interp(value, nodes, np.arange(nodes.size)))
     low = int(place)
     first, second = (table.isel({axis: min(one, nodes.size - 1)}, drop=True) for one in (low, low + 1))
-    return first.fillna(second) * (1 - (place - low)) + second.fillna(first) * (place - low)
+    cell = first.fillna(second) * (1 - (place - low)) + second.fillna(first) * (place - low)
+    if "deviation" in table and nodes.size > 1 and not nodes[0] <= value <= nodes[-1]:
+        end, inner = (0, 1) if value < nodes[0] else (-1, -2)
+        last, former = (table["deviation"].isel({axis: one}, drop=True) for one in (end, inner))
+        beyond = (value - nodes[end]) / (nodes[end] - nodes[inner])
+        cell["deviation"] = cell["deviation"] + beyond * (last - former).clip(min=0).fillna(0)
+    return cell
 
 
 def _walked_of_sea(table: xr.Dataset, wind: float, level: bool) -> float:
@@ -298,31 +331,33 @@ def _walked_of_sea(table: xr.Dataset, wind: float, level: bool) -> float:
     rows = table["wind_speed"].values == 0
     nodes = table["ripples"].values[rows == level] if np.any(rows == level) else table["wind_speed"].values
     nodes = np.append(nodes, 0.0) if rows.any() and not level else nodes
-    return float(_walked(nodes, wind))
+    return float(_walked(_calmness(nodes), _calmness(wind))[0] if level else _walked(nodes, wind))
 
 
-def _walks(learnt: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
+def _walks(learnt: xr.Dataset, others: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
     """Return the rates of the random walks of biases along the axes of a table [m^2 per unit], as `correct_depths`.
 
-    All but that of ``water`` are over water; a water without them has the mean of the others, 0 without any. Those of
-    ``wind_speed`` and ``ripples`` are between the angles of the table, less the variance of the means of places.
+    All but that of ``water`` are over water; a water without them has the mean of the others, or that of the `others`,
+    columns of the other kind, 0 without any. Those of ``wind_speed`` and ``ripples`` are between the angles of the
+    table, less the variance of the means of places.
     """
-    calm = learnt.isel(wind_speed=0)
-    bias = calm["bias"].where(calm["found"] >= _USUAL)
-    rates: dict[str, xr.DataArray] = {}
-    for axis in ("off_nadir_deg", "depth", "water"):
-        nodes = calm["attenuation"] if axis == "water" else calm[axis]
-        rate = _rate(bias, nodes, axis)
+
+    def of_lowest(table: xr.Dataset, axis: str) -> xr.DataArray:
+        calm = table.isel(wind_speed=0)
+        bias = calm["bias"].where(calm["found"] >= _USUAL)
+        rate = _rate(bias, calm["attenuation"] if axis == "water" else calm[axis], axis)
         rate = rate.mean([dim for dim in rate.dims if dim == axis or dim not in ("water", "estimator", "pixel")])
-        if axis != "water":
-            rate = rate.fillna(rate.mean("water")).transpose("water", ...)
-        rates[axis] = rate.fillna(0)
+        return rate if axis == "water" else rate.fillna(rate.mean("water")).transpose("water", ...)
+
+    axes = ("off_nadir_deg", "depth", "water")
+    rates = {axis: of_lowest(learnt, axis).fillna(of_lowest(others, axis)).fillna(0) for axis in axes}
     rows = learnt["wind_speed"] == 0
     for name, own in (("ripples", learnt.isel(wind_speed=rows)), ("wind_speed", learnt.isel(wind_speed=~rows))):
         if own.sizes["wind_speed"] < 2:
             rates[name] = xr.full_like(rates["depth"], _OF_RIPPLES if name == "ripples" else 0.0)
             continue
-        usual, steps = own.where(own["found"] >= _USUAL), np.diff(own["ripples"].values)
+        usual, places = own.where(own["found"] >= _USUAL), own["ripples"].values
+        steps = np.diff(_calmness(places) if name == "ripples" else places)
         first, second = (usual.isel(wind_speed=part).drop_vars("wind_speed") for part in (slice(-1), slice(1, None)))
         change = (second["bias"] - first["bias"]) ** 2 - first["uncertain"] - second["uncertain"]
         change = _OF_TWO * change / xr.DataArray(steps, dims="wind_speed")

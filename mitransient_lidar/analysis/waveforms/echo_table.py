@@ -412,9 +412,8 @@ def _label(
     for suffix, of in (("", ""), ("_stderr", "standard error of the "), ("_method_error", by_places)):
         values = table["surface_time_ns" + suffix]
         described = {"units": "ns", "long_name": f"{of}arrival of the surface"}
-        inner = ("estimator",) if several else ()
-        values = values.reshape(*shape, *values.shape[1:][: len(inner)])
-        data["surface_time_ns" + suffix] = (*dims, *inner), values, described
+        inner, sizes = ("estimator",) * several, values.shape[1 : 1 + several]
+        data["surface_time_ns" + suffix] = (*dims, *inner), values.reshape(*shape, *sizes), described
     meanings = {
         "units": "1",
         "long_name": "problems of the echo",

@@ -121,19 +121,62 @@ def test_unknown_water_is_all_waters_in_which_the_bottom_is_seen():
 
 
 def test_ripples_are_an_axis_of_level_seas():
-    """Biases of 1 and 7 cm with ripples of 3 and 6 m/s: the walk has 0.47 of 6^2/3 cm^2 for each m/s."""
+    """Biases of 1 and 7 cm with ripples of 3 and 6 m/s are linear in the inverse slope variance, as is their walk.
+
+    At 22 degrees the echo of a level surface has the same ratio from 2 to 2.9 m/s as from 3 to 6 m/s.
+    """
     made = xr.concat([table().isel(wind_speed=[0]), table()], "wind_speed")
     made = made.assign_coords(ripples=("wind_speed", [3.0, 6.0, 6.0]))
     made["bias"][:], made["spread"][:] = 0.0, 0.0
     made["bias"][{"wind_speed": 0}], made["bias"][{"wind_speed": 1}] = 0.01, 0.07
-    rate = 0.47 * 0.06**2 / 3
-    for ripples, bias, away in ((3.0, 0.01, 0.0), (4.0, 0.03, 2 / 3), (1.0, 0.01, 2.0), (9.0, 0.07, 3.0)):
+
+    def inverse(ripples):
+        return 1 / (0.003 + 5.08e-3 * ripples)  # Cox and Munk
+
+    whole = inverse(3.0) - inverse(6.0)
+    for ripples in (2.0, 3.0, 3.5, 5.0, 9.0):
         found = echoes([6.0], several=False, surface_heights_m=[0.0, 0.0], **{"scene.wind_speed": ripples})
         bottom = correct_depths(found, made).sel(echo="bottom", pixel="red")
+        low, high = inverse(3.0) - inverse(ripples), inverse(ripples) - inverse(6.0)
+        away = -low if low < 0 else -high if high < 0 else low * high / whole
+        bias = 0.01 + 0.06 * np.clip(low / whole, 0, 1)
         assert bottom["depth_correction_m"].item() == pytest.approx(bias)
-        assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(rate * away), abs=1e-9)
+        walked = np.sqrt(0.47 * 0.06**2 / whole * away)
+        assert bottom["depth_m_method_error"].item() == pytest.approx(walked, abs=1e-9)
+    found = echoes([6.0], several=False, surface_heights_m=[0.0, 0.0], **{"scene.wind_speed": 3.0})
     bottom = correct_depths(found, made.isel(wind_speed=[1, 2])).sel(echo="bottom", pixel="red")
-    assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(3 * depth_correction._OF_RIPPLES))
+    assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(whole * depth_correction._OF_RIPPLES))
+
+
+def test_spreads_that_grow_outwards_go_on_beyond_the_ends():
+    """Waves of 9 m/s have more than the 8 cm of 6 m/s; at 25 degrees the 4 cm of 20 degrees stay those of the end."""
+    made = table()
+    made["bias"][:] = 0.0
+    made["spread"][:] = xr.DataArray([0.02, 0.08], dims="wind_speed")
+    for wind, spread in ((3.0, 0.05), (6.0, 0.08), (9.0, 0.11)):
+        bottom = correct_depths(echoes([6.0]), made, wind_speed=wind).sel(echo="bottom")
+        np.testing.assert_allclose(bottom["depth_m_method_error"], spread)
+    made["spread"][:] = xr.DataArray([0.06, 0.04], dims="off_nadir_deg")
+    for angle, spread in ((15.0, 0.05), (25.0, 0.04), (5.0, 0.07)):
+        bottom = correct_depths(echoes([6.0], off_nadir_deg=angle), made).sel(echo="bottom")
+        np.testing.assert_allclose(bottom["depth_m_method_error"], spread)
+
+
+def test_columns_with_and_without_attenuation_have_no_bias_in_common():
+    """At 2 m no column is measured, and the bias is -20 cm; at 6 and 10 m it is 10 cm."""
+    made = table()
+    made["attenuation"] = made["attenuation"].where(made["depth"] > 2)
+    made["bias"] = xr.zeros_like(made["bias"]) + xr.where(made["depth"] > 2, 0.1, -0.2)
+    for attenuation, bias in ((0.3, 0.1), (np.nan, -0.2)):
+        corrected = correct_depths(echoes([4.0], attenuation, several=False), made).isel(pixel=0, echo=-1)
+        assert corrected["depth_correction_m"].item() == pytest.approx(bias)
+        # The spread is 2 cm at 2 m, 6 cm at 6 m.
+        assert corrected["depth_m_method_error"].item() == pytest.approx(0.06 if bias > 0 else 0.02)
+    # Of a single depth without attenuation, the walk of the other columns counts.
+    made["bias"] = made["bias"] + xr.where(made["depth"] > 6, 0.04, 0.0)
+    corrected = correct_depths(echoes([4.0], np.nan, several=False), made).isel(pixel=0, echo=-1)
+    walked = 2 * 0.47 * 0.04**2 / 4
+    assert corrected["depth_m_method_error"].item() == pytest.approx(np.sqrt(0.02**2 + walked))
 
 
 def test_attenuation_is_compared_with_that_of_columns_as_long():
@@ -240,10 +283,14 @@ def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
         for axis, nodes in (("depth", calm["depth"]), ("water", calm["attenuation"])):
             if nodes.size < 3:
                 continue
-            whole = bias.where(bias.notnull().all(axis))
+            whole = bias.where((bias.notnull() & nodes.notnull()).all(axis))
+            if whole.isnull().all():
+                continue
             differences = whole.diff(axis) ** 2 / np.abs(nodes.diff(axis))
             ratios.append(float(depth_correction._rate(whole, nodes, axis).mean() / differences.mean()))
-    assert np.mean(ratios) == pytest.approx(depth_correction._OF_TWO, abs=0.005)
+    # Of one table it is from 0.01 to 1.7.
+    assert len(ratios) > 10
+    assert abs(np.mean(ratios) - depth_correction._OF_TWO) < 2 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)) < 0.3
 
 
 def test_unknown_cells_take_the_nearest_known_one():
