@@ -129,12 +129,12 @@ def test_grids_of_other_sizes_than_their_header_says_are_refused(tmp_path, kind)
     grid = {"type": kind, "filename": str(path)}
     texture = {"type": "volume", "volume": grid}
     held = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": texture}} if kind == "gridvolume" else grid
-    assert load({"type": "scene", "part": held}).scene.shapes()
+    assert open_scene({"type": "scene", "part": held}).scene.shapes()
     data = path.read_bytes()
     for counts in ((2**30,) * 3, (4, 3, 3), (-4, -3, 2)):
         path.write_bytes(data[:8] + np.array(counts, "<i4").tobytes() + data[20:])
         with pytest.raises(UserError, match=r"grid.vol has \d+ bytes, and says that it holds .* cells"):
-            load({"type": "scene", "part": held})
+            open_scene({"type": "scene", "part": held})
     path.write_bytes(b"VOL")
     with pytest.raises(UserError, match=r"grid.vol is damaged, or is not a grid of Mitsuba"):
-        load({"type": "scene", "part": held})
+        open_scene({"type": "scene", "part": held})
