@@ -8,8 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, integer
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import MOST_BINS, TimeAxis
 from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.histogram import TransientHistogram

@@ -10,8 +10,7 @@ from scipy.integrate import quad
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates import cut as gating
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_stack
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
 PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])

@@ -15,8 +15,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
 from mitransient_lidar.physics.sea.realization import heights_of, wave_coefficients
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
-from mitransient_lidar.physics.sea.wave_spectrum import variances_along
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, variances_along
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 BoolArray = npt.NDArray[np.bool_]
