@@ -132,13 +132,6 @@ class GateShape:
             return float(self.times_ns[0]), float(self.times_ns[-1])
         return -0.5 * _EDGE_PER_RISE * self.rise_ns, self.width_ns + 0.5 * _EDGE_PER_RISE * self.fall_ns
 
-    def transmission(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Transmission, 0 to 1, at the times `t_ns` [ns] after the half height of the rising edge."""
-        t = np.asarray(t_ns, dtype=np.float64)
-        if self.times_ns.size:
-            return np.asarray(np.interp(t, self.times_ns, self.values, left=0.0, right=0.0))
-        return np.asarray(_edge(t, self.rise_ns) - _edge(t - self.width_ns, self.fall_ns))
-
     def open_time(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Integral of the transmission [ns] up to the times `t_ns` [ns] after the half height of the rising edge."""
         t = np.asarray(t_ns, dtype=np.float64)
@@ -147,16 +140,8 @@ class GateShape:
         return np.asarray(_edge_integral(t, self.rise_ns) - _edge_integral(t - self.width_ns, self.fall_ns))
 
 
-def _edge(t: FloatArray, rise: float) -> FloatArray:
-    """Edge from 0 to 1, half open at t = 0."""
-    length = _EDGE_PER_RISE * rise
-    if length == 0:
-        return np.asarray(np.where(t >= 0, 1.0, 0.0))
-    return np.asarray(np.sin(0.5 * np.pi * np.clip(t / length + 0.5, 0, 1)) ** 2)
-
-
 def _edge_integral(t: FloatArray, rise: float) -> FloatArray:
-    """Integral of `_edge` up to t."""
+    """Integral of an edge from 0 to 1, half open at t = 0, up to t."""
     length = _EDGE_PER_RISE * rise
     if length == 0:
         return np.maximum(t, 0)

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from oracles.gates import transmission
 from scipy.integrate import quad
 
 from mitransient_lidar import results
@@ -71,7 +72,7 @@ def test_gates_integrate_the_waveform(train):
         joules = (
             1e-9
             * quad(
-                lambda t, gate=gate: float(power(t) * train.shape.transmission(t - train.starts_ns[gate])),
+                lambda t, gate=gate: float(power(t) * transmission(train.shape, t - train.starts_ns[gate])),
                 low,
                 high,
                 points=[p for p in points if low < p < high],
