@@ -8,8 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO
 from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.transport.histogram import TransientHistogram

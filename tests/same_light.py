@@ -7,7 +7,7 @@ Run by hand, before a change and after it, with the same package versions, varia
     python tests/same_light.py compare before --only flights
 
 Cases are all shipped scenes with both integrators (daylight with its own), all instruments over a default scene,
-images, series of shots, derivatives, light by origin, other values from the same paths, a flight and a scene of Python.
+images, series of shots, derivatives, light by origin, a flight and a scene of Python.
 Results differ in a case when a variable or a coordinate has other bits; a case also fails when attributes that state a
 number differ. Where bits differ, the largest difference beside its standard error is printed.
 """

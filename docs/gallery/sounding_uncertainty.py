@@ -9,8 +9,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
+from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
-from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS
 
 # %%
 # One wind and one water, and few places of the sea: a table for a survey takes more, as the guide of uncertainties has.

@@ -155,10 +155,9 @@ def tpu(
     single soundings, measured and corrected, and the orders of IHO S-44 that they meet as NetCDF file, figures, and the
     fits of the part below the sea surface as CSV files for uncertainty tools. Prints TVU at 95 % [cm] and the fits.
     """
-    from mitransient_lidar.analysis.depth_uncertainty import write_fits
+    from mitransient_lidar.analysis.depth_uncertainty import TrajectoryErrors, write_fits
     from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
     from mitransient_lidar.loading.instruments import read_instrument
-    from mitransient_lidar.physics.lidar.sounding_errors import TrajectoryErrors
     from mitransient_lidar.plots.studies.depth_uncertainty import plot_orders, plot_uncertainty
     from mitransient_lidar.studies import depth_uncertainty as study
 

@@ -6,6 +6,8 @@ import math
 import operator
 import os
 import resource
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +168,22 @@ def time_samples(times_ns: npt.ArrayLike, name: str, values: npt.ArrayLike) -> t
     if t.shape != v.shape:
         raise UserError(f"times_ns of shape {t.shape} and {name} of shape {v.shape} must have equal lengths")
     return t, v
+
+
+def checked(check: Callable[..., object], *limits: float, default: Any = MISSING) -> Any:
+    """Return a field of a dataclass `Checked` whose value a validator must accept, with its limits."""
+    return field(default=default, metadata={"check": lambda name, value: check(name, value, *limits)})
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Dataclass whose fields by `checked` are validated in their order; None may stay where it is the default."""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if "check" in one.metadata and not (value is None and one.default is None):
+                one.metadata["check"](one.name, value)
 
 
 def usable_memory() -> float:

@@ -1,6 +1,8 @@
-"""Integrals and crossings of functions that are linear between nodes."""
+"""Integrals and crossings of functions that are linear between nodes, and the inside of polygons."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -33,3 +35,17 @@ def first_crossing(t: FloatArray, values: FloatArray, level: float) -> float:
     if i == 0:
         return float(t[0])
     return float(t[i - 1] + (level - values[i - 1]) / (values[i] - values[i - 1]) * (t[i] - t[i - 1]))
+
+
+def inside_polygon(corners: FloatArray, x: Any, y: Any) -> Any:
+    """Return whether points, arrays of any library, have an odd number of edges between them and x = infinity.
+
+    Corners (x, y) have the shape (n, 2), at least three that are not on one line.
+    """
+    inside: Any = None
+    # Python numbers: NumPy scalars would turn Dr.Jit arrays into NumPy ones.
+    for (x0, y0), (x1, y1) in zip(corners.tolist(), np.roll(corners, -1, axis=0).tolist(), strict=True):
+        if y0 != y1:
+            beyond = ((y < y0) != (y < y1)) & (x < x0 + (y - y0) * ((x1 - x0) / (y1 - y0)))
+            inside = beyond if inside is None else inside ^ beyond
+    return inside

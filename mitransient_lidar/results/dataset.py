@@ -163,7 +163,9 @@ def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.Arr
     """
     values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
     coords = {"origin": (np.array(origins, dtype=str), {"long_name": "where the light comes from"})}
-    return _add(dataset, "by_origin", coords, values, lambda about: _suffixed(about, ", by origin"))
+    return _add(
+        dataset, "by_origin", coords, values, lambda about: {**about, "long_name": f"{about['long_name']}, by origin"}
+    )
 
 
 def add_derivatives(
@@ -240,11 +242,6 @@ def _add(
         values = np.asarray(array, dtype=np.float64).reshape(len(coords[dim][0]), *shape)
         data[_with_ending(name, ending)] = ((dim, *dims), values, attributes)
     return dataset.assign(data).assign_coords({name: (dim, *about) for name, about in coords.items()})
-
-
-def _suffixed(about: Mapping[str, str], suffix: str) -> dict[str, str]:
-    """Return attributes of a variable with a suffix of its long name."""
-    return {**about, "long_name": about["long_name"] + suffix}
 
 
 def _with_ending(name: str, ending: str) -> str:

@@ -22,8 +22,7 @@ import xarray as xr
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number
 

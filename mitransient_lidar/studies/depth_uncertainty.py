@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.depth_uncertainty import sounding_uncertainty
+from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS, TrajectoryErrors, sounding_uncertainty
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, finite_array
 from mitransient_lidar.loading.instruments import read_instrument
-from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS, TrajectoryErrors
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.studies.depth_bias import depth_bias

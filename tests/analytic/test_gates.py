@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.gates import transmission
 from significance import largest_z
 
 import mitransient_lidar
@@ -42,7 +43,7 @@ def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
         # Bins are short against pulse and edges: power is linear, and the shutter sampled, within each.
         fine = np.linspace(time[0], time[-1], 20 * len(time))
         power = np.array([np.interp(fine, time, pixel) for pixel in result["waveform"].values])
-        energy = np.trapezoid(power * train.shape.transmission(fine - train.start_ns), 1e-9 * fine, axis=1)
+        energy = np.trapezoid(power * transmission(train.shape, fine - train.start_ns), 1e-9 * fine, axis=1)
         np.testing.assert_allclose(result["gate_energy"].values[:, gate], energy, rtol=0.01)
 
 

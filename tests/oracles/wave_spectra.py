@@ -3,8 +3,8 @@
 import numpy as np
 
 from mitransient_lidar.physics.sea.realization import facet_slope_variance, heights_of, wave_coefficients, wave_numbers
-from mitransient_lidar.physics.sea.sea_state import SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import SeaState
 
 
 def directional(spectrum, kx, ky):

@@ -1,4 +1,4 @@
-"""Contrast of regions or gates, and the range of the echo in every pixel, from gated images."""
+"""Range of the echo in every pixel, from gated images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer
+from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
@@ -20,15 +20,6 @@ _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most
 _CERTAIN = 4.0  # standard errors that are enough for any gate
 _FIRST_ECHOES = 1.0  # percentile of the echoes' times before which all pixels see the column
 _BLOCK = 8192  # pixels computed at once
-
-
-class Contrast(NamedTuple):
-    """Contrast of a against b with standard errors, NaN where undefined."""
-
-    michelson: FloatArray
-    michelson_stderr: FloatArray
-    weber: FloatArray
-    weber_stderr: FloatArray
 
 
 class RangeImage(NamedTuple):
@@ -55,44 +46,6 @@ class DepthImage(NamedTuple):
     sigma: FloatArray
     method_error: FloatArray
     confidence: FloatArray
-
-
-def contrast(
-    a: npt.ArrayLike, b: npt.ArrayLike, a_stderr: npt.ArrayLike, b_stderr: npt.ArrayLike, correlation: float = 0.0
-) -> Contrast:
-    """Return Michelson's contrast (a - b) / (a + b) and Weber's (a - b) / b, with errors to first order.
-
-    Parameters
-    ----------
-    a, b, a_stderr, b_stderr : array_like
-        Mean energies of two regions, such as target and background, or gates, and their standard errors, at least 0, in
-        one unit; they broadcast.
-    correlation : float
-        Correlation of the errors of a and b, -1 to 1; that of overlapping gates is at most the shared fraction of the
-        open time.
-
-    Raises
-    ------
-    UserError
-        If a value is not finite, an error negative or the correlation out of range.
-    """
-    x, y = finite_array("a", a), finite_array("b", b)
-    sx, sy = finite_array("a_stderr", a_stderr), finite_array("b_stderr", b_stderr)
-    for name, error in (("a_stderr", sx), ("b_stderr", sy)):
-        if np.any(error < 0):
-            raise UserError(f"{name} = {error.min():g} must not be negative")
-    covariance = in_range("correlation", correlation, -1, 1) * sx * sy
-    total = np.where(x + y == 0, np.nan, x + y)
-    y_known = np.where(y == 0, np.nan, y)
-    # The variance of fully correlated errors may be rounded below 0.
-    michelson_variance = np.maximum((y * sx) ** 2 + (x * sy) ** 2 - 2 * x * y * covariance, 0)
-    weber_variance = np.maximum(sx**2 + (x / y_known * sy) ** 2 - 2 * x / y_known * covariance, 0)
-    return Contrast(
-        np.asarray((x - y) / total),
-        np.asarray(2 * np.sqrt(michelson_variance) / total**2),
-        np.asarray((x - y) / y_known),
-        np.asarray(np.sqrt(weber_variance) / np.abs(y_known)),
-    )
 
 
 def range_from_gates(

@@ -14,13 +14,13 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
+from mitransient_lidar.analysis.retrieval.surface_echoes import inside_outline
 from mitransient_lidar.analysis.waveforms.column_onset import Focusing
 from mitransient_lidar.analysis.waveforms.echo_detection import error_of_sums
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
-from mitransient_lidar.physics.sea.surface_echoes import inside_outline
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Largest relative standard error with which a reflectance is given.

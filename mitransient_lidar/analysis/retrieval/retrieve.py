@@ -17,11 +17,11 @@ import xarray as xr
 from mitransient_lidar.analysis.retrieval import bottom_errors, column_retrieval, surface_inputs, surface_slope
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
+from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
-from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.geometry import (
     LinesOfSight,

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mitransient_lidar.analysis.retrieval.surface_echoes import SeaShots, inside_outline
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, positive
-from mitransient_lidar.physics.sea.surface_echoes import SeaShots, inside_outline
 
 BoolArray = npt.NDArray[np.bool_]
 

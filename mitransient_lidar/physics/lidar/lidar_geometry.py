@@ -10,32 +10,36 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+from mitransient_lidar.core.validation import Checked, FloatArray, checked, finite_array, in_range, positive
 from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 
 
+def _below_horizon(name: str, value: float) -> None:
+    """Reject an angle from the vertical outside [0, pi/2) rad."""
+    if not 0 <= value < np.pi / 2:
+        raise UserError(f"{name} = {value:g} must be at least 0 and below pi/2")
+
+
 @dataclass(frozen=True)
-class LidarGeometry:
+class LidarGeometry(Checked):
     """Co-located transmitter and receiver over a level sea, along their axis.
 
     Values out of range raise UserError.
     """
 
-    height: float  #: Height above the mean sea level [m], positive.
-    off_nadir: float  #: Angle of the axis from the vertical [rad], 0 to below pi/2.
-    refractive_index: float  #: Refractive index of the water, at least 1, which refracts rays.
-    group_index: float  #: Group index of the water, at least 1, which determines travel times.
+    height: float = checked(positive)  #: Height above the mean sea level [m], positive.
+    off_nadir: float = checked(_below_horizon)  #: Angle of the axis from the vertical [rad], 0 to below pi/2.
+    #: Refractive index of the water, at least 1, which refracts rays.
+    refractive_index: float = checked(in_range, 1, np.inf)
+    #: Group index of the water, at least 1, which determines travel times.
+    group_index: float = checked(in_range, 1, np.inf)
     #: Arrival of the surface echo [ns], the zero of depths; by default (NaN) from the mean sea level along the axis.
     surface_time_ns: float = field(default=math.nan, kw_only=True)
 
     def __post_init__(self) -> None:
-        positive("height", self.height)
-        if not 0 <= self.off_nadir < np.pi / 2:
-            raise UserError(f"off_nadir = {self.off_nadir:g} must be at least 0 and below pi/2")
-        for name in ("refractive_index", "group_index"):
-            in_range(name, getattr(self, name), 1, np.inf)
+        super().__post_init__()
         if math.isnan(self.surface_time_ns):
             level = float(refraction.surface_time_ns(self.height, self.off_nadir))
             object.__setattr__(self, "surface_time_ns", level)
@@ -107,13 +111,9 @@ class LidarGeometry:
 class LidarSystem(LidarGeometry):
     """Co-located transmitter and receiver of a given energy and aperture."""
 
-    energy: float  #: Pulse energy [J], positive, times efficiencies of both optics and two-way transmission of the air.
-    aperture_area: float  #: Area of the receiver normal to the ray [m^2], positive.
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("energy", "aperture_area"):
-            positive(name, getattr(self, name))
+    #: Pulse energy [J], positive, times efficiencies of both optics and two-way transmission of the air.
+    energy: float = checked(positive)
+    aperture_area: float = checked(positive)  #: Area of the receiver normal to the ray [m^2], positive.
 
     def water_gain(self, depth: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
         """Received energy per unit of backscatter [J sr], without attenuation in the water.

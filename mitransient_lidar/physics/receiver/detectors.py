@@ -23,6 +23,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import (
     FloatArray,
     IntArray,
+    checked,
     finite_array,
     in_range,
     integer,
@@ -79,6 +80,12 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
     return float(1 + np.sum(1 / np.cumprod(gains)))
 
 
+def _efficiency(name: str, value: object) -> None:
+    """Reject an efficiency outside (0, 1]."""
+    if (number := positive(name, value)) > 1:
+        raise UserError(f"{name} = {number:g} must be above 0 and at most 1")
+
+
 @dataclass(frozen=True)
 class LinearDetector(SignalTail):
     """Detector whose charge is proportional to the light: photodiode, avalanche photodiode or photomultiplier.
@@ -108,23 +115,18 @@ class LinearDetector(SignalTail):
     the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
     """
 
-    quantum_efficiency: float
-    gain: float = 1.0
-    excess_noise: float = 1.0
-    dark_current_na: float = 0.0
-    leakage_current_na: float = 0.0
+    quantum_efficiency: float = checked(_efficiency)
+    gain: float = checked(in_range, 1, np.inf, default=1.0)
+    excess_noise: float = checked(in_range, 1, np.inf, default=1.0)
+    dark_current_na: float = checked(non_negative, default=0.0)
+    leakage_current_na: float = checked(non_negative, default=0.0)
     dynode_gains: tuple[float, ...] = ()
     largest_current_ma: float = np.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_efficiency(self.quantum_efficiency)
-        for name in ("gain", "excess_noise"):
-            in_range(name, getattr(self, name), 1, np.inf)
         if not self.largest_current_ma > 0:
             raise UserError(f"largest_current_ma = {self.largest_current_ma:g} must be greater than 0")
-        for name in ("dark_current_na", "leakage_current_na"):
-            non_negative(name, getattr(self, name))
 
     @classmethod
     def avalanche(
@@ -247,23 +249,13 @@ class SiliconPhotomultiplier(SignalTail):
     A cell recovers instantaneously. Afterpulses are in any cell, with equal probability.
     """
 
-    quantum_efficiency: float
-    cells: int
-    recovery_time_ns: float
-    crosstalk: float = 0.0
-    dark_count_rate_hz: float = 0.0
-    gain: float = 1.0
-    gain_spread: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_efficiency(self.quantum_efficiency)
-        integer("cells", self.cells, 1, 10**9)
-        positive("recovery_time_ns", self.recovery_time_ns)
-        in_range("crosstalk", self.crosstalk, 0, 0.5)
-        in_range("gain", self.gain, 1, np.inf)
-        for name in ("dark_count_rate_hz", "gain_spread"):
-            non_negative(name, getattr(self, name))
+    quantum_efficiency: float = checked(_efficiency)
+    cells: int = checked(integer, 1, 10**9)
+    recovery_time_ns: float = checked(positive)
+    crosstalk: float = checked(in_range, 0, 0.5, default=0.0)
+    dark_count_rate_hz: float = checked(non_negative, default=0.0)
+    gain: float = checked(in_range, 1, np.inf, default=1.0)
+    gain_spread: float = checked(non_negative, default=0.0)
 
     @property
     def charge_spread(self) -> float:
@@ -348,29 +340,23 @@ class SinglePhotonDetector(SignalTail):
     ones have trapped no longer count, so that the counts are a renewal process with exact moments.
     """
 
-    quantum_efficiency: float
-    dead_time_ns: float
-    dark_count_rate_hz: float = 0.0
+    quantum_efficiency: float = checked(_efficiency)
+    dead_time_ns: float = checked(positive)
+    dark_count_rate_hz: float = checked(non_negative, default=0.0)
     paralyzable: bool = False
-    channels: int = 1
-    afterpulse_probability: float = 0.0
-    afterpulse_decay_ns: float | None = None
+    channels: int = checked(integer, 1, 10_000, default=1)
+    afterpulse_probability: float = checked(in_range, 0, 0.5, default=0.0)
+    afterpulse_decay_ns: float | None = checked(positive, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_efficiency(self.quantum_efficiency)
-        positive("dead_time_ns", self.dead_time_ns)
-        non_negative("dark_count_rate_hz", self.dark_count_rate_hz)
-        integer("channels", self.channels, 1, 10_000)
-        if in_range("afterpulse_probability", self.afterpulse_probability, 0, 0.5) > 0:
+        if self.afterpulse_probability > 0:
             if self.paralyzable:
                 raise UserError(
                     f"afterpulse_probability = {self.afterpulse_probability:g} must be 0 for a paralyzable detector"
                 )
             if self.afterpulse_decay_ns is None:
                 raise UserError("afterpulse_decay_ns is required for an afterpulse_probability above 0")
-        if self.afterpulse_decay_ns is not None:
-            positive("afterpulse_decay_ns", self.afterpulse_decay_ns)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin without dead time for a mean number of photons per bin, of the same shape."""
@@ -407,12 +393,6 @@ class SinglePhotonDetector(SignalTail):
 
 
 Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector
-
-
-def _check_efficiency(value: float) -> None:
-    """Reject an efficiency outside (0, 1]."""
-    if positive("quantum_efficiency", value) > 1:
-        raise UserError(f"quantum_efficiency = {value:g} must be above 0 and at most 1")
 
 
 def _electrons(current_na: float, bin_width_ns: float) -> float:

@@ -11,7 +11,16 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import BOLTZMANN
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, finite_array, integer, non_negative, positive
+from mitransient_lidar.core.validation import (
+    Checked,
+    FloatArray,
+    checked,
+    finite,
+    finite_array,
+    integer,
+    non_negative,
+    positive,
+)
 from mitransient_lidar.physics.piecewise_linear import integral
 
 _TAIL = 1e-10  # fraction of a filter's response left out at its ends
@@ -76,7 +85,7 @@ MEAN_OF_BINS = LowPass(1, -1, np.ones(1))
 
 
 @dataclass(frozen=True)
-class Amplifier:
+class Amplifier(Checked):
     """Transimpedance amplifier or load resistor.
 
     Parameters
@@ -113,24 +122,19 @@ class Amplifier:
     Thermal noise: J. B. Johnson and H. Nyquist, Phys. Rev. 32, 97 and 110 (1928), doi:10.1103/PhysRev.32.110.
     """
 
-    transimpedance_ohm: float
-    noise_pa_per_rthz: float = 0.0
-    load_ohm: float | None = None
-    temperature_k: float = 293.15
-    bandwidth_mhz: float | None = None
+    transimpedance_ohm: float = checked(positive)
+    noise_pa_per_rthz: float = checked(non_negative, default=0.0)
+    load_ohm: float | None = checked(positive, default=None)
+    temperature_k: float = checked(non_negative, default=293.15)
+    bandwidth_mhz: float | None = checked(positive, default=None)
     response: Literal["single_pole", "gaussian"] = "single_pole"
-    limit_v: float | None = None
+    limit_v: float | None = checked(positive, default=None)
     impulse_response: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    coupling_ns: float | None = None
-    recovery_ns: float | None = None
+    coupling_ns: float | None = checked(positive, default=None)
+    recovery_ns: float | None = checked(positive, default=None)
 
     def __post_init__(self) -> None:
-        positive("transimpedance_ohm", self.transimpedance_ohm)
-        for name in ("noise_pa_per_rthz", "temperature_k"):
-            non_negative(name, getattr(self, name))
-        for name in ("load_ohm", "bandwidth_mhz", "limit_v", "coupling_ns", "recovery_ns"):
-            if getattr(self, name) is not None:
-                positive(name, getattr(self, name))
+        super().__post_init__()
         if self.response not in ("single_pole", "gaussian"):
             raise UserError(f"response = {self.response!r} must be 'single_pole' or 'gaussian'")
         if self.impulse_response is not None:
@@ -208,19 +212,15 @@ class Amplifier:
 
 
 @dataclass(frozen=True)
-class LogAmplifier:
+class LogAmplifier(Checked):
     """Logarithmic compression of voltages of either sign.
 
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
     knee, and smooth at 0, where noise makes the input negative.
     """
 
-    volts_per_decade: float  #: Increase of the output per decade of the input [V], positive.
-    knee_v: float  #: Input below which the output is linear [V], positive.
-
-    def __post_init__(self) -> None:
-        positive("volts_per_decade", self.volts_per_decade)
-        positive("knee_v", self.knee_v)
+    volts_per_decade: float = checked(positive)  #: Increase of the output per decade of the input [V], positive.
+    knee_v: float = checked(positive)  #: Input below which the output is linear [V], positive.
 
     def compress(self, volts: FloatArray) -> FloatArray:
         """Return the output [V] for an input [V]."""
@@ -239,7 +239,7 @@ class LogAmplifier:
 
 
 @dataclass(frozen=True)
-class Digitiser:
+class Digitiser(Checked):
     """Analogue-to-digital converter.
 
     Parameters
@@ -265,25 +265,18 @@ class Digitiser:
     at least about half a step; a steady signal with less noise has an error of up to half a step instead.
     """
 
-    bits: int
-    full_scale_v: float
-    low_v: float = 0.0
-    sampling_ghz: float | None = None
-    block_threshold_v: float | None = None
-    block_before: int = 0
-    block_after: int = 0
+    bits: int = checked(integer, 1, 24)
+    full_scale_v: float = checked(positive)
+    low_v: float = checked(finite, default=0.0)
+    sampling_ghz: float | None = checked(positive, default=None)
+    block_threshold_v: float | None = checked(positive, default=None)
+    block_before: int = checked(integer, 0, 100_000, default=0)
+    block_after: int = checked(integer, 0, 100_000, default=0)
 
     def __post_init__(self) -> None:
-        integer("bits", self.bits, 1, 24)
-        positive("full_scale_v", self.full_scale_v)
-        finite("low_v", self.low_v)
-        if self.sampling_ghz is not None:
-            positive("sampling_ghz", self.sampling_ghz)
-        if self.block_threshold_v is not None:
-            positive("block_threshold_v", self.block_threshold_v)
+        super().__post_init__()
         for name in ("block_before", "block_after"):
-            number = integer(name, getattr(self, name), 0, 100_000)
-            if number and self.block_threshold_v is None:
+            if (number := getattr(self, name)) and self.block_threshold_v is None:
                 raise UserError(f"{name} = {number} needs block_threshold_v, above which blocks are stored")
 
     @property

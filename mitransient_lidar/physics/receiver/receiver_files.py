@@ -6,7 +6,7 @@ import importlib.resources
 import inspect
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -205,25 +205,24 @@ def _channel(
     stages: dict[str, Any] = dict(others)
     own = _table(name, values, "detector")
     if own:
-        kind = own.pop("type", None)
+        kind, label = own.pop("type", None), f"{name}: detector"
         if kind is None and base is not None:
-            stages["detector"] = _changed_detector(f"{name}: detector", base.chain.detector, own)
+            stages["detector"] = _with_dynodes(label, _stage(label, own, base.chain.detector), own)
         elif kind not in _DETECTORS:
             raise UserError(f"{name}: detector.type = {shown(kind)} must be one of {', '.join(_DETECTORS)}")
         else:
-            stages["detector"] = _built(f"{name}: detector", _DETECTORS[kind], own)
+            stages["detector"] = _stage(label, own, _DETECTORS[kind])
     elif base is None:
         raise UserError(f"{name} has neither a preset nor a detector")
     for stage, build in _STAGES.items():
         own = _table(name, values, stage)
         if not own:
             continue
-        label = f"{name}: {stage}"
         if "impulse_response" in own:
             own["impulse_response"] = _impulse_response(folder, own["impulse_response"])
             own.setdefault("bandwidth_mhz", None)
         former = None if base is None else getattr(base.chain, stage)
-        stages[stage] = _built(label, build, own) if former is None else _changed(label, former, own)
+        stages[stage] = _stage(f"{name}: {stage}", own, build if former is None else former)
     try:
         chain = ReceiverChain(**stages) if base is None else replace(base.chain, **stages)
     except UserError as error:
@@ -260,40 +259,28 @@ def _check_keys(name: str, values: Mapping[str, Any], known: tuple[str, ...]) ->
             raise UserError(f"{name}: {key} is not known; it must be one of {', '.join(known)}")
 
 
-def _built(name: str, build: Callable[..., Any], values: Mapping[str, Any]) -> Any:
-    """Return a stage from its parameters."""
-    parameters = inspect.signature(build).parameters
+def _stage(name: str, values: Mapping[str, Any], base: Any) -> Any:
+    """Return a stage that a function or class makes from its parameters, or another stage with some of them changed."""
+    is_stage = is_dataclass(base) and not isinstance(base, type)
+    parameters = inspect.signature(type(base) if is_stage else base).parameters
     _check_keys(name, values, tuple(parameters))
     missing = [key for key, one in parameters.items() if one.default is one.empty and key not in values]
-    if missing:
+    if missing and not is_stage:
         raise UserError(f"{name} lacks {', '.join(missing)}")
-    return _tried(name, lambda: build(**_checked(name, values)))
-
-
-def _changed(name: str, stage: Any, values: Mapping[str, Any]) -> Any:
-    """Return a stage with other parameters."""
-    assert is_dataclass(stage)
-    assert not isinstance(stage, type)
-    _check_keys(name, values, tuple(one.name for one in fields(stage)))
-    return _tried(name, lambda: replace(stage, **_checked(name, values)))
-
-
-def _changed_detector(name: str, detector: Any, values: Mapping[str, Any]) -> Any:
-    """Return a detector with other parameters; dynodes give a photomultiplier its gain and excess noise."""
-    changed = _changed(name, detector, values)
-    if not getattr(changed, "dynode_gains", ()):
-        return changed
-    if derived := [key for key in ("gain", "excess_noise") if key in values]:
-        raise UserError(f"{name}: {derived[0]} = {shown(values[derived[0]])} follows from dynode_gains: give these")
-    return _tried(name, lambda: changed.with_dynodes(changed.dynode_gains))
-
-
-def _checked(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters with lists as tuples; refuse tables."""
     for key, value in values.items():
         if isinstance(value, dict):
             raise UserError(f"{name}.{key} must be a value, not a table")
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    given = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    return _tried(name, lambda: replace(base, **given) if is_stage else base(**given))
+
+
+def _with_dynodes(name: str, detector: Any, values: Mapping[str, Any]) -> Any:
+    """Return a detector with changed parameters, of which dynodes give a photomultiplier its gain and excess noise."""
+    if not getattr(detector, "dynode_gains", ()):
+        return detector
+    if derived := [key for key in ("gain", "excess_noise") if key in values]:
+        raise UserError(f"{name}: {derived[0]} = {shown(values[derived[0]])} follows from dynode_gains: give these")
+    return _tried(name, lambda: detector.with_dynodes(detector.dynode_gains))
 
 
 def _tried(name: str, build: Callable[[], Any]) -> Any:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from mitransient_lidar.core.validation import FloatArray, in_range, non_negative
+from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, non_negative
 
 
 @dataclass(frozen=True)
-class ShotJitter:
+class ShotJitter(Checked):
     """Fluctuation of pulse energy, trigger and clocks from shot to shot.
 
     Parameters
@@ -32,14 +32,9 @@ class ShotJitter:
     n the group index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom of one channel.
     """
 
-    energy_rms: float = 0.0
-    trigger_ns: float = 0.0
-    clock_ns: float = 0.0
-
-    def __post_init__(self) -> None:
-        in_range("energy_rms", self.energy_rms, 0, 1)
-        for name in ("trigger_ns", "clock_ns"):
-            non_negative(name, getattr(self, name))
+    energy_rms: float = checked(in_range, 0, 1, default=0.0)
+    trigger_ns: float = checked(non_negative, default=0.0)
+    clock_ns: float = checked(non_negative, default=0.0)
 
     def draw(
         self, shots: int, records: tuple[int, ...], series: bool, seed: int, common_seed: int

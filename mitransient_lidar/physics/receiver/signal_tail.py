@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.core.validation import Checked, FloatArray, finite_array
 
 
 @dataclass(frozen=True, kw_only=True)
-class SignalTail:
+class SignalTail(Checked):
     """Events that follow those of the light, a sum of decaying exponentials; the default has none.
 
     Parameters
@@ -52,6 +52,7 @@ class SignalTail:
                 raise UserError(
                     f"{name} = {values.tolist()} must have as many numbers as tail_fractions, {fractions.size}"
                 )
+        super().__post_init__()
 
     def with_tail(self, events: FloatArray, steady: FloatArray, part_ns: float) -> FloatArray:
         """Return mean events with the delayed ones.

@@ -20,8 +20,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import turn_by_slope
-from mitransient_lidar.physics.sea.sea_state import SeaState
-from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import SeaState, WaveSpectrum
 
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
 _SHORTEST_WAVE, _FARTHEST = 8.5e-4, 300.0

@@ -16,14 +16,16 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
-from mitransient_lidar.physics.sea.height_units import (
+from mitransient_lidar.physics.sea.height_files import (
+    UNEVENNESS,
     check_positions,
     described,
+    grid_of_points,
     heights_in_metres,
     position_unit,
     read_netcdf_heights,
+    read_points,
 )
-from mitransient_lidar.physics.sea.point_grids import UNEVENNESS, grid_of_points, read_points
 
 logger = logging.getLogger(__name__)
 
@@ -101,7 +103,7 @@ def read_height_map(
         ``.exr``
             an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
         ``.nc``
-            a variable of two dimensions; see `height_units.read_netcdf_heights`;
+            a variable of two dimensions; see `height_files.read_netcdf_heights`;
         ``.asc``
             an ESRI ASCII grid, with a .prj file beside it or without;
         ``.tif``, ``.tiff``
@@ -109,7 +111,7 @@ def read_height_map(
         ``.bag``
             a Bathymetric Attributed Grid of one resolution;
         ``.xyz``, ``.csv``, ``.txt``
-            a table of points x, y, z, with or without a heading; see `point_grids.read_points`.
+            a table of points x, y, z, with or without a heading; see `height_files.read_points`.
     size : float, optional
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.

@@ -10,8 +10,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, positive
-from mitransient_lidar.physics.sea.sea_state import SeaState
-from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY, SLOWEST_WAVENUMBER, WaveSpectrum, variances_along
+from mitransient_lidar.physics.sea.wave_spectrum import (
+    GRAVITY,
+    SLOWEST_WAVENUMBER,
+    SeaState,
+    WaveSpectrum,
+    variances_along,
+)
 
 #: Largest number of cells per side of one grid, and number of cells of the grids for the long waves of a finer sea.
 _MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024

@@ -20,9 +20,14 @@ from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
-from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum, variances_along
+from mitransient_lidar.physics.sea.wave_spectrum import (
+    CosineSpectrum,
+    MatchedSpectrum,
+    SeaState,
+    WaveSpectrum,
+    variances_along,
+)
 from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
     JonswapSpectrum,

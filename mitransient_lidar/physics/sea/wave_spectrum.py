@@ -1,26 +1,31 @@
-"""Base classes of directional wave spectra.
+"""Directional wave spectra: systems of waves, their sums, and wind waves matched to given slope variances.
 
 A spectrum Psi(kx, ky) [m^4] is the variance density of a frozen surface: Psi(k) = Psi(-k), and its integral over the
 plane is the elevation variance. Psi does not contain the direction of travel: waves travel towards the half plane of
-the direction of their system.
-Directions are those that wind and waves travel towards, in rad counter-clockwise from +x.
+the direction of their system. Directions are those that wind and waves travel towards, in rad counter-clockwise from
++x.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative, positive
 
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 
 SLOWEST_WAVENUMBER = 370.0
 """Wavenumber of the slowest gravity-capillary wave [rad/m], which defines the surface tension."""
+
+_LARGEST_FRACTION = 0.75  # of the slope variance on one axis: that of the angular density cos^2(phi)/pi
+_NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
 
 
 def phase_speed(k: npt.ArrayLike) -> FloatArray:
@@ -144,3 +149,187 @@ class CosineSpectrum(WaveSpectrum):
         variances = mean[square] + modulation[square] * angle
         # Where Delta is 1, rounding may make the density across the direction negative.
         return np.asarray(np.maximum(variances, 0))
+
+
+@dataclass(frozen=True)
+class SeaState:
+    """Sum of independent wave systems, each with its own direction of travel.
+
+    Parameters
+    ----------
+    components : tuple of WaveSpectrum
+        At least one. The first determines `direction` and thus the axes of the slope variances.
+
+    Raises
+    ------
+    UserError
+        If there is no component, or one is not a spectrum.
+    """
+
+    components: tuple[WaveSpectrum, ...]
+    direction: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        components = tuple(self.components)
+        if not components:
+            raise UserError("components must hold at least one spectrum")
+        for component in components:
+            if not isinstance(component, WaveSpectrum):
+                raise UserError(f"components holds {component!r} but every component must be a wave spectrum")
+        object.__setattr__(self, "components", components)
+        object.__setattr__(self, "direction", components[0].direction)
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Peak wavenumber [rad/m] of the component with the highest waves."""
+        return max(self.components, key=lambda component: component.elevation_variance()).peak_wavenumber
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        return np.asarray(sum(component.omnidirectional(k) for component in self.components))
+
+    def elevation_variance(self) -> float:
+        """Variance of the elevation [m^2]."""
+        return sum(component.elevation_variance() for component in self.components)
+
+    def slope_covariance(self) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
+        return np.asarray(sum(component.slope_covariance() for component in self.components))
+
+    def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
+        """Elevation variances [m^2]; see `WaveSpectrum.mode_variances`."""
+        return np.asarray(sum(component.mode_variances(ix, iy, dk) for component in self.components))
+
+    def slope_variance(self) -> tuple[float, float]:
+        """Slope variances [1] along and across the direction."""
+        return variances_along(self.slope_covariance(), self.direction)
+
+    @property
+    def systems(self) -> tuple[WaveSpectrum, ...]:
+        """Independent wave systems, in the order of the components."""
+        return self.components
+
+
+@dataclass(frozen=True)
+class MatchedSpectrum(CosineSpectrum):
+    """Spectrum whose short waves are scaled so that all waves together have given slope variances.
+
+    Resolved and unresolved waves of a mesh then add up to the same total at every resolution.
+
+    Parameters
+    ----------
+    spectrum : CosineSpectrum
+        Elfouhaily, Pierson-Moskowitz or JONSWAP. One with less than a millionth of the given variances, as in the
+        lightest winds, is made flat.
+    upwind, crosswind : float
+        Slope variances [1] along and across the direction, not negative, such as those of Cox and Munk. Their ratio is
+        limited to a factor of 3 (cos^2 about the direction); beyond it, as for Cox and Munk below 0.4 m/s, the larger
+        one is reduced.
+    k_from : float
+        Waves with wavenumbers [rad/m] above this are scaled, positive. If the others alone have too much slope
+        variance, or a ratio that scaling cannot correct, it is reduced in steps of a tenth; below the longest wave all
+        are scaled.
+
+    Attributes
+    ----------
+    scaled_from : float
+        Wavenumber above which waves are scaled [rad/m].
+    scales : tuple of float
+        Factors along and across the direction [1].
+
+    Notes
+    -----
+    With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give
+    S' = S (s_u (1/2 + Delta/4) + s_c (1/2 - Delta/4)) and Delta' = 2 (s_u (1/2 + Delta/4) - s_c (1/2 - Delta/4)) S/S',
+    clipped to ``|Delta'| <= 1`` so that no wave has a negative density; s_u and s_c are found with the clipping.
+    """
+
+    spectrum: CosineSpectrum
+    upwind: float
+    crosswind: float
+    k_from: float = 2 * np.pi
+    direction: float = field(init=False)
+    scaled_from: float = field(init=False)
+    scales: tuple[float, float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.spectrum, CosineSpectrum):
+            raise UserError(f"spectrum = {self.spectrum!r} must be one of wind waves")
+        upwind, crosswind = non_negative("upwind", self.upwind), non_negative("crosswind", self.crosswind)
+        k_from = positive("k_from", self.k_from)
+        object.__setattr__(self, "direction", self.spectrum.direction)
+        scales = None
+        ratio = _LARGEST_FRACTION / (1 - _LARGEST_FRACTION)
+        target = min(upwind, ratio * crosswind), min(crosswind, ratio * upwind)
+        while scales is None:
+            object.__setattr__(self, "scaled_from", k_from)
+            scales = self._find_scales(*target)
+            k_from *= 0.9
+        object.__setattr__(self, "scales", scales)
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Wavenumber of the unscaled spectrum's peak [rad/m]."""
+        return self.spectrum.peak_wavenumber
+
+    @property
+    def smooth_ranges(self) -> tuple[float, ...]:
+        """Wavenumbers [rad/m] of the unscaled spectrum, and the step at `scaled_from`."""
+        ranges = self.spectrum.smooth_ranges
+        if ranges and ranges[0] < self.scaled_from < ranges[-1]:
+            ranges = tuple(sorted({*ranges, self.scaled_from}))
+        return ranges
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S'(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        wavenumber = np.asarray(k, dtype=np.float64)
+        density = self.spectrum.omnidirectional(wavenumber)
+        up, cross = self._fractions(np.where(wavenumber > 0, wavenumber, 1.0))
+        return np.where(
+            wavenumber > self.scaled_from, density * (self.scales[0] * up + self.scales[1] * cross), density
+        )
+
+    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+        """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `WaveSpectrum.spreading`."""
+        wavenumber = np.asarray(k, dtype=np.float64)
+        up, cross = self._fractions(wavenumber)
+        fraction = _upwind_fraction(self.scales[0] * up, self.scales[1] * cross)
+        return np.where(wavenumber > self.scaled_from, 4 * fraction - 2, 4 * up - 2)
+
+    def _fractions(self, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Upwind and crosswind fractions of the unscaled slope variance."""
+        up = 0.5 + self.spectrum.spreading(k) / 4
+        return up, 1 - up
+
+    def _find_scales(self, upwind: float, crosswind: float) -> tuple[float, float] | None:
+        """Factors for waves above `scaled_from` that give the total slope variances, or None if there are none."""
+        k, weight = self.quadrature()
+        curvature = self.spectrum.omnidirectional(k) * k**2 * weight
+        up, cross = (curvature * fraction for fraction in self._fractions(k))
+        short = k > self.scaled_from
+        left_up, left_cross = upwind - up[~short].sum(), crosswind - cross[~short].sum()
+        if curvature.sum() <= _NO_WAVES * (upwind + crosswind) or min(upwind, crosswind) == 0:
+            object.__setattr__(self, "scaled_from", 0.0)
+            return 0.0, 0.0
+        all_scaled = not np.any(curvature[~short] > 0)
+        smallest = (1 - _LARGEST_FRACTION) / _LARGEST_FRACTION
+        if not all_scaled and not (left_up > smallest * left_cross and left_cross > smallest * left_up):
+            return None
+        up, cross = up[short], cross[short]
+        scale_up, scale_cross = left_up / up.sum(), left_cross / cross.sum()
+        # Exact in one step without clipping; clipped waves have a fixed fraction, which the others compensate.
+        for _ in range(1000):
+            total = scale_up * up + scale_cross * cross
+            fraction = _upwind_fraction(scale_up * up, scale_cross * cross)
+            change_up, change_cross = left_up / np.sum(total * fraction), left_cross / np.sum(total * (1 - fraction))
+            scale_up, scale_cross = float(scale_up * change_up), float(scale_cross * change_cross)
+            if max(abs(change_up - 1), abs(change_cross - 1)) < 1e-13:
+                break
+        return scale_up, scale_cross
+
+
+def _upwind_fraction(up: FloatArray, cross: FloatArray) -> FloatArray:
+    """Upwind fraction of slope variances, within the limits of a non-negative angular density."""
+    total = up + cross
+    fraction = np.divide(up, total, out=np.full_like(total, 0.5), where=total > 0)
+    return np.clip(fraction, 1 - _LARGEST_FRACTION, _LARGEST_FRACTION)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, in_range, is_number, shown
+from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, is_number, shown
 from mitransient_lidar.physics.water.data_tables import read_columns
 
 #: Bottoms in the order of the columns of the table.
@@ -36,7 +36,7 @@ _CHECKED_DEG = (0.0, 45.0, 70.0, 80.0, 88.0)
 
 
 @dataclass(frozen=True)
-class HapkeSurface:
+class HapkeSurface(Checked):
     """Reflection by a layer of particles.
 
     Raises
@@ -45,21 +45,14 @@ class HapkeSurface:
         If a value lies outside its range.
     """
 
-    albedo: float  #: Single-scattering albedo w of the particles, 0 to 1.
-    lobe_asymmetry: float = 0.0  #: Asymmetry b of both lobes of the particles' phase function, 0 to 0.9.
-    backward_share: float = 0.5  #: Share of the lobe towards the source, 0 to 1: (1 + c)/2 with the c of Hapke.
-    opposition_amplitude: float = 1.0  #: Opposition effect B0, 0 to 3; above 1 shadows alone do not explain it.
-    opposition_width: float = 0.06  #: Its half width h [rad], 0.001 to 1.
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("albedo", 0.0, 1.0),
-            ("lobe_asymmetry", 0.0, 0.9),
-            ("backward_share", 0.0, 1.0),
-            ("opposition_amplitude", 0.0, 3.0),
-            ("opposition_width", 1e-3, 1.0),
-        ):
-            object.__setattr__(self, name, in_range(name, getattr(self, name), low, high))
+    albedo: float = checked(in_range, 0, 1)  #: Single-scattering albedo w of the particles, 0 to 1.
+    #: Asymmetry b of both lobes of the particles' phase function, 0 to 0.9.
+    lobe_asymmetry: float = checked(in_range, 0, 0.9, default=0.0)
+    #: Share of the lobe towards the source, 0 to 1: (1 + c)/2 with the c of Hapke.
+    backward_share: float = checked(in_range, 0, 1, default=0.5)
+    #: Opposition effect B0, 0 to 3; above 1 shadows alone do not explain it.
+    opposition_amplitude: float = checked(in_range, 0, 3, default=1.0)
+    opposition_width: float = checked(in_range, 1e-3, 1, default=0.06)  #: Its half width h [rad], 0.001 to 1.
 
     def h_function(self, cosine: npt.ArrayLike) -> FloatArray:
         """Return Hapke's approximation of Chandrasekhar's H function, within 1 %, at cosines 0 to 1."""

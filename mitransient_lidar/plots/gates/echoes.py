@@ -1,26 +1,23 @@
-"""Depths of echoes, and contrast of a target, in a gate stack."""
+"""Depths of echoes in a gate stack."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from mitransient_lidar.analysis.gates.range_images import DepthImage, contrast, depth_image
+from mitransient_lidar.analysis.gates.range_images import DepthImage, depth_image
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.plots.gates.images import SIGNIFICANT, known_depths, reached_by_surface
+from mitransient_lidar.plots.gates.images import known_depths, reached_by_surface
 from mitransient_lidar.results.gate_files import check_stack
 from mitransient_lidar.results.geometry import optional_number
 
 _NAMED_PIXELS = 16  # on an axis
-_CONTRAST_COLOUR = "#1f5fd6"
 
 
 def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_depth: float | None = None) -> Figure:
@@ -56,64 +53,6 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     (_draw_pixel_depths if "pixel" in stack.dims else _draw_depth_image)(figure, stack, found)
     text = f"depth of the strongest echo, gates at {depths.min():.2f} to {depths.max():.2f} m on the axis"
     figure.suptitle(drawing.titled(stack.attrs, text))
-    return drawing.save(figure, path)
-
-
-def plot_contrast(
-    dataset: xr.Dataset, target: npt.ArrayLike, background: npt.ArrayLike, path: drawing.FilePath | None = None
-) -> Figure:
-    """Draw the contrast of a target against its background in a gate stack, against the start of the gate.
-
-    The contrast is Weber's (t - b) / b of the mean energies t and b of two groups of pixels, selected by masks of shape
-    (row, column) or (pixel,). Bars are one standard error if the errors of the pixels are independent; the band is its
-    bound, reached if those within a group are fully correlated, as they partly are where pixels share photons. Gates
-    whose background is below three standard errors are left out.
-
-    Raises
-    ------
-    UserError
-        If the dataset is no gate stack, a mask has another shape, is empty or shares pixels with the other one, or no
-        gate has a background.
-    """
-    figure = drawing.new_figure(path, 9.6, 4.6)
-    stack = check_stack(dataset)
-    shape = stack["gate_energy"].shape[:-1]
-    masks = {"target": np.asarray(target, dtype=bool), "background": np.asarray(background, dtype=bool)}
-    for name, mask in masks.items():
-        if mask.shape != shape or not mask.any():
-            raise UserError(
-                f"{name} selects {np.count_nonzero(mask)} pixels of an array of shape {mask.shape}, but must select at "
-                f"least one of {shape}."
-            )
-    if shared := np.count_nonzero(masks["target"] & masks["background"]):
-        raise UserError(f"target and background must have no pixels in common, but share {shared}.")
-    energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
-    means = {name: energy[mask].mean(axis=0) for name, mask in masks.items()}
-    independent = {name: np.sqrt((stderr[mask] ** 2).sum(axis=0)) / mask.sum() for name, mask in masks.items()}
-    correlated = {name: stderr[mask].mean(axis=0) for name, mask in masks.items()}
-    known = means["background"] > SIGNIFICANT * independent["background"]
-    if not known.any():
-        raise UserError("the background is below three standard errors in every gate: there is no contrast to draw.")
-    t, b = (means[name][known] for name in masks)
-    bars, bound = (contrast(t, b, *(errors[name][known] for name in masks)) for errors in (independent, correlated))
-    starts = stack["gate_start"].values
-    ax = figure.subplots()
-    ax.axhline(0, color="0.55", linewidth=0.9)
-    low, high = (bound.weber + sign * bound.weber_stderr for sign in (-1, 1))
-    label = "fully correlated errors (bound)"
-    ax.fill_between(starts[known], low, high, color=_CONTRAST_COLOUR, alpha=0.16, linewidth=0, label=label)
-    style: dict[str, Any] = {"color": _CONTRAST_COLOUR, "linewidth": 1.3, "markersize": 4, "capsize": 3}
-    ax.errorbar(starts[known], bars.weber, bars.weber_stderr, fmt="o-", label="independent errors", **style)
-    ax.set_xlabel("start of the gate since the pulse left the transmitter (ns)")
-    ax.set_ylabel("contrast (target - background) / background")
-    drawing.add_grid(ax)
-    ax.legend(frameon=False, title="one standard error")
-    depths = known_depths(stack)
-    if depths is not None and depths.size > 1:
-        slope = (depths[-1] - depths[0]) / (starts[-1] - starts[0])
-        drawing.add_top_axis(ax, depths[0] - slope * starts[0], slope, "depth of the gate's middle on the axis (m)")
-    pixels = f"{masks['target'].sum()} pixels against {masks['background'].sum()}"
-    figure.suptitle(drawing.titled(stack.attrs, f"contrast of the target, {pixels}"))
     return drawing.save(figure, path)
 
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 
-from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS
+from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots import drawing
 
 _COLUMNS = 3

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.physics.piecewise_linear import inside_polygon
 from mitransient_lidar.transport.opaque import opaque
 
 #: Bisection steps that invert a distribution function to float32 accuracy.
@@ -255,16 +256,8 @@ class Polygon(FovShape):
         self._cdf = np.cumsum(areas) / areas.sum()
 
     def contains(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Bool:
-        """Return whether points lie inside: an odd number of edges lies between them and angle_x = infinity."""
-        inside = mi.Bool(False)
-        # Python numbers: NumPy scalars would turn Dr.Jit arrays into NumPy ones.
-        ends = self.vertices.tolist(), np.roll(self.vertices, -1, axis=0).tolist()
-        for (x0, y0), (x1, y1) in zip(*ends, strict=True):
-            if y0 == y1:
-                continue
-            crosses = (angle_y < y0) != (angle_y < y1)
-            inside ^= crosses & (angle_x < x0 + (angle_y - y0) * ((x1 - x0) / (y1 - y0)))
-        return inside
+        """Return whether points lie inside."""
+        return mi.Bool(inside_polygon(self.vertices, angle_x, angle_y))
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to uniform points: pick a triangle by its area, then a point in it."""

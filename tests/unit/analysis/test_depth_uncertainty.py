@@ -5,9 +5,14 @@ import pytest
 import xarray as xr
 from scipy.optimize import nnls
 
-from mitransient_lidar.analysis.depth_uncertainty import non_negative_line, sounding_uncertainty, write_fits
+from mitransient_lidar.analysis.depth_uncertainty import (
+    SURVEY_ORDERS,
+    TrajectoryErrors,
+    non_negative_line,
+    sounding_uncertainty,
+    write_fits,
+)
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
-from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS, TrajectoryErrors
 
 WINDS, WATERS, DEPTHS = [1.0, 3.0, 5.0, 7.0, 9.0], ["III", "1C", "3C", "5C", "7C", "9C"], np.array([2.0, 4.0, 8.0])
 SLOPE = 0.05

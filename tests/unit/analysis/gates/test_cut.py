@@ -5,13 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from oracles.gates import transmission
 from scipy.integrate import quad
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates import cut as gating
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_stack
 
@@ -72,7 +72,7 @@ def test_gates_integrate_the_waveform(train):
         joules = (
             1e-9
             * quad(
-                lambda t, gate=gate: float(power(t) * train.shape.transmission(t - train.starts_ns[gate])),
+                lambda t, gate=gate: float(power(t) * transmission(train.shape, t - train.starts_ns[gate])),
                 low,
                 high,
                 points=[p for p in points if low < p < high],

@@ -1,4 +1,4 @@
-"""Contrast of gates and range images."""
+"""Range images from gates."""
 
 import time
 
@@ -7,34 +7,9 @@ import pytest
 import xarray as xr
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
-from significance import largest_z
 
-from mitransient_lidar.analysis.gates.range_images import contrast, depth_image, range_from_gates
+from mitransient_lidar.analysis.gates.range_images import depth_image, range_from_gates
 from mitransient_lidar.core.errors import UserError
-
-
-def test_contrast_and_its_error():
-    found = contrast([3.0, 1.0], [1.0, 0.0], [0.2, 0.1], [0.1, 0.1])
-    np.testing.assert_allclose(found.michelson, [0.5, 1.0])
-    np.testing.assert_allclose(found.weber, [2.0, np.nan])
-    # 2/(a+b)^2 sqrt(b^2 0.2^2 + a^2 0.1^2) and sqrt(0.2^2 + (a/b)^2 0.1^2)/b
-    assert found.michelson_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09) / 8)
-    assert found.weber_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09))
-    with pytest.raises(ValueError, match="a_stderr = -1 must not be negative"):
-        contrast(1.0, 1.0, -1.0, 1.0)
-
-
-@pytest.mark.parametrize("correlation", [-0.6, 0.0, 0.8])
-def test_contrast_error_is_the_spread(correlation):
-    draws, a, b, sa, sb = 20_000, 5.0, 2.0, 0.05, 0.04
-    covariance = correlation * sa * sb
-    sample = np.random.default_rng(5).multivariate_normal([a, b], [[sa**2, covariance], [covariance, sb**2]], draws)
-    seen, stated = contrast(*sample.T, sa, sb, correlation), contrast(a, b, sa, sb, correlation)
-    # The spread of 20 000 draws is known to 0.5 %; second order is below 0.1 %.
-    for name in ("michelson", "weber"):
-        ratio = np.std(getattr(seen, name), ddof=1) / float(getattr(stated, f"{name}_stderr"))
-        assert abs(ratio - 1) < largest_z(draws, 2) / np.sqrt(2 * draws) + 1e-3
-
 
 MID = 0.5 + 0.25 * np.arange(64)
 

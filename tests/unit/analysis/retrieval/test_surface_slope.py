@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from significance import largest_z
 
+from mitransient_lidar.analysis.retrieval.surface_echoes import SeaShots
 from mitransient_lidar.analysis.retrieval.surface_slope import (
     PixelEchoes,
     PixelLight,
@@ -17,7 +18,6 @@ from mitransient_lidar.analysis.retrieval.surface_slope import (
     steepest,
     with_prior,
 )
-from mitransient_lidar.physics.sea.surface_echoes import SeaShots
 
 C0 = 0.299792458  # m/ns
 THETA = math.radians(20)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles.gates import transmission
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
-from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
 PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])
@@ -14,10 +14,10 @@ PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])
 
 def level_crossing(shape, level, low, high):
     """Bisect for the time at which the transmission passes a level."""
-    rising = shape.transmission(high) > shape.transmission(low)
+    rising = transmission(shape, high) > transmission(shape, low)
     for _ in range(60):
         middle = (low + high) / 2
-        if (shape.transmission(middle) < level) == rising:
+        if (transmission(shape, middle) < level) == rising:
             low = middle
         else:
             high = middle
@@ -35,12 +35,12 @@ def test_edges_have_the_stated_times_and_half_heights():
     assert fall[2] - fall[0] == pytest.approx(5, abs=1e-9)
     # A raised cosine is 1/(1 - 2 acos(0.8)/pi) = 1.694 times as long as its 10-90 % part.
     assert first == pytest.approx(-1.694 * 3 / 2, rel=1e-3)
-    np.testing.assert_array_equal(shape.transmission([first - 1e-9, 6.0, last + 1e-9]), [0, 1, 0])
+    np.testing.assert_array_equal(transmission(shape, [first - 1e-9, 6.0, last + 1e-9]), [0, 1, 0])
 
 
 def test_sharp_gates_are_half_open():
     shape = GateShape.edges(4.0)
-    np.testing.assert_array_equal(shape.transmission([-1e-12, 0, 4 - 1e-12, 4]), [0, 1, 1, 0])
+    np.testing.assert_array_equal(transmission(shape, [-1e-12, 0, 4 - 1e-12, 4]), [0, 1, 1, 0])
 
 
 def test_width_and_edges_of_measured_gates():
@@ -48,7 +48,7 @@ def test_width_and_edges_of_measured_gates():
     assert PROFILE.width_ns == pytest.approx(3.5)
     assert PROFILE.rise_ns == pytest.approx(0.8)
     assert PROFILE.fall_ns == pytest.approx((104 + 3 * 0.8) - (103 + 0.2))
-    assert PROFILE.transmission(0.0) == pytest.approx(0.4)
+    assert transmission(PROFILE, 0.0) == pytest.approx(0.4)
     assert PROFILE.span_ns == (-0.5, 6.5)
     assert PROFILE.open_time(99.0) == pytest.approx(0.4 + 1.6 + 0.6 + 0.6)
 
@@ -70,7 +70,7 @@ def test_open_time_is_the_integral_of_the_transmission(shape):
     points = [p for p in (0.0, 0.5, shape.width_ns, 2.5, 3.5) if first < p < last]
     for t in np.linspace(first, last, 5)[1:]:
         inside = [p for p in points if p < t]
-        expected = quad(lambda x: float(shape.transmission(x)), first, t, points=inside, limit=200)[0]
+        expected = quad(lambda x: float(transmission(shape, x)), first, t, points=inside, limit=200)[0]
         assert float(shape.open_time(t)) == pytest.approx(expected, abs=1e-8)
     assert shape.open_time(first - 5) == 0
     assert shape.open_time(last + 5) == pytest.approx(float(shape.open_time(last)))
@@ -130,7 +130,7 @@ def test_weights_of_bins_are_exact_means(train):
     for gate in range(train.count):
         first, column = train.gate_bins(gate, 1400.0, 0.5, 60)
         weights[first : first + column.size, gate] = column
-    fine = train.shape.transmission((1400 + 0.5 * (np.arange(60 * 500) + 0.5) / 500)[:, None] - train.starts_ns)
+    fine = transmission(train.shape, (1400 + 0.5 * (np.arange(60 * 500) + 0.5) / 500)[:, None] - train.starts_ns)
     # The midpoint rule with 500 points a bin is right to h^2 g''/24 and to h at a profile's steps of slope.
     np.testing.assert_allclose(weights, fine.reshape(60, 500, -1).mean(axis=1), atol=2e-5)
     np.testing.assert_allclose(0.5 * weights.sum(axis=0), float(train.shape.open_time(99.0)), rtol=1e-12)
@@ -169,7 +169,7 @@ def test_response_of_a_gate_with_edges_agrees_with_quadrature():
     sigma = 3 / 2.3548200450309493
     for t in (1396.0, 1399.0, 1403.0, 1406.5, 1411.0):
         expected = quad(
-            lambda tau, t=t: norm.pdf(tau, scale=sigma) * float(train.shape.transmission(t + tau - train.start_ns)),
+            lambda tau, t=t: norm.pdf(tau, scale=sigma) * float(transmission(train.shape, t + tau - train.start_ns)),
             -8 * sigma,
             8 * sigma,
             points=[1400 - t, 1408 - t],

@@ -7,7 +7,7 @@ from oracles.wave_spectra import mesh_slope_variance
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.realization import wave_numbers
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, PiersonMoskowitzSpectrum
 
 

@@ -11,7 +11,7 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_spread,
     slope_structures,
 )
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 DISTANCE = np.geomspace(1e-5, 300, 240)

@@ -7,7 +7,7 @@ from significance import assert_equal
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 STILL = Motion(0.0, 1e4, (0.0, 0.0))

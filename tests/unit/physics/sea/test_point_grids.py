@@ -8,8 +8,8 @@ import pytest
 
 from mitransient_lidar.core import long_tables
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.sea.height_files import read_points
 from mitransient_lidar.physics.sea.height_maps import read_height_map
-from mitransient_lidar.physics.sea.point_grids import read_points
 
 POINTS = np.array([[1.0, 10.0, -3.0], [2.5, 11.0, -3.5], [4.0, 13.0, -4.0]])
 

@@ -13,8 +13,8 @@ from significance import largest_z
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import angular_frequency, wave_numbers
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, JonswapSpectrum, PiersonMoskowitzSpectrum
 
 G = 9.81

@@ -12,8 +12,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, realise_heights
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 PERIOD = 32.0

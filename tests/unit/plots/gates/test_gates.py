@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from PIL import Image
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.gates.echoes import plot_contrast, plot_depths
+from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates, reached_by_surface
 
 SURFACE_NS, STEP_NS, WIDTH_NS = 1420.0, 5.0, 5.0
@@ -302,45 +302,6 @@ def test_depth_map_needs_three_gates_with_depths(tmp_path):
     with pytest.raises(UserError, match="no gate_depth"):
         plot_depths(stack.drop_vars("gate_depth"), tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_contrast_curve_has_the_error_of_a_quotient():
-    energy = np.full((ROWS, COLUMNS, 3), 2e-15)
-    target = np.zeros((ROWS, COLUMNS), dtype=bool)
-    target[0, :4] = True
-    background = np.zeros((ROWS, COLUMNS), dtype=bool)
-    background[1:] = True
-    energy[target] = [6e-15, 2e-15, 1e-15]
-    energy[background, 2] = 0.0
-    stack = make(3, energy)
-    stack["gate_energy_stderr"][:] = 1e-16
-    ax = plot_contrast(stack, target, background).axes[0]
-    (container,) = ax.containers
-    line, _, (bars,) = container.lines
-    np.testing.assert_allclose(line.get_xdata(), [1415.0, 1420.0])  # gate 2 has no background
-    np.testing.assert_allclose(line.get_ydata(), [2.0, 0.0], atol=1e-12)
-    # t / b = 3 and 1, with errors of 1e-16 / sqrt(4 and 15 pixels), or of 1e-16 where pixels share them.
-    ratio = np.array([3.0, 1.0])
-    t = 2e-15 * ratio
-    half = [(segment[1, 1] - segment[0, 1]) / 2 for segment in bars.get_segments()]
-    np.testing.assert_allclose(half, ratio * np.hypot(1e-16 / 2 / t, 1e-16 / math.sqrt(15) / 2e-15), rtol=1e-9)
-    band = ax.collections[0].get_paths()[0].vertices
-    top = [band[band[:, 0] == x, 1].max() for x in (1415.0, 1420.0)]
-    np.testing.assert_allclose(top, ratio - 1 + ratio * np.hypot(1e-16 / t, 1e-16 / 2e-15), rtol=1e-9)
-
-
-def test_contrast_curve_of_wrong_masks(tmp_path):
-    stack, one = make(3), np.zeros((ROWS, COLUMNS), dtype=bool)
-    one[0, 0] = True
-    with pytest.raises(UserError, match=r"target selects 0 pixels of an array of shape \(4, 5\)"):
-        plot_contrast(stack, ~one & one, one, tmp_path / "a.png")
-    with pytest.raises(UserError, match=r"background selects 1 pixels of an array of shape \(1, 5\)"):
-        plot_contrast(stack, one, one[:1], tmp_path / "a.png")
-    with pytest.raises(UserError, match="share 1"):
-        plot_contrast(stack, one, np.ones_like(one), tmp_path / "a.png")
-    stack["gate_energy"][:] = 0.0
-    with pytest.raises(UserError, match="below three standard errors in every gate"):
-        plot_contrast(stack, one, ~one, tmp_path / "a.png")
 
 
 @pytest.mark.slow

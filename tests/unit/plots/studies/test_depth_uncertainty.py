@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS
+from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots.studies.depth_bias import plot_depth_bias
 from mitransient_lidar.plots.studies.depth_uncertainty import plot_orders, plot_uncertainty
 

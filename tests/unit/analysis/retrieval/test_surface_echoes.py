@@ -7,11 +7,11 @@ import pytest
 from oracles.two_scale import two_scale_ratio
 from significance import largest_z
 
+from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
-from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 THETA, HEIGHT, BEAM, N = math.radians(20), 200.0, 2e-3, 1.34

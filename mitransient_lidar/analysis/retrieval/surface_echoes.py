@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +14,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.piecewise_linear import inside_polygon
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
 from mitransient_lidar.physics.sea.realization import heights_of, wave_coefficients
-from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
-from mitransient_lidar.physics.sea.wave_spectrum import variances_along
+from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, variances_along
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 BoolArray = npt.NDArray[np.bool_]
@@ -78,13 +79,7 @@ class PixelMap:
 
 def inside_outline(lines: list[FloatArray], x: FloatArray, y: FloatArray) -> BoolArray:
     """Return whether an odd number of closed lines, of points (x, y) each, surround each point."""
-    odd = np.zeros(x.shape, dtype=bool)
-    for line in lines:
-        for (x0, y0), (x1, y1) in zip(line, np.roll(line, -1, axis=0), strict=True):
-            crosses = (y0 > y) != (y1 > y)
-            if y0 != y1:
-                odd ^= crosses & (x < x0 + (x1 - x0) * (y - y0) / (y1 - y0))
-    return odd
+    return np.asarray(reduce(np.logical_xor, (inside_polygon(line, x, y) for line in lines)))
 
 
 @dataclass(frozen=True, kw_only=True)

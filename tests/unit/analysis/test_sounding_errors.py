@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.sounding_errors import (
+from mitransient_lidar.analysis.depth_uncertainty import (
     SURVEY_ORDERS,
     TrajectoryErrors,
     order_met,
     shift_by_pointing,
     shift_by_slope,
 )
+from mitransient_lidar.core.errors import UserError
 
 INDEX = 1.34
 STEP = 1e-5
