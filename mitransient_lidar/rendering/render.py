@@ -195,8 +195,8 @@ def _render(
 
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
-    chosen = choose_integrator(session.scene, integrator)
-    renderer = chosen.prepare(session.scene, session.sensor)
+    sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
+    renderer = chosen.prepare(session.scene, sensor)
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
