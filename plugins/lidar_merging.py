@@ -7,7 +7,8 @@ import mitsuba as mi
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.plugins.bases import PassIntegrator, recorded
-from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
+from mitransient_lidar.transport.merging.layout import MergingOptions
+from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

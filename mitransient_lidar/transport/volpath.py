@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -15,11 +15,10 @@ from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.path import Path, PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.refracted_connection import (
-    ConnectedPath,
     EmitterDirection,
     RefractedEmitterSampler,
     RefractedLaserSampler,
@@ -79,6 +78,30 @@ class VolpathOptions:
     solid_guiding_probability: float | None = None
     expects_emitter: bool = False
     weights_absorption: bool = False
+
+
+@dataclass(kw_only=True)
+class ConnectedPath(Path):
+    """A path whose vertices are connected to an emitter.
+
+    Attributes
+    ----------
+    emitter_ratio
+        Density of the sampled connection over that of the path's own sampling, for the direction of the next segment; 0
+        where no connection was sampled.
+    specular
+        Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
+        receiver: the last vertex could not be connected.
+    reflected_by_sea
+        Whether the next segment was reflected by the dry side of the sea surface.
+    solid
+        Number of the first solid met, as `PathClasses.solid`.
+    """
+
+    emitter_ratio: mi.Float = field(default_factory=lambda: mi.Float(0))
+    specular: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    reflected_by_sea: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    solid: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
 
 class PathLight:
@@ -478,9 +501,9 @@ def trace_connected(
     """Trace a number of paths from the receiver for each shot and connect them to the laser, into a record."""
     require_memory(f"{shots.count * paths} paths", BYTES_PER_PATH * shots.count * paths, "take fewer paths_per_pass")
     lanes = shots.paths(paths)
-    scene, rng = scene.of(lanes), shots.streams(_STREAM, lanes)
+    scene, rng = lanes.pick(scene), shots.streams(_STREAM, lanes)
     start = sampler.sample_shots(lanes, paths, rng)
-    path = ConnectedPath.start(scene, start.angles, start.weight > 0)
+    path = ConnectedPath.start(scene, scene.receiver_pose, start.angles, mi.Float(1), start.weight > 0)
     light = LaserLight(scene, record, start.pixel, start.weight)
     record.rays += PathTracer(scene, options, light).trace(path, rng)
 

@@ -220,7 +220,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     width, count = 0.1, 2**18
     rings, shift = BeamRings(lidar.transmitter.pose, 1.0, 1.34), mi.Point2f(0.37, 0.61)
-    patches = SolidPatches(lidar, region, rings, 8.0, width, shift)
+    patches = SolidPatches(lidar, region, rings, 8.0, width).of_pass(lidar, shift)
     rng = pass_streams(3, 0, count)
     x, y = (half * (2 * rng.next_float32() - 1) for _ in range(2))
     ray = mi.Ray3f(mi.Point3f(x + 0.1, y + 0.05, -3), mi.Vector3f(0, 0, -1))

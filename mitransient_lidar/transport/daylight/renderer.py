@@ -13,7 +13,6 @@ from mitransient_lidar.transport.daylight.sampling import FovSampler
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.refracted_connection import (
-    ConnectedPath,
     EmitterDirection,
     RefractedSunSampler,
     connect_sun,
@@ -22,6 +21,7 @@ from mitransient_lidar.transport.refracted_connection import (
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.volpath import (
     BYTES_PER_PATH,
+    ConnectedPath,
     PathLight,
     PathTracer,
     VolpathOptions,
@@ -138,7 +138,9 @@ class DaylightRenderer:
         with dr.suspend_grad():
             rng = pass_streams(seed, _STREAM, count)
             start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
-            path = ConnectedPath.start(self.scene, start.angles, start.weight > 0)
+            path = ConnectedPath.start(
+                self.scene, self.scene.receiver_pose, start.angles, mi.Float(1), start.weight > 0
+            )
             return self.follow(path, rng, start.pixel, start.weight)
 
     def follow(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> DaylightRecord:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 
@@ -12,8 +11,8 @@ import numpy as np
 
 from mitransient_lidar.transport.merging.region import SurfaceHeights
 from mitransient_lidar.transport.merging.rings import BeamRings
-from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.opaque import changed, opaque
+from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Logarithm to base 2 of the largest number of buckets of a shot.
@@ -95,6 +94,15 @@ class RefractedProfile:
         of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
         self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
 
+    @classmethod
+    def of_scene(cls, scene: LidarScene, footprint: float) -> RefractedProfile:
+        """Return the profile of a scene's beam, of a standard deviation on the sea [m]."""
+        beam = scene.transmitter.profile
+        squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
+        spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
+        along, across = (spreads * footprint / scene.transmitter.angular_spread).tolist()
+        return cls(scene, (along, across))
+
     def growth(self, most: float) -> float:
         """Return by how much ripples widen light of the beam or, if less, of a deviation `most`, for each metre."""
         return min(growth / min(spread, most) for spread, growth in self._own)
@@ -161,6 +169,8 @@ class WaterGrid:
         that is seen, and the largest width that it reaches, over that at the surface.
     """
 
+    OF_SHOTS = ("heights", "rings")
+
     def __init__(
         self,
         rings: BeamRings,
@@ -190,25 +200,15 @@ class WaterGrid:
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
-        grid = self.moved(heights, rings)
-        grid.width, grid.bits = self.width * opaque(wider), bits
-        return grid
+        return changed(self, heights=heights, rings=rings, width=self.width * opaque(wider), bits=bits)
 
     def moved(self, heights: SurfaceHeights, rings: BeamRings) -> WaterGrid:
         """Return the grid below another sea surface and about other axes."""
-        grid = copy.copy(self)
-        grid.heights, grid.rings = heights, rings
-        return grid
+        return changed(self, heights=heights, rings=rings)
 
     def of_even_width(self, wider: float) -> WaterGrid:
         """Return the grid of cells that are wider by a factor than those at the surface, at all depths."""
-        grid = copy.copy(self)
-        grid.width, grid.growth = self.width * opaque(wider), opaque(0.0)
-        return grid
-
-    def repeated(self, copies: int) -> WaterGrid:
-        """Return the grid of each shot several times in turn."""
-        return self.moved(self.heights.repeated(copies), self.rings.repeated(copies))
+        return changed(self, width=self.width * opaque(wider), growth=opaque(0.0))
 
     @property
     def bits_ring(self) -> int:
@@ -250,20 +250,12 @@ class WaterGrid:
 class WaterCells:
     """The cells of one pass: a `WaterGrid` shifted by four uniform random numbers of each shot."""
 
+    OF_SHOTS = ("heights", "rings", "_shift", "_start")
+
     def __init__(self, grid: WaterGrid, shift: mi.Point4f) -> None:
         self.grid, self.heights, self.rings = grid, grid.heights, grid.rings
         self._shift = shift
-        self._start = mi.UInt32(0)
-
-    def of(self, lanes: Lanes) -> WaterCells:
-        """Return the cells of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        cells = copy.copy(self)
-        cells.heights, cells.rings = self.heights.of(lanes), self.rings.of(lanes)
-        cells._shift = lanes.pick(self._shift)
-        cells._start = lanes.shot << self.grid.bits
-        return cells
+        self._start = starts(dr.width(shift), 1 << grid.bits)
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -12,9 +11,9 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -42,10 +41,6 @@ _MOST_CROSSINGS = 4
 
 #: Largest distance below the sea at which vertical rays to solids start [m].
 _MARGIN_BELOW_SEA = 1.0
-
-#: Least width of patches over the size of the largest solid, eight times the rounding of positions on it; and that of
-#: cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
-_PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
 
 #: Height of the bed of columns without a solid below [m].
 _NO_BED = -1e9
@@ -153,7 +148,7 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
     Means over the beam, shape (shots, 3).
     """
     lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * _ENTRY_RAYS), shots, _ENTRY_RAYS)
-    moved = scene.of(lanes)
+    moved = lanes.pick(scene)
     pose = moved.transmitter_pose
     angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
     direction = np.array(pose.direction(*angles), np.float64).T
@@ -178,8 +173,10 @@ class _Grid:
     cells
         Number of cells on each side.
     start
-        Number of the first cell.
+        Number of the first cell of each shot.
     """
+
+    OF_SHOTS = ("low", "start")
 
     values: mi.Float
     kind: type[mi.Float] | type[mi.UInt32]
@@ -187,17 +184,6 @@ class _Grid:
     per_metre: mi.Point2f
     cells: int
     start: mi.UInt32
-
-    def repeated(self, copies: int) -> _Grid:
-        """Return the grid of each shot several times in turn."""
-        low = dr.repeat(self.low, copies)
-        dr.eval(low)
-        return replace(self, low=low)
-
-    def of(self, lanes: Lanes, copies: mi.UInt32) -> _Grid:
-        """Return the grid of each lane's shot, of which `copies` successive ones share one."""
-        start = (lanes.shot // copies) * (self.cells * self.cells)
-        return replace(self, low=lanes.pick(self.low), start=start)
 
     def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
@@ -221,24 +207,16 @@ class SurfaceHeights:
         Displacements of the region (x, y) of each shot [m], shape (shots, 2).
     """
 
+    OF_SHOTS = ("_surface", "_bed", "_veil")
+
     def __init__(self, scene: LidarScene, region: Region, depth: float, moves: FloatArray | None = None) -> None:
         moves = np.zeros((1, 2)) if moves is None else moves
-        #: Number of successive shots that share a grid.
-        self._copies = opaque_index(1)
         self._surface = self._look_down(scene, region, moves, solids=False)
         below = region.below(scene, depth)
         self._bed = self._look_down(scene, below, moves, solids=True)
         #: Whether there are heights of veils: solids that let a part of the light pass unchanged.
         self.has_veils = scene.has_veils
         self._veil = self._look_down(scene, below, moves, solids=True, veils=True) if self.has_veils else self._bed
-
-    def repeated(self, copies: int) -> SurfaceHeights:
-        """Return the heights of each shot several times in turn, which share them."""
-        heights = copy.copy(self)
-        heights._copies = opaque_index(copies)
-        grids = (grid.repeated(copies) for grid in (self._surface, self._bed, self._veil))
-        heights._surface, heights._bed, heights._veil = grids
-        return heights
 
     def _look_down(
         self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool, veils: bool = False
@@ -253,7 +231,7 @@ class SurfaceHeights:
         low = mi.Point2f(*(aligned(mi.Float, column) for column in corner.T))
         per_metre = mi.Point2f(*(opaque(n / size) for size in region.size))
         lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * n * n), shots, n * n)
-        index, scene = lanes.number, scene.of(lanes)
+        index, scene = lanes.number, lanes.pick(scene)
         x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
         y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
         top = max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0
@@ -295,16 +273,7 @@ class SurfaceHeights:
         _, found, _, _ = dr.while_loop(state, lambda *state: state[-1], look_down, label="heights")
         values = found.x if solids else dr.ravel(found)
         dr.eval(values)
-        return _Grid(values, mi.Float if solids else mi.Vector4f, low, per_metre, n, mi.UInt32(0))
-
-    def of(self, lanes: Lanes) -> SurfaceHeights:
-        """Return the heights of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        heights = copy.copy(self)
-        grids = (grid.of(lanes, self._copies) for grid in (self._surface, self._bed, self._veil))
-        heights._surface, heights._bed, heights._veil = grids
-        return heights
+        return _Grid(values, mi.Float if solids else mi.Vector4f, low, per_metre, n, starts(shots, n * n))
 
     def surface_at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Vector2f]:
         """Return height [m] and slopes of the surface at (x, y) [m]: outside the region, level at the edge's height."""
@@ -322,15 +291,3 @@ class SurfaceHeights:
         """Return the height of the first veil below the surface at (x, y) [m], -1e9 where there is none."""
         height, _, _ = self._veil.at(x, y)
         return height
-
-
-def least_cell(scene: LidarScene, reach: float) -> float:
-    """Return the least width of cells that a narrow view limits [m]."""
-    spots = [pose.ground_point()[:2] for pose in (scene.transmitter.pose, scene.receiver.pose)]
-    return _CELL_PER_COORDINATE * float(np.abs(spots).max() + reach)
-
-
-def least_patch(scene: LidarScene) -> float:
-    """Return the least width of the patches of solids [m]."""
-    sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
-    return float(_PATCH_PER_SOLID * max(sizes, default=0.0))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,7 +9,7 @@ import numpy as np
 from mitransient_lidar.transport.merging.cells import Cell
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.opaque import opaque, opaque_point
-from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
+from mitransient_lidar.transport.rng import pass_streams, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -65,18 +63,12 @@ class SphericalGrid:
 class SphericalCells:
     """The cells of one pass: a `SphericalGrid` shifted by uniform random numbers of each shot."""
 
+    OF_SHOTS = ("_shift", "_start")
+
     def __init__(self, grid: SphericalGrid, shift: mi.Point4f) -> None:
         self.grid = grid
         self._shift = shift
-        self._start = mi.UInt32(0)
-
-    def of(self, lanes: Lanes) -> SphericalCells:
-        """Return the cells of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        cells = copy.copy(self)
-        cells._shift, cells._start = lanes.pick(self._shift), lanes.shot << _BUCKET_BITS
-        return cells
+        self._start = starts(dr.width(shift), 1 << _BUCKET_BITS)
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
