@@ -147,6 +147,30 @@ class Path(PathPoint):
         return distance * dr.select(self.in_water, group, 1)
 
 
+@dataclass(kw_only=True)
+class ConnectedPath(Path):
+    """A path whose vertices are connected to an emitter.
+
+    Attributes
+    ----------
+    emitter_ratio
+        Density of the sampled connection over that of the path's own sampling, for the direction of the next segment; 0
+        where no connection was sampled.
+    specular
+        Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
+        receiver: the last vertex could not be connected.
+    reflected_by_sea
+        Whether the next segment was reflected by the dry side of the sea surface.
+    solid
+        Number of the first solid met, as `PathClasses.solid`.
+    """
+
+    emitter_ratio: mi.Float = field(default_factory=lambda: mi.Float(0))
+    specular: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    reflected_by_sea: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    solid: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+
+
 @dataclass
 class Vertex:
     """End of a segment.
@@ -190,6 +214,11 @@ class Vertex:
     def on_surface(self) -> mi.Bool:
         """Whether the segment ends on the sea surface or on a solid."""
         return self.at_sea | self.on_solid
+
+    @property
+    def submerged(self) -> mi.Bool:
+        """Whether it lies under water: a scattering event, or a place on a solid."""
+        return self.scattered | (self.on_solid & self.in_water)
 
     @property
     def is_rough(self) -> mi.Bool:

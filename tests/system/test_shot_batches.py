@@ -165,7 +165,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
     renderer = prepared("docs/guide/survey_lidar.xml", params, "lidar_merging")
     places, copies, points = PLACES[:2], 3, 1000
     batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, [])
-    heights, region = batches.at(ShotPoses(places))(copies).layout.grid.heights, renderer.layout.patches.region
+    heights, region = batches.at(ShotPoses(places))(copies).layout.cells.heights, renderer.layout.patches.region
     highest, lowest = renderer.scene.empty_heights
     assert (highest < lowest) == (slope == 0)
     x, y = (np.random.default_rng(1).uniform(region.low[axis], region.high[axis], points) for axis in (0, 1))

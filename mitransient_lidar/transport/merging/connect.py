@@ -75,28 +75,6 @@ class ConnectionRates:
         return self.cells.typical_volume(point)
 
 
-@dataclass(frozen=True)
-class _Pairs:
-    """Points of the receiver's paths, and random partners among the light of their shots.
-
-    Attributes
-    ----------
-    lanes
-        Lanes of the pairs, whose numbers are those of pairs.
-    point
-        The points.
-    partner
-        Numbers of the partners.
-    weight
-        Reciprocal of the expected number of pairs of the same point and partner; 0 where one of them does not exist.
-    """
-
-    lanes: Lanes
-    point: PathPoint
-    partner: mi.UInt32
-    weight: mi.Float
-
-
 class WaterConnections:
     """Connections of a scene's pass with independent random numbers for each pass and shot."""
 
@@ -107,11 +85,20 @@ class WaterConnections:
         self._water, self._points, self._shots = scene.required_water, points, shots
         self._group = self._water.index_layers.group(mi.UInt32(0))
 
-    def _pairs(self, light: SegmentBuffer | int, stream: int) -> _Pairs:
-        """Return points of each path, and random partners: points of light paths, or a number of photons of a shot.
+    def _pairs(self, light: SegmentBuffer | int, stream: int) -> tuple[Lanes, PathPoint, mi.UInt32, mi.Float]:
+        """Draw points of the receiver's paths, and random partners among the light of their shots.
 
         Path and point are drawn one after the other, so that paths with other points, in a scene that differs a little,
-        change no other pairs.
+        change no other pairs. Partners are points of light paths, or a number of photons of a shot.
+
+        Returns
+        -------
+        lanes
+            Lanes of the pairs, whose numbers count them.
+        point, partner
+            The points, and the numbers of their partners.
+        weight
+            Reciprocal of the expected number of pairs of the same point and partner; 0 where one does not exist.
         """
         points = self._points
         lanes = self._shots.paths(points.paths * self.rates.per_path)
@@ -128,13 +115,13 @@ class WaterConnections:
             partner, others = light.pick(partner, rng.next_float32())
             weight *= mi.Float(others)
         exists = weight > 0
-        return _Pairs(lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight)
+        return lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight
 
     def to_light(self, light: SegmentBuffer, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some points of light paths."""
-        pairs = self._pairs(light, stream)
-        point, exists = pairs.point, pairs.weight > 0
-        other, (scene, rates) = light.points(pairs.partner), pairs.lanes.pick((self.scene, self.rates))
+        lanes, point, partner, weight = self._pairs(light, stream)
+        other, exists = light.points(partner), weight > 0
+        scene, rates = lanes.pick((self.scene, self.rates))
         direction, distance, transmittance, pending = self._segment(point, other.point)
         x = self._inverse_scattering_density(point.point, point.direction, direction, exists)
         y = self._inverse_scattering_density(other.point, other.direction, -direction, exists)
@@ -142,7 +129,7 @@ class WaterConnections:
         total += x * (rates.volume(point.point) + rates.in_water * point.inverse_density)
         total += y * (rates.volume(other.point) + rates.in_water * other.inverse_density)
         total += rates.in_water * x * y * pending
-        scale = rates.in_water * pairs.weight
+        scale = rates.in_water * weight
         energy = scale * point.throughput * other.throughput * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
@@ -158,10 +145,10 @@ class WaterConnections:
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some photons on solids."""
-        pairs = self._pairs(light.photons, stream)
-        point, scene, patches = pairs.point, *pairs.lanes.pick((self.scene, patches))
-        photon = light.connectable(pairs.partner)
-        exists = (pairs.weight > 0) & (photon.throughput != 0)
+        lanes, point, partner, weight = self._pairs(light.photons, stream)
+        scene, patches = lanes.pick((self.scene, patches))
+        photon = light.connectable(partner)
+        exists = (weight > 0) & (photon.throughput != 0)
         direction, distance, transmittance, pending = self._segment(point, photon.point)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
@@ -173,7 +160,7 @@ class WaterConnections:
         x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
-        scale = self.rates.on_solids * pairs.weight
+        scale = self.rates.on_solids * weight
         energy = scale * point.throughput * photon.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         depth, perturbed = point.depth, self.scene.perturbations

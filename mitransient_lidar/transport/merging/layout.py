@@ -10,12 +10,12 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterGrid
+from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL
-from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
+from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries, reach_under_water
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings, cell_widths
-from mitransient_lidar.transport.merging.spherical_cells import SphericalGrid, reach_under_water
+from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
 
@@ -93,8 +93,8 @@ class MergingLayout:
     ----------
     entry
         Where the beam meets the sea, relative to where it meets its mean level [m], shape (3,).
-    grid, patches
-        Layout of the cells, and patches of the solids.
+    cells, patches
+        Cells of the water, and patches of the solids.
     spacing, reach
         Distance between points along a path [m], and mean distance in the water along the axis to a solid or to the
         record's end [m].
@@ -110,10 +110,10 @@ class MergingLayout:
         Whether cells and patches are wider for shots of few photons: their width is automatic.
     """
 
-    OF_SHOTS = ("grid", "patches")
+    OF_SHOTS = ("cells", "patches")
 
     entry: FloatArray
-    grid: WaterGrid | SphericalGrid
+    cells: WaterCells | SphericalCells
     patches: SolidPatches
     spacing: float
     reach: float
@@ -129,14 +129,14 @@ class MergingLayout:
         """Return the layout of shots that meet a scene in parts, with a number of photons each."""
         bits = math.ceil(math.log2(photons))
         wider = max(min((PHOTONS / photons) ** (1 / 3), _WIDEST), 1.0) if self.widens else 1.0
-        grid, patches, rings = self.grid, self.patches, self.patches.rings
-        if isinstance(grid, WaterGrid):
+        cells, patches, rings = self.cells, self.patches, self.patches.rings
+        if isinstance(cells, WaterCells):
             entries = beam_entries(scene, shots)
             heights = SurfaceHeights(scene, patches.region, patches.depth, entries[:, :2] - self.entry[:2])
-            buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
+            buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, cells.bits_z + 2))
             axes = None if scene.transmitter_poses is None else scene.transmitter_poses.axis
             rings = rings.of_entries(entries, axes, scene.mean_slopes(shots))
-            grid = grid.of_shots(heights, rings, wider, buckets)
+            cells = cells.of_shots(heights, rings, wider, buckets)
         patches = replace(
             patches,
             scene=scene,
@@ -146,13 +146,13 @@ class MergingLayout:
             width=patches.width * wider,
         )
         # A copy has capacities of its own.
-        return replace(self, grid=grid, patches=patches)
+        return replace(self, cells=cells, patches=patches)
 
     def coarse(self) -> MergingLayout:
         """Return a layout with the same points and wider cells, for differences of scenes."""
-        grid = self.grid.of_even_width(_COARSE) if isinstance(self.grid, WaterGrid) else self.grid
+        cells = self.cells.of_even_width(_COARSE) if isinstance(self.cells, WaterCells) else self.cells
         patches = replace(self.patches, width=_COARSE_PATCHES * self.patches.width)
-        return replace(self, grid=grid, patches=patches, photons_of_cell=_PHOTONS_OF_COARSE)
+        return replace(self, cells=cells, patches=patches, photons_of_cell=_PHOTONS_OF_COARSE)
 
     def of_scene_alike(self, scene: LidarScene) -> MergingLayout:
         """Return the same points and cells for a scene that differs a little, whose solids may be other objects.
@@ -160,12 +160,12 @@ class MergingLayout:
         Cells go with the beam, as the sea refracts it, with the sea surface and with the solids where they end: most
         light of the same random numbers stays in its cell, and light near a surface that moves is right.
         """
-        grid, region, rings = self.grid, self.patches.region, self.patches.rings
-        if isinstance(grid, WaterGrid):
+        cells, region, rings = self.cells, self.patches.region, self.patches.rings
+        if isinstance(cells, WaterCells):
             rings = rings.alike(scene.transmitter.pose, beam_entries(scene), scene.mean_slopes(1))
-            grid = grid.moved(SurfaceHeights(scene, region, self.patches.depth), rings)
+            cells = cells.moved(SurfaceHeights(scene, region, self.patches.depth), rings)
         uneven = solids_of_several_levels(scene, region)
-        return replace(self, grid=grid, patches=replace(self.patches, scene=scene, rings=rings, uneven=uneven))
+        return replace(self, cells=cells, patches=replace(self.patches, scene=scene, rings=rings, uneven=uneven))
 
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
@@ -196,7 +196,7 @@ class MergingLayout:
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
             rings = BeamRings(pose, spread, 1.0, 0.0)
             patches = SolidPatches(scene, region, rings, depth, PATCH_PER_CELL * width, **solids)
-            return cls(np.zeros(3), SphericalGrid(scene, thickness), patches, **points)
+            return cls(np.zeros(3), SphericalCells(scene, thickness), patches, **points)
         footprint = scene.transmitter.angular_spread * pose.ground_range
         entries = beam_entries(scene)
         rings = BeamRings(pose, footprint, scene.refractive_index, tilt=scene.mean_slopes(1)).of_entries(entries)
@@ -218,7 +218,7 @@ class MergingLayout:
         )
         # The standard deviation of even light in the field of view is a quarter of its diameter.
         by_ripples, core = profile.growth(most=0.25 * view), CORE_PER_SPREAD * footprint
-        grid = WaterGrid(
+        cells = WaterCells(
             *(rings, heights, profile, min(width, longest) / core, growth, thickness, uppermost, reach),
             view_growth=by_ripples,
             widening=min(widest, longest) / min(width, longest),
@@ -226,4 +226,4 @@ class MergingLayout:
         solids |= {"growth": by_ripples, "widening": widest / width}
         patches = SolidPatches(scene, region, rings, depth, PATCH_PER_CELL * width, **solids)
         spread = (_SPREAD_PER_BLUR * profile.blur + _SPREAD_PER_DEPTH) * depth
-        return cls(entries[0], grid, patches, spread=spread, **points)
+        return cls(entries[0], cells, patches, spread=spread, **points)

@@ -11,36 +11,14 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
-from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.path import PathPoint, interaction_at
-from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
 from mitransient_lidar.transport.ripple_focusing import Echo
-from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape
-
-
-def store_points(
-    segments: SegmentBuffer,
-    count: int,
-    cells: WaterCells | SphericalCells,
-    classes: PathClasses,
-    shots: Shots,
-    most: int,
-) -> PhotonMap | None:
-    """Store the `count` points of light paths by their cells, `most` of full ones; return None if there are none."""
-    if count == 0:
-        return None
-    index = dr.arange(mi.UInt32, count)
-    points = segments.points(index)
-    cell = segments.lanes(index).pick(cells).locate(points.point, points.direction, points.unscattered)
-    position = dr.dot(points.point, points.direction)
-    place = shots.count << cells.grid.bits, cell.bucket, cell.tag
-    return PhotonMap(points, *place, position, segments.random(index, shots), most, classes)
 
 
 def merge_in_water(

@@ -11,11 +11,11 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, pass_streams, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.receiver import SensorSample, SensorSampler
 
 #: Number of rays that find the region and the solids below it.
 PROBE_RAYS = 4096
@@ -25,6 +25,9 @@ _ENTRY_RAYS = 64
 
 #: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
+
+#: Least margin of a region under water [m].
+_LEAST_MARGIN = 1.0
 
 #: Distance beside the view within which light counts, over the size of the view and over the longest way in the water:
 #: tables of the heights below all of a very wide beam would not resolve its waves.
@@ -56,8 +59,7 @@ class Region:
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
         """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
-        seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
-        tangents = mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
+        seen, tangents = _view_and_beam(scene, sampler)
         places = [
             meet_sea(scene, scene.receiver.pose, seen.angles)[np.array(seen.weight) > 0],
             meet_sea(scene, scene.transmitter.pose, tangents),
@@ -119,6 +121,35 @@ class Region:
             and float(box.max[axis]) > below.high[axis] + below.size[axis]
             for axis in (0, 1)
         )
+
+
+def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region, float, float]:
+    """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
+
+    Rays end at the first surface, or where their light returns at the end of the record.
+    """
+    seen, tangents = _view_and_beam(scene, sampler)
+    beam = scene.transmitter.pose.direction(*tangents)
+    longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
+    places, lengths = [], np.full(1, longest)
+    shortest = longest
+    for pose, direction in ((scene.receiver.pose, seen.direction), (scene.transmitter.pose, beam)):
+        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), direction))
+        length = dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), longest)
+        lengths = np.array(length, dtype=np.float64)
+        solid = si.is_valid() & ~scene.is_surface(si.shape)
+        shortest = min(shortest, float(np.min(np.where(np.array(solid), lengths, np.inf))))
+        places += [pose.origin[:2], np.array(opaque_point(pose.origin) + direction * length).T[:, :2]]
+    points = np.vstack(places)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = np.maximum(_REGION_MARGIN * (high - low), _LEAST_MARGIN)
+    return Region.between(low, high, margin), float(lengths.mean()), shortest
+
+
+def _view_and_beam(scene: LidarScene, sampler: SensorSampler) -> tuple[SensorSample, mi.Point2f]:
+    """Return samples of the view, and tangent-plane angles of the beam."""
+    seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+    return seen, mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
 
 
 def _longest_way(scene: LidarScene) -> float:

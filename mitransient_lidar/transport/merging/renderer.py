@@ -10,14 +10,12 @@ import numpy as np
 
 from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
-from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.layout import PATCH_PER_CELL, PHOTONS, MergingLayout, MergingOptions
-from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
+from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
-from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import changed, opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -111,12 +109,12 @@ class MergingRenderer(PassRenderer):
         scene, layout = self.scene, self.layout
         self._fit_segments(shots, paths)
         shifts = shots.uniform(_COMMON_STREAM, 6)
-        cells = layout.grid.cells(mi.Point4f(shifts[:4]))
+        cells = layout.cells.of_pass(mi.Point4f(shifts[:4]))
         patches = layout.patches.of_pass(scene, mi.Point2f(shifts[4:]))
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
-        light = self._trace_light(record, shots, cells, patches, rates)
-        if light is None or not self._trace_sensor(record, shots, paths, cells, patches, rates, light):
+        light = self._trace_light(record, shots, patches, rates)
+        if light is None or not self._trace_sensor(record, shots, paths, patches, rates, light):
             return False
         # The path tracer adds the light that merging leaves out.
         if not scene.has_specular_or_dry_solids:
@@ -142,16 +140,12 @@ class MergingRenderer(PassRenderer):
             layout.light_segments, layout.sensor_segments = np.add(needed, share * np.subtract(wanted, needed)).tolist()
 
     def _trace_light(
-        self,
-        record: PassRecord,
-        shots: Shots,
-        cells: WaterCells | SphericalCells,
-        patches: SolidPatches,
-        rates: ConnectionRates,
+        self, record: PassRecord, shots: Shots, patches: SolidPatches, rates: ConnectionRates
     ) -> _StoredLight | None:
         """Trace light from the laser; return it, or None when a buffer was too small."""
         layout, lanes, count = self.layout, shots.paths(self.photons), shots.count * self.photons
-        (scene, patches, rates), rng = lanes.pick((self.scene, patches, rates)), shots.streams(_LIGHT_STREAM, lanes)
+        scene, patches, rates_of_paths = lanes.pick((self.scene, patches, rates))
+        rng = shots.streams(_LIGHT_STREAM, lanes)
         capacity = int(layout.light_segments * count)
         segments = SegmentBuffer(scene, self.classes, layout.spacing, self.photons, capacity, shots.count)
         hits = PhotonBuffer(int(layout.hits * count), self.photons, self.classes, shots.count, scene.perturbations)
@@ -159,7 +153,7 @@ class MergingRenderer(PassRenderer):
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.walking(scene, scene.transmitter_pose, angles, energy, offset)
         path.sums = scene.perturbations.at_laser(path.sums, scene.transmitter.profile, angles.x, angles.y)
-        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates)
+        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates_of_paths)
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
@@ -177,7 +171,14 @@ class MergingRenderer(PassRenderer):
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * layout.least_segments[0])
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        in_cells = store_points(segments, points, cells, self.classes, shots, layout.photons_of_cell)
+        in_cells = None
+        if points > 0:
+            index = dr.arange(mi.UInt32, points)
+            light, cells = segments.points(index), segments.lanes(index).pick(rates.cells)
+            cell = cells.locate(light.point, light.direction, light.unscattered)
+            place = shots.count << cells.bits, cell.bucket, cell.tag
+            position, u = dr.dot(light.point, light.direction), segments.random(index, shots)
+            in_cells = PhotonMap(light, *place, position, u, layout.photons_of_cell, self.classes)
         return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(
@@ -185,7 +186,6 @@ class MergingRenderer(PassRenderer):
         record: PassRecord,
         shots: Shots,
         paths: int,
-        cells: WaterCells | SphericalCells,
         patches: SolidPatches,
         rates: ConnectionRates,
         light: _StoredLight,
@@ -212,8 +212,8 @@ class MergingRenderer(PassRenderer):
             sums = perturbed_to_laser(scene, sums, si.p, si, active)
             record.receive(path.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 
-        of_merges = shots.streams(_MERGE_STREAM, lanes)
-        merge = merge_on_solids(patches_of_paths, record, light.on_patches, rates.on_solids, of_merges)
+        random = shots.streams(_MERGE_STREAM, lanes)
+        merge = merge_on_solids(patches_of_paths, record, light.on_patches, rates.on_solids, random)
         path = walk.run(path, rng, segments, on_solid=merge, on_first_hit=connect, past_solids=False)
         record.rays += dr.sum(mi.Float64(path.rays))
         dr.schedule(record.rays)
@@ -226,7 +226,7 @@ class MergingRenderer(PassRenderer):
             return True
         if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
-            cells = segments.lanes(index).pick(cells)
+            cells = segments.lanes(index).pick(rates.cells)
             merge_in_water(scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
         if rates.per_path:
             connections = WaterConnections(self.scene, record, rates, segments, shots)
