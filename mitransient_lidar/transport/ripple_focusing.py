@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ from mitransient_lidar.physics.water.forward_scattering import displacements
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.transport.medium.water_phases import table_of
-from mitransient_lidar.transport.opaque import aligned, changed, opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -129,9 +130,10 @@ class RippleFocusing:
 
     def perturbed(self, perturbations: Sequence[Perturbation]) -> RippleFocusing:
         """Return these factors with their changes by perturbations."""
+        changed = copy.copy(self)
         tables = [one.focusing for one in perturbations]
-        changes = [None if one is None else aligned(mi.Float, one.astype(np.float32)) for one in tables]
-        return changed(self, _changes=changes)
+        changed._changes = [None if one is None else aligned(mi.Float, one.astype(np.float32)) for one in tables]
+        return changed
 
     def describe(self) -> dict[str, list[float]]:
         """Return attributes of a result: mean enhancement by all waves by depth [m], linear and to 1 at 0 m.

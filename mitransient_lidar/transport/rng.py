@@ -45,7 +45,7 @@ class Lanes:
         """Return what the lanes' shots have of an array with one entry a shot, or of an object that holds such arrays.
 
         An object names its arrays, and the objects that hold others, in ``OF_SHOTS``; arrays of one entry are those of
-        all shots. Poses, which kernels get as they need them, remember the lanes.
+        all shots. A pose names its ``lanes``, and looks up its own numbers as kernels need them.
         """
         picked: Tree = _each_array(tree, lambda values: dr.gather(type(values), values, self.shot), self)
         return picked

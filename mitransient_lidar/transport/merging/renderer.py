@@ -114,8 +114,12 @@ class MergingRenderer(PassRenderer):
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
         light = self._trace_light(record, shots, patches, rates)
-        if light is None or not self._trace_sensor(record, shots, paths, patches, rates, light):
+        found = None if light is None else self._trace_sensor(record, shots, paths, patches, rates, light.on_patches)
+        if light is None or found is None:
             return False
+        segments, points = found
+        if points > 0:
+            self._join(record, shots, segments, points, patches, rates, light)
         # The path tracer adds the light that merging leaves out.
         if not scene.has_specular_or_dry_solids:
             paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, _COMPLEMENT_PATHS // shots.count)
@@ -188,9 +192,12 @@ class MergingRenderer(PassRenderer):
         paths: int,
         patches: SolidPatches,
         rates: ConnectionRates,
-        light: _StoredLight,
-    ) -> bool:
-        """Trace paths from the receiver and join them with light; return False when a buffer was too small."""
+        light: PhotonMap | None,
+    ) -> tuple[SegmentBuffer, int] | None:
+        """Trace paths from the receiver, and merge them with light on solids.
+
+        Return their segments and the number of points, or None when a buffer was too small.
+        """
         layout, lanes, count = self.layout, shots.paths(paths), shots.count * paths
         scene, patches_of_paths, rates_of_paths = lanes.pick((self.scene, patches, rates))
         rng = shots.streams(_SENSOR_STREAM, lanes)
@@ -213,7 +220,7 @@ class MergingRenderer(PassRenderer):
             record.receive(path.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 
         random = shots.streams(_MERGE_STREAM, lanes)
-        merge = merge_on_solids(patches_of_paths, record, light.on_patches, rates.on_solids, random)
+        merge = merge_on_solids(patches_of_paths, record, light, rates.on_solids, random)
         path = walk.run(path, rng, segments, on_solid=merge, on_first_hit=connect, past_solids=False)
         record.rays += dr.sum(mi.Float64(path.rays))
         dr.schedule(record.rays)
@@ -221,20 +228,30 @@ class MergingRenderer(PassRenderer):
         if wanted > segments.capacity:
             layout.least_segments = layout.least_segments[0], (wanted + 1) / count
             layout.sensor_segments = _CAPACITY_MARGIN * layout.least_segments[1]
-            return False
-        if points == 0:
-            return True
+            return None
+        return segments, points
+
+    def _join(
+        self,
+        record: PassRecord,
+        shots: Shots,
+        segments: SegmentBuffer,
+        points: int,
+        patches: SolidPatches,
+        rates: ConnectionRates,
+        light: _StoredLight,
+    ) -> None:
+        """Merge the points of the receiver's paths with light in their cells, and connect some of them."""
         if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
             cells = segments.lanes(index).pick(rates.cells)
-            merge_in_water(scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
+            merge_in_water(self.scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
         if rates.per_path:
             connections = WaterConnections(self.scene, record, rates, segments, shots)
             if light.points > 0:
                 connections.to_light(light.segments, _CONNECTION_STREAM)
             if light.on_patches is not None:
                 connections.to_solids(light.hits, patches, _SOLID_CONNECTION_STREAM)
-        return True
 
 
 @dataclass(frozen=True)
