@@ -77,14 +77,10 @@ class PhotonMap:
         classes: PathClasses,
     ) -> None:
         self._classes = classes
-        x, y, z = light.direction
-        names = ("inverse_density", "length", "throughput", "lost", "mis_partial_sum", "sums")
-        values = {name: getattr(light, name) for name in names}
-        values |= {"x": x, "y": y, "up": z > 0, "tag": tag, "further": further, "label": classes.pack(light)}
         counts = dr.zeros(mi.UInt32, buckets)
         dr.scatter_add(counts, mi.UInt32(1), bucket)
-        # Kept until the places are known: to compute the light again takes 3 % more of a pass.
-        dr.eval(bucket, counts, u, values)
+        # The light itself is computed again below: to keep it takes 3 % less time, and 60 % more memory.
+        dr.eval(bucket, counts, u)
         found = dr.gather(mi.UInt32, counts, bucket)
         kept = u * mi.Float(found) < most
         counts = dr.zeros(mi.UInt32, buckets)
@@ -98,7 +94,9 @@ class PhotonMap:
         number, number_kept = mi.Float(found), mi.Float(dr.gather(mi.UInt32, counts, bucket, kept))
         some = 1 - dr.exp(number * dr.log(1 - most / number))
         scale = dr.select(number > most, number / (some * number_kept), 1)
-        values["throughput"] *= scale
+        x, y, z = light.direction
+        values = {**vars(light), "x": x, "y": y, "up": z > 0, "tag": tag, "further": further}
+        values |= {"throughput": light.throughput * scale, "label": classes.pack(light)}
         self._photons.write(values, dr.gather(mi.UInt32, self._end, bucket) - 1 - rank, kept)
         self._photons.evaluate()
 
