@@ -7,7 +7,8 @@ import mitsuba as mi
 from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
-from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
+from mitransient_lidar.transport.merging.layout import MergingOptions
+from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

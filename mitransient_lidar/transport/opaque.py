@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -10,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Type of a Dr.Jit array.
+#: Type of a Dr.Jit array, or of an object that kernels read.
 ArrayT = TypeVar("ArrayT")
 
 
@@ -41,6 +42,13 @@ def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
     for shape in shapes:
         wanted = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
         found |= number == opaque_index(int(wanted[0]))
+    return found
+
+
+def changed(given: ArrayT, **values: Any) -> ArrayT:
+    """Return a copy of an object with other values of some attributes."""
+    found = copy.copy(given)
+    vars(found).update(values)
     return found
 
 

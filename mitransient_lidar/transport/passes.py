@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ import mitsuba as mi
 
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
+from mitransient_lidar.transport.opaque import changed
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
 from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
@@ -103,9 +103,7 @@ class PassRenderer(ABC):
 
     def scaled(self, share: float) -> PassRenderer:
         """Return a renderer of passes with a share of the paths."""
-        scaled = copy.copy(self)
-        scaled.paths = max(round(share * self.paths), 1)
-        return scaled
+        return changed(self, paths=max(round(share * self.paths), 1))
 
     def for_differences(self) -> PassRenderer:
         """Return a renderer on which differences of scenes have less noise, by default this one."""
@@ -113,29 +111,22 @@ class PassRenderer(ABC):
 
     def by_origin(self) -> PassRenderer:
         """Return a renderer that separates light by its origin; raise UserError for too many solids."""
-        separate = copy.copy(self)
-        separate.classes = replace(PathClasses.by_origin(self.scene.solids), counted=self.classes.counted)
-        return separate
+        classes = PathClasses.by_origin(self.scene.solids)
+        return changed(self, classes=replace(classes, counted=self.classes.counted))
 
     def perturbed(self, perturbations: Sequence[Perturbation]) -> PassRenderer:
         """Return a renderer whose records hold perturbations, too."""
-        perturbed = copy.copy(self)
-        perturbed.scene = replace(self.scene, perturbations=Perturbations(perturbations))
-        if self.focusing is not None:
-            perturbed.focusing = self.focusing.perturbed(perturbations)
-        return perturbed
+        scene = replace(self.scene, perturbations=Perturbations(perturbations))
+        focusing = None if self.focusing is None else self.focusing.perturbed(perturbations)
+        return changed(self, scene=scene, focusing=focusing)
 
     def of_shots(self, scene: LidarScene, shots: int) -> PassRenderer:
         """Return a renderer of a number of shots that meet a scene in parts."""
-        moved = copy.copy(self)
-        moved.scene = scene
-        return moved
+        return changed(self, scene=scene)
 
     def repeated(self, scene: LidarScene, copies: int) -> PassRenderer:
         """Return a renderer of each shot several times in turn, which meet a scene in parts."""
-        several = copy.copy(self)
-        several.scene = scene
-        return several
+        return changed(self, scene=scene)
 
     def render_pass(
         self, seed: int | Sequence[int], *, paths: int | None = None, gates: GateWeights | None = None

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.path import PathPoint
 
 #: Bits of a label for the pixel, and for the number of scattering events; the others are for reversals.
 _PIXEL_BITS, _ORDER_BITS = 20, 6
@@ -80,21 +84,23 @@ class PathClasses:
             return 2 * (self.orders + 1)
         return 1 if self.solids is None else len(ORIGINS) + len(self.solids)
 
-    def pack(self, label: mi.UInt32, scatterings: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
-        """Return a label packed with numbers of scattering events and reversals."""
+    def pack(self, point: PathPoint) -> mi.UInt32:
+        """Return the label of points: their pixels, with their numbers of scattering events and reversals."""
         if not self.labels_orders:
-            return label
+            return point.pixel
         if not self.by_order:
-            return label | (dr.minimum(scatterings, _MOST_COUNTED) << _MANY_PIXEL_BITS)
-        return label | _packed(scatterings, _PIXEL_BITS) | _packed(reversals, _PIXEL_BITS + _ORDER_BITS)
+            return point.pixel | (dr.minimum(point.scatterings, _MOST_COUNTED) << _MANY_PIXEL_BITS)
+        events, reversals = (dr.minimum(each, _MOST) for each in (point.scatterings, point.reversals))
+        return point.pixel | (events << _PIXEL_BITS) | (reversals << (_PIXEL_BITS + _ORDER_BITS))
 
-    def unpack(self, label: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return a label without the numbers of scattering events and reversals, and these (0 where not counted)."""
+    def unpack(self, label: mi.UInt32) -> dict[str, mi.UInt32]:
+        """Return ``pixel``, ``scatterings`` and ``reversals`` of a label, where they are counted."""
         if not self.labels_orders:
-            return label, mi.UInt32(0), mi.UInt32(0)
+            return {"pixel": label}
         if not self.by_order:
-            return label & ((1 << _MANY_PIXEL_BITS) - 1), label >> _MANY_PIXEL_BITS, mi.UInt32(0)
-        return (label & ((1 << _PIXEL_BITS) - 1), (label >> _PIXEL_BITS) & _MOST, label >> (_PIXEL_BITS + _ORDER_BITS))
+            return {"pixel": label & ((1 << _MANY_PIXEL_BITS) - 1), "scatterings": label >> _MANY_PIXEL_BITS}
+        events, reversals = label >> _PIXEL_BITS, label >> (_PIXEL_BITS + _ORDER_BITS)
+        return {"pixel": label & ((1 << _PIXEL_BITS) - 1), "scatterings": events & _MOST, "reversals": reversals}
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
         """Return the numbers of solids among those that are separated, from 1 on; 0 for other shapes."""
@@ -112,7 +118,3 @@ class PathClasses:
             return pixel
         several = dr.select(reversals > 1, mi.UInt32(self.orders + 1), 0)
         return pixel * self.count + several + dr.minimum(order, self.orders)
-
-
-def _packed(number: mi.UInt32, bit: int) -> mi.UInt32:
-    return dr.minimum(number, _MOST) << bit

@@ -79,25 +79,6 @@ class Perturbation:
     beam: float | None = None
 
 
-class SumStore:
-    """Sums of `count` perturbations for a number of paths, in packets of four that are read together."""
-
-    def __init__(self, size: int, count: int) -> None:
-        self._count = count
-        self.packets = [dr.empty(mi.Float, 4 * size) for _ in range(-(-count // 4))]
-
-    def write(self, sums: Sums, place: mi.UInt32, active: mi.Bool) -> None:
-        """Store sums."""
-        padded = [*sums, *[mi.Float(0)] * (-len(sums) % 4)]
-        for number, packet in enumerate(self.packets):
-            dr.scatter(packet, mi.Vector4f(*padded[4 * number : 4 * number + 4]), place, active)
-
-    def read(self, place: mi.UInt32, active: mi.Bool | bool = True) -> Sums:
-        """Return sums."""
-        found = [value for packet in self.packets for value in dr.gather(mi.Vector4f, packet, place, active)]
-        return found[: self._count]
-
-
 class _Layer:
     """A `LayerChange` as numbers that kernels read from memory."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
@@ -24,6 +25,13 @@ _LONGEST_WAY, _SMALLEST_REST = 50.0, 1e-6
 
 #: Initial capacity for segments of each photon, and capacity over the need of the last pass.
 _SEGMENTS, _CAPACITY_MARGIN = 2.5, 1.25
+
+
+#: What is stored of a segment: planes before and after it, start, direction and length, and the entry of its path.
+_PACKETS = (("point", "length"), ("direction", "longest"), ("entry", "entry_length"), ("entry_direction", "throughput"))
+_FIELDS = dict.fromkeys(("before", "passed", "scatterings", "index_layer"), "UInt32") | {
+    name: kind for packet in _PACKETS for name, kind in zip(packet, ("Vector3f", "Float"), strict=True)
+}
 
 
 @dataclass(kw_only=True)
@@ -42,25 +50,12 @@ class CrossingPath(RandomWalkPath):
         Number of planes at or above it, stored because rounding could lose or repeat crossings if it were recomputed.
     """
 
-    entry: mi.Point3f
-    entry_direction: mi.Vector3f
-    entry_length: mi.Float
-    entered: mi.Bool
-    submerged: mi.Bool
-    passed: mi.UInt32
-
-    @classmethod
-    def of(cls, path: RandomWalkPath) -> CrossingPath:
-        """Return paths at their start."""
-        return cls(
-            **vars(path),
-            entry=mi.Point3f(0),
-            entry_direction=mi.Vector3f(0),
-            entry_length=mi.Float(0),
-            entered=mi.Bool(False),
-            submerged=mi.Bool(False),
-            passed=mi.UInt32(0),
-        )
+    entry: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    entry_direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    entry_length: mi.Float = field(default_factory=lambda: mi.Float(0))
+    entered: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    submerged: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    passed: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
 
 @dataclass(frozen=True)
@@ -117,16 +112,12 @@ class Crossings:
         self._depths = aligned(mi.Float, np.append(depths, np.inf))
         self._planes = len(depths)
         self._stored = dr.zeros(mi.UInt32, 1)
-        self._first = dr.empty(mi.UInt32, 4 * capacity)
-        self._start = dr.empty(mi.Float, 4 * capacity)
-        self._direction = dr.empty(mi.Float, 4 * capacity)
-        self._entry = dr.empty(mi.Float, 4 * capacity)
-        self._entry_direction = dr.empty(mi.Float, 4 * capacity)
+        self._segments = PackedStore(capacity, _FIELDS)
 
     def _planes_above(self, depth: mi.Float) -> mi.UInt32:
         return mi.UInt32(dr.binary_search(0, self._planes, lambda i: dr.gather(mi.Float, self._depths, i) <= depth))
 
-    def add(self, path: CrossingPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+    def add(self, path: CrossingPath, length: mi.Float, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path that crosses a plane, and return the paths' offset unchanged.
 
         Inactive lanes are stored, too: light that never ends its segment in clear water is inactive but crosses planes.
@@ -144,24 +135,23 @@ class Crossings:
         crosses = wet & (path.passed != before)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), crosses)
         keep = crosses & (slot < self.capacity)
-        dr.scatter(self._first, mi.Vector4u(before, path.passed, path.scatterings, path.index_layer), slot, keep)
-        dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.length), slot, keep)
-        along, into = path.direction, path.entry_direction
-        dr.scatter(self._direction, mi.Vector4f(along.x, along.y, along.z, length), slot, keep)
-        entry = mi.Vector4f(path.entry.x, path.entry.y, path.entry.z, path.entry_length)
-        dr.scatter(self._entry, entry, slot, keep)
-        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.throughput), slot, keep)
+        self._segments.write({**vars(path), "before": before, "longest": length}, slot, keep)
         path.active &= ~path.entered | (path.length - path.entry_length < self._longest)
         return path.offset
 
     def finalize(self) -> tuple[PlaneCrossings, int]:
         """Return the crossings, and the number of segments, stored or not."""
-        arrays = (self._first, self._start, self._direction, self._entry, self._entry_direction)
-        dr.eval(self._stored, *arrays)
+        self._segments.evaluate()
+        dr.eval(self._stored)
         wanted = int(self._stored[0])
         count = min(wanted, self.capacity)
-        counts, start, direction, entry, entry_direction = (np.array(array).reshape(-1, 4)[:count] for array in arrays)
-        before, after, scatterings, layer = counts.astype(np.int64).T
+        stored = self._segments.read(dr.arange(mi.UInt32, count))
+        before, after, scatterings, layer = (
+            np.array(stored[name]).astype(np.int64) for name in ("before", "passed", "scatterings", "index_layer")
+        )
+        start, direction, entry, entry_direction = (
+            np.column_stack([np.array(stored[name]).T, np.array(stored[more])]) for name, more in _PACKETS
+        )
         number = np.abs(after - before)
         segment = np.repeat(np.arange(count), number)
         rank = np.arange(len(segment)) - np.repeat(np.cumsum(number) - number, number)
@@ -243,10 +233,10 @@ class CrossingTracer:
             segments = Crossings(scene.required_water, self._depths, int(self._segments * count), self._longest)
             angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
             sent = np.broadcast_to(np.array(energy, dtype=np.float64), count)
-            path = CrossingPath.of(RandomWalkPath.start(scene, pose, angles, energy, mi.Float(0)))
+            path = CrossingPath.walking(scene, pose, angles, energy, mi.Float(0))
             # Infinite length: no record ends the paths.
             walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
-            end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
+            end = walk.run(path, rng, segments, on_solid=lambda *_: None, past_solids=False)
             outside = sent[np.array(end.lost)].sum()
             crossings, wanted = segments.finalize()
             if wanted <= segments.capacity:

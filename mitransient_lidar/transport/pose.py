@@ -34,6 +34,8 @@ class KernelPose(Pose):
         Place of the frame's origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
     """
 
+    OF_SHOTS = ("lanes",)
+
     delay: float | FloatArray = 0.0
     lanes: Lanes | None = None
     frame_origin: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -45,10 +47,6 @@ class KernelPose(Pose):
     def in_scene(self, points: FloatArray) -> FloatArray:
         """Return where points of the frame are in the scene [m], x, y or x, y, z along the last axis."""
         return np.asarray(points + self.frame_origin[: points.shape[-1]])
-
-    def of(self, lanes: Lanes) -> KernelPose:
-        """Return the poses with the lanes of paths."""
-        return replace(self, lanes=lanes)
 
     def part(self, rows: slice | IntArray) -> KernelPose:
         """Return the poses of some of the shots."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.path import Path
-from mitransient_lidar.transport.path_step import PathStep, Vertex
+from mitransient_lidar.transport.path import Path, PathStep, Vertex
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.snell import refract_level
@@ -20,61 +19,44 @@ from mitransient_lidar.transport.snell import refract_level
 _SMALLEST_DISTANCE = 1e-9
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RandomWalkPath(Path):
-    """A path of a random walk.
+    """A path of a random walk; `inverse_density` is that of the end of its last segment.
 
     Attributes
     ----------
-    mis_partial_sum
-        Sum of the densities, up to a common factor, with which merges and connections of the path so far make the same
-        path. With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a
-        merge in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
-        transmittance T of scattering.
     lane, points
         Number of the path, and of its points in the water so far.
     inverse_scattering_density
-        1 / (b p) of the last vertex [m sr] if it is a scattering event in the water, else 0.
+        1 / (b p) of the last vertex [m sr] if it is a scattering event in the water, else 0 (see `mis_partial_sum`).
     offset
         Distance from the last vertex to the next point along the path [m].
     """
 
     lane: mi.UInt32
-    points: mi.UInt32
-    mis_partial_sum: mi.Float
-    inverse_scattering_density: mi.Float
+    points: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    inverse_scattering_density: mi.Float = field(default_factory=lambda: mi.Float(0))
     offset: mi.Float
 
     @classmethod
-    def start(
+    def walking(
         cls, scene: LidarScene, pose: KernelPose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
-    ) -> RandomWalkPath:
+    ) -> Self:
         """Return paths from laser or receiver at tangent-plane angles, without those of throughput 0."""
         count = dr.width(angles)
         active = (throughput > 0) & dr.full(mi.Bool, True, count)
-        state = Path.initial(scene, pose, angles, throughput, active)
-        return cls(
-            **state,
-            lane=dr.arange(mi.UInt32, count),
-            points=mi.UInt32(0),
-            mis_partial_sum=mi.Float(0),
-            inverse_scattering_density=mi.Float(0),
-            offset=offset,
-        )
+        return cls.start(scene, pose, angles, throughput, active, lane=dr.arange(mi.UInt32, count), offset=offset)
 
 
 class Segments(Protocol):
     """Store of the segments in the water, up to the first solid."""
 
-    def add(self, path: Any, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+    def add(self, path: Any, length: mi.Float, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
 
 
-#: Callback at solids: paths, interaction, `inverse_density` there as in `SegmentPoints`, active lanes.
-Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Float, mi.Bool], None]
-
-#: Callback at first hits: paths, interaction, active lanes.
-FirstAction = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
+#: Callback at solids and at first hits: paths, interaction, active lanes.
+Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
 
 
 class EstimateRates(Protocol):
@@ -125,18 +107,16 @@ class RandomWalk:
         self,
         path: RandomWalkPath,
         rng: mi.PCG32,
-        label: mi.UInt32,
         segments: Segments,
         *,
         on_solid: Action,
-        on_first_hit: FirstAction | None = None,
+        on_first_hit: Action | None = None,
         past_solids: bool,
     ) -> RandomWalkPath:
         """Walk until all paths have ended.
 
-        Segments are stored with the label of their path. `on_solid` is called where a path meets a solid under water,
-        `on_first_hit` where its first segment ends on the sea or on a solid in the air. `past_solids` is whether paths
-        continue beyond the first solid.
+        `on_solid` is called where a path meets a solid under water, `on_first_hit` where its first segment ends on the
+        sea or on a solid in the air. `past_solids` is whether paths continue beyond the first solid.
         """
         step, perturbations = self._step, self.scene.perturbations
 
@@ -147,13 +127,13 @@ class RandomWalk:
             self._end_outside(path, vertex, first)
             path.active &= vertex.exists
             in_record = dr.minimum(vertex.length, self._longest(path))
-            path.offset = segments.add(path, in_record, label, wet & path.active & path.before_first_solid)
+            path.offset = segments.add(path, in_record, wet & path.active & path.before_first_solid)
             absorption = self._water.absorption_flight.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
             path.sums = perturbations.along(path.sums, path.depth, path.downward, vertex.length, wet & path.active)
             depth = self._water.scattering_flight.optical_depth(path.depth, path.downward, vertex.length)
             inverse = path.inverse_scattering_density
-            inverse_density = dr.select(inverse > 0, inverse * dr.square(vertex.length) * dr.exp(depth), 0)
+            path.inverse_density = dr.select(inverse > 0, inverse * dr.square(vertex.length) * dr.exp(depth), 0)
             step.arrive(path, vertex)
             by_surface = path.length + self._to_go.distance(path.point)
             path.surface_length = dr.select(first & vertex.at_sea, by_surface, path.surface_length)
@@ -161,8 +141,8 @@ class RandomWalk:
                 on_first_hit(path, vertex.si, first & (vertex.at_sea | (vertex.on_solid & ~wet)))
             hit = vertex.on_solid & wet
             # Most segments end in the water: the action is skipped where no path of a packet meets a solid.
-            dr.if_stmt((path, vertex.si, inverse_density, hit), hit, on_solid, lambda *_: None, label="solid")
-            self._redirect(path, rng, vertex, inverse_density)
+            dr.if_stmt((path, vertex.si, hit), hit, on_solid, lambda *_: None, label="solid")
+            self._redirect(path, rng, vertex)
             self._enter_outside(path, vertex.outside)
             step.cross_boundary(path, vertex.at_boundary & path.active)
             if not past_solids:
@@ -188,7 +168,7 @@ class RandomWalk:
         spare = self._path_end - path.length - self._to_go.distance(path.point)
         return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
 
-    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex, inverse_density: mi.Float) -> None:
+    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex) -> None:
         """Draw the next direction."""
         step, si = self._step, vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -199,7 +179,8 @@ class RandomWalk:
         b_p = self._water.coefficient(self._water.scattering_flight, event.scatterer, path.point) * weight[0] * pdf
         inverse = dr.select(vertex.scattered, dr.rcp(b_p), 0)
         if self._rates is not None:
-            path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * inverse_density)
+            connections = self._rates.in_water * path.inverse_density
+            path.mis_partial_sum += inverse * (self._rates.volume(path.point) + connections)
         path.inverse_scattering_density = inverse
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))

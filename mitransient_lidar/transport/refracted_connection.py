@@ -11,7 +11,6 @@ import numpy as np
 
 from mitransient_lidar.transport.medium.index_layers import coinciding
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.snell import refract
@@ -164,42 +163,6 @@ def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Floa
     """Return the transmittance of radiance through a level surface, with Fresnel's factor for normal incidence."""
     index = opaque(scene.refractive_index)
     return 4 * index / (1 + index) ** 2 * emitter.in_air.z / emitter.in_water.z
-
-
-@dataclass
-class ConnectedPath(Path):
-    """A path whose vertices are connected to an emitter.
-
-    Attributes
-    ----------
-    emitter_ratio
-        Density of the sampled connection over that of the path's own sampling, for the direction of the next segment; 0
-        where no connection was sampled.
-    specular
-        Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
-        receiver: the last vertex could not be connected.
-    reflected_by_sea
-        Whether the next segment was reflected by the dry side of the sea surface.
-    solid
-        Number of the first solid met, as `PathClasses.solid`.
-    """
-
-    emitter_ratio: mi.Float
-    specular: mi.Bool
-    reflected_by_sea: mi.Bool
-    solid: mi.UInt32
-
-    @classmethod
-    def start(cls, scene: WaterScene, angles: mi.Point2f, active: mi.Bool) -> ConnectedPath:
-        """Return paths that start at the receiver at tangent-plane angles."""
-        state = Path.initial(scene, scene.receiver_pose, angles, mi.Float(1), active)
-        return cls(
-            **state,
-            emitter_ratio=mi.Float(0),
-            specular=mi.Bool(True),
-            reflected_by_sea=mi.Bool(False),
-            solid=mi.UInt32(0),
-        )
 
 
 @dataclass

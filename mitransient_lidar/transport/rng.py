@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.opaque import ArrayT, aligned
+from mitransient_lidar.transport.opaque import aligned, changed
+
+#: An array of Dr.Jit with one entry a shot, or an object that holds such arrays.
+Tree = TypeVar("Tree")
 
 
 @dataclass(frozen=True)
@@ -37,9 +41,38 @@ class Lanes:
         shot = lane // paths
         return cls(shots, shot, lane - shot * paths)
 
-    def pick(self, values: ArrayT) -> ArrayT:
-        """Return the value of the lane's shot, of arrays with one entry a shot."""
-        return values if self.shots == 1 else dr.gather(type(values), values, self.shot)
+    def pick(self, tree: Tree) -> Tree:
+        """Return what the lanes' shots have of an array with one entry a shot, or of an object that holds such arrays.
+
+        An object names its arrays, and the objects that hold others, in ``OF_SHOTS``; arrays of one entry are those of
+        all shots. A pose names its ``lanes``, and looks up its own numbers as kernels need them.
+        """
+        picked: Tree = _each_array(tree, lambda values: dr.gather(type(values), values, self.shot), self)
+        return picked
+
+
+def tiled(tree: Tree, copies: int) -> Tree:
+    """Return an object that holds arrays with one entry a shot, for shots that are each repeated several times."""
+    repeated: Tree = _each_array(tree, lambda values: dr.repeat(values, copies))
+    return repeated
+
+
+def starts(shots: int, size: int) -> mi.UInt32:
+    """Return the number of the first of `size` entries of each shot."""
+    return mi.UInt32(0) if shots == 1 else aligned(mi.UInt32, np.arange(shots) * size)
+
+
+def _each_array(tree: Any, change: Callable[[Any], Any], lanes: Lanes | None = None) -> Any:
+    """Return a tree with its arrays of several shots changed."""
+    if dr.is_array_v(tree):
+        return change(tree) if dr.width(tree) > 1 else tree
+    if isinstance(tree, list | tuple):
+        return type(tree)(_each_array(part, change, lanes) for part in tree)
+    names = getattr(tree, "OF_SHOTS", None)
+    if names is None:
+        return tree
+    own = {name: _each_array(getattr(tree, name), change, lanes) for name in names}
+    return changed(tree, **({"lanes": lanes} if names == ("lanes",) else own))
 
 
 class Shots:

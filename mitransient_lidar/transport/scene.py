@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self, TypeVar
+from typing import ClassVar, Self, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +23,6 @@ from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
-from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import children
 
@@ -51,14 +50,11 @@ class ScenePart:
     displaced [m] to the shapes. Without `turn` they are only displaced.
     """
 
+    OF_SHOTS = ("displacement", "turn")
+
     shapes: mi.Scene
     displacement: mi.Vector3f
     turn: mi.Vector2f | None = None
-
-    def of(self, lanes: Lanes) -> ScenePart:
-        """Return the part with the displacement of each lane."""
-        turn = None if self.turn is None else lanes.pick(self.turn)
-        return ScenePart(self.shapes, lanes.pick(self.displacement), turn)
 
     def ray(self, ray: mi.Ray3f) -> mi.Ray3f:
         """Return rays of the lidar's frame among the shapes."""
@@ -95,6 +91,8 @@ class WaterScene:
         Groups of shapes that instances repeat.
     """
 
+    OF_SHOTS: ClassVar[tuple[str, ...]] = ("parts", "receiver_poses")
+
     mitsuba_scene: mi.Scene
     receiver: Receiver
     water: Water | None
@@ -104,13 +102,6 @@ class WaterScene:
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
     groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)
-
-    def of(self, lanes: Lanes) -> Self:
-        """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
-        if not self.parts:
-            return self
-        poses = None if self.receiver_poses is None else self.receiver_poses.of(lanes)
-        return replace(self, parts=tuple(part.of(lanes) for part in self.parts), receiver_poses=poses)
 
     def with_parts_of(self, shapes: Sequence[mi.Shape]) -> Self:
         """Return a scene in parts without the parts that hold none of the shapes; the same one if all hold none."""
@@ -386,17 +377,13 @@ class LidarScene(WaterScene):
         Pose of the transmitter in each shot, where they differ.
     """
 
+    OF_SHOTS = (*WaterScene.OF_SHOTS, "transmitter_poses")
+
     transmitter: Transmitter
     axis: TimeAxis
     gates: GatePlan | None
     record_end: str = ""
     transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
-
-    def of(self, lanes: Lanes) -> LidarScene:
-        """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
-        moved = super().of(lanes)
-        poses = self.transmitter_poses
-        return moved if poses is None else replace(moved, transmitter_poses=poses.of(lanes))
 
     @property
     def transmitter_pose(self) -> KernelPose:

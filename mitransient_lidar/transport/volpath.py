@@ -15,11 +15,10 @@ from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.path import ConnectedPath, PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.refracted_connection import (
-    ConnectedPath,
     EmitterDirection,
     RefractedEmitterSampler,
     RefractedLaserSampler,
@@ -87,12 +86,11 @@ class PathLight:
     ----------
     sampler
         Samples directions under water towards the emitter.
-    pixel, weight
-        Pixel of each path, and the weight of its light.
+    weight
+        Weight of the light of each path.
     """
 
     sampler: RefractedEmitterSampler
-    pixel: mi.UInt32
     weight: mi.Float
 
     #: Whether the emitter is under water, where straight lines reach it.
@@ -150,8 +148,8 @@ class PathLight:
 class LaserLight(PathLight):
     """The laser, and the record of a pass."""
 
-    def __init__(self, scene: LidarScene, record: PassRecord, pixel: mi.UInt32, weight: mi.Float) -> None:
-        self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
+    def __init__(self, scene: LidarScene, record: PassRecord, weight: mi.Float) -> None:
+        self.scene, self.record, self.weight = scene, record, weight
         self.submerged = scene.submerged
         self.sampler = SubmergedLaserSampler(scene) if scene.submerged else RefractedLaserSampler(scene)
         self._to_laser = scene.relative(scene.transmitter_pose)
@@ -187,7 +185,7 @@ class LaserLight(PathLight):
         upward = self.scene.transmitter_pose.point.z - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
-        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
+        self.record.receive(path.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
@@ -279,7 +277,7 @@ class PathTracer:
     ) -> None:
         """Connect from under water through the surface, and from the surface and from solids in the air directly."""
         scene, si, light = self.scene, vertex.si, self.light
-        submerged = self._submerged(vertex)
+        submerged = vertex.submerged
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         up, density = light.sampler.sample_in_layer(emitter, u, path.index_layer)
         sampled = submerged & (density > 0) if self.options.samples_emitter else mi.Bool(False)
@@ -341,14 +339,9 @@ class PathTracer:
         sums = light.perturbed(sums, path.point, vertex.si, vertex.on_surface)
         light.receive(path, path.length + length, energy, radiance > 0, vertex.on_solid, sums)
 
-    @staticmethod
-    def _submerged(vertex: Vertex) -> mi.Bool:
-        """Return whether a vertex lies under water."""
-        return vertex.scattered | (vertex.on_solid & vertex.in_water)
-
     def _merged(self, path: ConnectedPath, vertex: Vertex, first: mi.Bool) -> mi.Bool:
         """Return whether ``lidar_merging`` finds the connections of a vertex by merging."""
-        seen_through = self._submerged(vertex) | (vertex.at_sea & (path.scatterings > 0))
+        seen_through = vertex.submerged | (vertex.at_sea & (path.scatterings > 0))
         return (first & vertex.on_surface) | (path.before_first_solid & seen_through)
 
     def _optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Float:
@@ -417,7 +410,7 @@ class PathTracer:
         """
         probability, si = self._guiding_probability(vertex, emitter), vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        submerged = self._submerged(vertex)
+        submerged = vertex.submerged
         mixed = vertex.scattered | (submerged & vertex.on_surface & vertex.is_rough)
         guided = pick < probability
         # The random number is rescaled and reused by the phase function and the BSDF.
@@ -475,10 +468,11 @@ def trace_connected(
     """Trace a number of paths from the receiver for each shot and connect them to the laser, into a record."""
     require_memory(f"{shots.count * paths} paths", BYTES_PER_PATH * shots.count * paths, "take fewer paths_per_pass")
     lanes = shots.paths(paths)
-    scene, rng = scene.of(lanes), shots.streams(_STREAM, lanes)
+    scene, rng = lanes.pick(scene), shots.streams(_STREAM, lanes)
     start = sampler.sample_shots(lanes, paths, rng)
-    path = ConnectedPath.start(scene, start.angles, start.weight > 0)
-    light = LaserLight(scene, record, start.pixel, start.weight)
+    found = start.weight > 0
+    path = ConnectedPath.start(scene, scene.receiver_pose, start.angles, mi.Float(1), found, pixel=start.pixel)
+    light = LaserLight(scene, record, start.weight)
     record.rays += PathTracer(scene, options, light).trace(path, rng)
 
 

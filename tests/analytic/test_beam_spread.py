@@ -98,13 +98,13 @@ def moments(system, passes):
     for number in range(passes):
         rng = pass_streams(3, number, count)
         down = mi.Point2f(dr.zeros(mi.Float, count), 0)
-        path = RandomWalkPath.start(parts, parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(STEP))
+        path = RandomWalkPath.walking(parts, parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(STEP))
         path.point, path.in_water = mi.Point3f(0, 0, -SOURCE_DEPTH), mi.Bool(True)
         path.at_start, path.length = mi.Bool(False), mi.Float(1)
         segments = SegmentBuffer(parts, PathClasses(), STEP, count, 150 * count)
         end = parts.reference_length + 500.0
         RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, end).run(
-            path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False
+            path, rng, segments, on_solid=lambda *_: None, past_solids=False
         )
         points, wanted = segments.finalize()
         assert wanted <= segments.capacity
@@ -252,10 +252,10 @@ def test_white_bottom_returns_all_light(system):
         rng = pass_streams(5, number, count)
         beam = BeamSampler(parts.transmitter, parts.receiver)
         angles, energy = beam.sample(dr.arange(mi.UInt32, count), count, rng)
-        start = RandomWalkPath.start(parts, parts.transmitter.pose, angles, energy, mi.Float(0))
+        start = RandomWalkPath.walking(parts, parts.transmitter.pose, angles, energy, mi.Float(0))
         nothing = SimpleNamespace(add=lambda path, *_: path.offset)
         end = RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, 6000.0).run(
-            start, rng, mi.UInt32(0), nothing, on_solid=lambda *_: None, past_solids=True
+            start, rng, nothing, on_solid=lambda *_: None, past_solids=True
         )
         left = ~np.array(end.in_water) & (np.array(end.direction.z) > 0)
         share = np.array(end.throughput, dtype=np.float64) * left / parts.transmitter.energy

@@ -8,7 +8,7 @@ from significance import largest_chi2, largest_error, largest_z, mean_and_error
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
-from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import BeamRings
@@ -185,7 +185,7 @@ def test_points_fall_into_cells_by_their_volume(wavy_sea, shift, direction):
     rings = BeamRings(lidar.transmitter.pose, 0.5, 1.34)
     # So wide a beam has the same light everywhere.
     profile = RefractedProfile(lidar, (1e4, 1e4))
-    cells = WaterCells(WaterGrid(rings, heights, profile, 0.4, 0.2, 0.25, 0.1, 4.0), mi.Point4f(shift))
+    cells = WaterCells(rings, heights, profile, 0.4, 0.2, 0.25, 0.1, 4.0).of_pass(mi.Point4f(shift))
     rng, count, depth = np.random.default_rng(7), 2**21, 1.5
     lean = lidar.transmitter.pose.axis[0] / 1.34
     lean /= np.sqrt(1 - lean**2)
@@ -220,7 +220,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     width, count = 0.1, 2**18
     rings, shift = BeamRings(lidar.transmitter.pose, 1.0, 1.34), mi.Point2f(0.37, 0.61)
-    patches = SolidPatches(lidar, region, rings, 8.0, width, shift)
+    patches = SolidPatches(lidar, region, rings, 8.0, width).of_pass(lidar, shift)
     rng = pass_streams(3, 0, count)
     x, y = (half * (2 * rng.next_float32() - 1) for _ in range(2))
     ray = mi.Ray3f(mi.Point3f(x + 0.1, y + 0.05, -3), mi.Vector3f(0, 0, -1))

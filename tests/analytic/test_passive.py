@@ -13,7 +13,7 @@ from mitransient_lidar.physics.lidar.refraction import fresnel, snell
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering import passive
-from mitransient_lidar.transport.refracted_connection import ConnectedPath
+from mitransient_lidar.transport.path import ConnectedPath
 from mitransient_lidar.transport.rng import pass_streams
 
 N = 1.34
@@ -358,10 +358,11 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     count, found = 2**14 if ratio > 0.1 else 2**17, []
     for seed in range(8):
-        path = ConnectedPath.start(renderer.scene, mi.Point2f(0, 0), dr.full(mi.Bool, True, count))
+        pose, every = renderer.scene.receiver_pose, dr.full(mi.Bool, True, count)
+        path = ConnectedPath.start(renderer.scene, pose, mi.Point2f(0, 0), mi.Float(1), every)
         path.point, path.in_water = mi.Point3f(0, 0, -depth), mi.Bool(True)
         weight = dr.full(mi.Float, 1 / count, count)
-        record = renderer.follow(path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
+        record = renderer.follow(path, pass_streams(seed, 4, count), weight)
         found.append([float(record.found[0])])
     error = agrees(np.array(found), expected, 4, bias=spread)
     assert error < largest_error(8, 0.004 if ratio > 0.1 else 0.018)

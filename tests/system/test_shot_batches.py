@@ -163,7 +163,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
     renderer = prepared("docs/guide/survey_lidar.xml", params, "lidar_merging")
     places, copies, points = PLACES[:2], 3, 1000
     batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, [])
-    heights, region = batches.at(ShotPoses(places))(copies).layout.grid.heights, renderer.layout.region
+    heights, region = batches.at(ShotPoses(places))(copies).layout.cells.heights, renderer.layout.patches.region
     highest, lowest = renderer.scene.empty_heights
     assert (highest < lowest) == (slope == 0)
     x, y = (np.random.default_rng(1).uniform(region.low[axis], region.high[axis], points) for axis in (0, 1))
@@ -175,7 +175,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
         bed = alone.ray_intersect(alone.spawn_ray(sea, down.d))
         assert np.all(alone.is_surface(sea.shape))
         last_pass = Lanes(len(places) * copies, dr.full(mi.UInt32, copies * number + copies - 1, points), mi.UInt32(0))
-        found = heights.of(last_pass)
+        found = last_pass.pick(heights)
         surface, _ = found.surface_at(mi.Float(x), mi.Float(y))
         assert np.std(sea.p.z) > 0.03
         # Cells of 14 cm.

@@ -11,21 +11,16 @@ import mitsuba as mi
 from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.daylight.sampling import FovSampler
 from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.path import ConnectedPath
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.refracted_connection import (
-    ConnectedPath,
     EmitterDirection,
     RefractedSunSampler,
     connect_sun,
     level_transmittance,
 )
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.volpath import (
-    BYTES_PER_PATH,
-    PathLight,
-    PathTracer,
-    VolpathOptions,
-)
+from mitransient_lidar.transport.volpath import BYTES_PER_PATH, PathLight, PathTracer, VolpathOptions
 
 #: Number of the random streams within a pass.
 _STREAM = 4
@@ -60,10 +55,8 @@ class DaylightRecord:
 class DaylightLight(PathLight):
     """Sun and sky, and the record of a pass; uniform random numbers `u` choose a point of the sun's disc per path."""
 
-    def __init__(
-        self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f, pixel: mi.UInt32, weight: mi.Float
-    ) -> None:
-        self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
+    def __init__(self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f, weight: mi.Float) -> None:
+        self.scene, self.record, self.weight = scene, record, weight
         self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
         self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
 
@@ -86,7 +79,7 @@ class DaylightLight(PathLight):
         self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
         """Add light of the sun."""
-        self.add(self.pixel, energy, active)
+        self.add(path.pixel, energy, active)
 
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
         """Add the sky where paths leave the scene, and the sun where they could not be connected to it."""
@@ -94,7 +87,7 @@ class DaylightLight(PathLight):
         radiance = dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))
         if scene.sun is not None:
             radiance += dr.select(path.specular, scene.sun.radiance(path.direction), 0)
-        self.add(self.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
+        self.add(path.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
 
     def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
         """Add the sky that the dry side of the sea surface reflects, where the ray is not blocked."""
@@ -109,7 +102,7 @@ class DaylightLight(PathLight):
         bright = active & (radiance > 0)
         bright &= ~self.scene.ray_test(ray, bright)
         path.rays += dr.select(active, mi.UInt32(1), 0)
-        self.add(self.pixel, self.weight * path.throughput * radiance, bright)
+        self.add(path.pixel, self.weight * path.throughput * radiance, bright)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add light of the sun to the losses."""
@@ -138,17 +131,18 @@ class DaylightRenderer:
         with dr.suspend_grad():
             rng = pass_streams(seed, _STREAM, count)
             start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
-            path = ConnectedPath.start(self.scene, start.angles, start.weight > 0)
-            return self.follow(path, rng, start.pixel, start.weight)
+            pose, found = self.scene.receiver_pose, start.weight > 0
+            path = ConnectedPath.start(self.scene, pose, start.angles, mi.Float(1), found, pixel=start.pixel)
+            return self.follow(path, rng, start.weight)
 
-    def follow(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> DaylightRecord:
-        """Trace paths from their last vertices to their ends, with the pixel and the weight [sr] of each."""
+    def follow(self, path: ConnectedPath, rng: mi.PCG32, weight: mi.Float) -> DaylightRecord:
+        """Trace paths from their last vertices to their ends, with the weight [sr] of each."""
         pixels = self.scene.receiver.pixels.count
         found, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, 1))
         record = DaylightRecord(found, sampled, lost, mi.Float64(0))
-        dr.scatter_add(record.sampled, mi.Float64(weight), pixel, weight > 0)
+        dr.scatter_add(record.sampled, mi.Float64(weight), path.pixel, weight > 0)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        light = DaylightLight(self.scene, record, u, pixel, weight)
+        light = DaylightLight(self.scene, record, u, weight)
         options = self.options
         if self.scene.sun is None:
             # Nothing to be guided to.

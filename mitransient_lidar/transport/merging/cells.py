@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 
@@ -12,8 +11,8 @@ import numpy as np
 
 from mitransient_lidar.transport.merging.region import SurfaceHeights
 from mitransient_lidar.transport.merging.rings import BeamRings
-from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.opaque import changed, opaque
+from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Logarithm to base 2 of the largest number of buckets of a shot.
@@ -95,6 +94,15 @@ class RefractedProfile:
         of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
         self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
 
+    @classmethod
+    def of_scene(cls, scene: LidarScene, footprint: float) -> RefractedProfile:
+        """Return the profile of a scene's beam, of a standard deviation on the sea [m]."""
+        beam = scene.transmitter.profile
+        squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
+        spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
+        along, across = (spreads * footprint / scene.transmitter.angular_spread).tolist()
+        return cls(scene, (along, across))
+
     def growth(self, most: float) -> float:
         """Return by how much ripples widen light of the beam or, if less, of a deviation `most`, for each metre."""
         return min(growth / min(spread, most) for spread, growth in self._own)
@@ -133,8 +141,8 @@ class RefractedProfile:
         return along, across
 
 
-class WaterGrid:
-    """Layout of cells that follow the sea surface and are arranged about the refracted beam.
+class WaterCells:
+    """Cells that follow the sea surface and are arranged about the refracted beam, of a scene or of one pass.
 
     Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
     above a solid ends there, and the first one behind a veil begins there. They are sheared along the beam in still
@@ -161,6 +169,8 @@ class WaterGrid:
         that is seen, and the largest width that it reaches, over that at the surface.
     """
 
+    OF_SHOTS = ("heights", "rings", "_shift", "_start")
+
     def __init__(
         self,
         rings: BeamRings,
@@ -176,6 +186,7 @@ class WaterGrid:
         widening: float = 1.0,
     ) -> None:
         self.heights, self.rings, self.profile, self.bits = heights, rings, profile, bits
+        self._shift, self._start = mi.Point4f(0), mi.UInt32(0)
         uppermost = min(max(uppermost, _LEAST_THICKNESS * thickness), thickness)
         layers = math.log(thickness / uppermost) / _THICKNESS_PER_DEPTH
         self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
@@ -185,30 +196,20 @@ class WaterGrid:
         self._uppermost = opaque(uppermost)
         self.bits_z = int(np.clip(math.ceil(math.log2(layers + depth / thickness + 1)), 2, 8))
 
-    def of_shots(self, heights: SurfaceHeights, rings: BeamRings, wider: float, bits: int) -> WaterGrid:
-        """Return the grid of shots with heights and axes of their own.
+    def of_shots(self, heights: SurfaceHeights, rings: BeamRings, wider: float, bits: int) -> WaterCells:
+        """Return the cells of shots with heights and axes of their own.
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
-        grid = self.moved(heights, rings)
-        grid.width, grid.bits = self.width * opaque(wider), bits
-        return grid
+        return changed(self, heights=heights, rings=rings, width=self.width * opaque(wider), bits=bits)
 
-    def moved(self, heights: SurfaceHeights, rings: BeamRings) -> WaterGrid:
-        """Return the grid below another sea surface and about other axes."""
-        grid = copy.copy(self)
-        grid.heights, grid.rings = heights, rings
-        return grid
+    def moved(self, heights: SurfaceHeights, rings: BeamRings) -> WaterCells:
+        """Return the cells below another sea surface and about other axes."""
+        return changed(self, heights=heights, rings=rings)
 
-    def of_even_width(self, wider: float) -> WaterGrid:
-        """Return the grid of cells that are wider by a factor than those at the surface, at all depths."""
-        grid = copy.copy(self)
-        grid.width, grid.growth = self.width * opaque(wider), opaque(0.0)
-        return grid
-
-    def repeated(self, copies: int) -> WaterGrid:
-        """Return the grid of each shot several times in turn."""
-        return self.moved(self.heights.repeated(copies), self.rings.repeated(copies))
+    def of_even_width(self, wider: float) -> WaterCells:
+        """Return the cells of cells that are wider by a factor than those at the surface, at all depths."""
+        return changed(self, width=self.width * opaque(wider), growth=opaque(0.0))
 
     @property
     def bits_ring(self) -> int:
@@ -242,36 +243,17 @@ class WaterGrid:
         even = dr.maximum(layers - self._layers, 0) * self.thickness
         return dr.fma(thin, self._uppermost / _THICKNESS_PER_DEPTH, even)
 
-    def cells(self, shift: mi.Point4f) -> WaterCells:
+    def of_pass(self, shift: mi.Point4f) -> WaterCells:
         """Return the cells of a pass, shifted by four uniform random numbers of each shot."""
-        return WaterCells(self, shift)
-
-
-class WaterCells:
-    """The cells of one pass: a `WaterGrid` shifted by four uniform random numbers of each shot."""
-
-    def __init__(self, grid: WaterGrid, shift: mi.Point4f) -> None:
-        self.grid, self.heights, self.rings = grid, grid.heights, grid.rings
-        self._shift = shift
-        self._start = mi.UInt32(0)
-
-    def of(self, lanes: Lanes) -> WaterCells:
-        """Return the cells of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        cells = copy.copy(self)
-        cells.heights, cells.rings = self.heights.of(lanes), self.rings.of(lanes)
-        cells._shift = lanes.pick(self._shift)
-        cells._start = lanes.shot << self.grid.bits
-        return cells
+        return changed(self, _shift=shift, _start=starts(dr.width(shift), 1 << self.bits))
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""
-        grid, rings = self.grid, self.rings
+        rings = self.rings
         depth = dr.maximum(rings.depth_at(point.z), 0)
         along, across = rings.offset(point.x, point.y, depth)
         scale = dr.square(rings.core(depth)) + along * along + across * across
-        return grid.thickness_at(depth) * dr.square(grid.widths(depth)) * scale / rings.cosine
+        return self.thickness_at(depth) * dr.square(self.widths(depth)) * scale / rings.cosine
 
     def _depth_along_beam(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector2f, mi.Float]:
         """Return the depth of points below where the beam's direction leads up to the surface [m], and slopes there.
@@ -297,7 +279,7 @@ class WaterCells:
         others along the beam as it is refracted there. The volume for unscattered light is corrected by the profile of
         the beam on the plane over that at the point, so that it is light at the point.
         """
-        grid, rings = self.grid, self.rings
+        rings = self.rings
         depth, slope, stretch = self._depth_along_beam(point)
         line, looks_up = rings.refracted(slope), direction is None
         if not looks_up:
@@ -311,20 +293,20 @@ class WaterCells:
         depth = dr.maximum(depth, 0)
         # The uppermost layer ends here.
         top = 0.5 + self._shift.z
-        layer = dr.maximum(dr.floor(grid.layer_at(depth) - top) + 1, 0)
+        layer = dr.maximum(dr.floor(self.layer_at(depth) - top) + 1, 0)
         # A part of a cell above a solid that is less than half as thick belongs to the cell above.
-        lowest = dr.maximum(dr.floor(grid.layer_at(end) - top - 0.5) + 1, 0)
-        is_lowest = (layer >= lowest) & (depth < end + 0.5 * grid.thickness)
+        lowest = dr.maximum(dr.floor(self.layer_at(end) - top - 0.5) + 1, 0)
+        is_lowest = (layer >= lowest) & (depth < end + 0.5 * self.thickness)
         layer = dr.select(is_lowest, lowest, layer)
         if veiled:
             # Behind a veil cells begin there: the first one has a larger number than those that end there.
-            highest = dr.maximum(dr.floor(grid.layer_at(veil) - top + 0.5) + 1, 0)
+            highest = dr.maximum(dr.floor(self.layer_at(veil) - top + 0.5) + 1, 0)
             is_highest = behind & (layer <= highest)
             layer = dr.select(is_highest, highest, layer)
-        above = dr.select(layer == 0, 0, grid.depth_of(top + (layer - 1)))
+        above = dr.select(layer == 0, 0, self.depth_of(top + (layer - 1)))
         if veiled:
             above = dr.select(is_highest, veil, above)
-        below = dr.select(is_lowest, end, grid.depth_of(top + layer))
+        below = dr.select(is_lowest, end, self.depth_of(top + layer))
         place = dr.fma(_PLANE_STEP, layer, self._shift.w)
         plane = dr.lerp(above, below, place - dr.floor(place))
         # Change of this depth for each metre along the line, at least so large that level lines stay near.
@@ -336,17 +318,17 @@ class WaterCells:
         # Offsets are from the axis that the mean slope refracts.
         slopes, start = rings.along_and_across(slope - mi.Vector2f(*rings.tilt)), rings.offset(point.x, point.y, depth)
         if looks_up:
-            more = grid.profile.spread(start, depth, moved, slopes)
+            more = self.profile.spread(start, depth, moved, slopes)
             along, across = along + more[0], across + more[1]
-        sector = rings.sector(along, across, rings.core(above), grid.widths(above), mi.Point2f(self._shift.xy))
-        there, here = grid.profile.at((along, across), moved, slopes), grid.profile.at(start, depth, slopes)
+        sector = rings.sector(along, across, rings.core(above), self.widths(above), mi.Point2f(self._shift.xy))
+        there, here = self.profile.at((along, across), moved, slopes), self.profile.at(start, depth, slopes)
         i, j, k = sector.ring, sector.number, mi.UInt32(layer)
-        of_ring, of_sector, z = grid.bits_ring, grid.bits_sector, grid.bits_z
+        of_ring, of_sector, z = self.bits_ring, self.bits_sector, self.bits_z
         bucket = (
             low_bits(j, of_sector) | (low_bits(i, of_ring) << of_sector) | (low_bits(k, z) << (of_sector + of_ring))
         )
         tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
-        thickness = dr.maximum(below - above, 0.25 * grid.thickness_at(above))
+        thickness = dr.maximum(below - above, 0.25 * self.thickness_at(above))
         volume = thickness * stretch * rings.area(sector)
         return Cell(self._start + bucket, tag, volume, volume * there / here)
 

@@ -8,20 +8,21 @@ make its path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import WaterCells
-from mitransient_lidar.transport.merging.merge import SensorSubpath
+from mitransient_lidar.transport.merging.merge import receive
 from mitransient_lidar.transport.merging.patches import SolidPatches
-from mitransient_lidar.transport.merging.photon_map import Photon, PhotonBuffer
-from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
+from mitransient_lidar.transport.merging.photon_map import PhotonBuffer
+from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.passes import PassRecord
-from mitransient_lidar.transport.perturbations import Sums, joined
+from mitransient_lidar.transport.path import PathPoint, interaction_at
+from mitransient_lidar.transport.perturbations import joined
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape
@@ -47,6 +48,8 @@ class ConnectionRates:
         Number of connections of each path from the receiver, with points and with photons on solids; 0 for none.
     """
 
+    OF_SHOTS = ("cells",)
+
     cells: WaterCells | SphericalCells
     in_water: mi.Float
     on_solids: mi.Float
@@ -71,32 +74,6 @@ class ConnectionRates:
         """Return the rate of merges at scattering events [m^3]."""
         return self.cells.typical_volume(point)
 
-    def of(self, lanes: Lanes) -> ConnectionRates:
-        """Return the rates in the cells of each lane's shot."""
-        return replace(self, cells=self.cells.of(lanes))
-
-
-@dataclass(frozen=True)
-class _Pairs:
-    """Points of the receiver's paths, and random partners among the light of their shots.
-
-    Attributes
-    ----------
-    lanes
-        Lanes of the pairs, whose numbers are those of pairs.
-    point
-        The points.
-    partner
-        Numbers of the partners.
-    weight
-        Reciprocal of the expected number of pairs of the same point and partner; 0 where one of them does not exist.
-    """
-
-    lanes: Lanes
-    point: SegmentPoints
-    partner: mi.UInt32
-    weight: mi.Float
-
 
 class WaterConnections:
     """Connections of a scene's pass with independent random numbers for each pass and shot."""
@@ -106,12 +83,22 @@ class WaterConnections:
     ) -> None:
         self.scene, self.record, self.rates = scene, record, rates
         self._water, self._points, self._shots = scene.required_water, points, shots
+        self._group = self._water.index_layers.group(mi.UInt32(0))
 
-    def _pairs(self, light: SegmentBuffer | int, stream: int) -> _Pairs:
-        """Return points of each path, and random partners: points of light paths, or a number of photons of a shot.
+    def _pairs(self, light: SegmentBuffer | int, stream: int) -> tuple[Lanes, PathPoint, mi.UInt32, mi.Float]:
+        """Draw points of the receiver's paths, and random partners among the light of their shots.
 
         Path and point are drawn one after the other, so that paths with other points, in a scene that differs a little,
-        change no other pairs.
+        change no other pairs. Partners are points of light paths, or a number of photons of a shot.
+
+        Returns
+        -------
+        lanes
+            Lanes of the pairs, whose numbers count them.
+        point, partner
+            The points, and the numbers of their partners.
+        weight
+            Reciprocal of the expected number of pairs of the same point and partner; 0 where one does not exist.
         """
         points = self._points
         lanes = self._shots.paths(points.paths * self.rates.per_path)
@@ -128,13 +115,13 @@ class WaterConnections:
             partner, others = light.pick(partner, rng.next_float32())
             weight *= mi.Float(others)
         exists = weight > 0
-        return _Pairs(lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight)
+        return lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight
 
     def to_light(self, light: SegmentBuffer, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some points of light paths."""
-        pairs = self._pairs(light, stream)
-        point, exists = pairs.point, pairs.weight > 0
-        other, scene, rates = light.points(pairs.partner), self.scene.of(pairs.lanes), self.rates.of(pairs.lanes)
+        lanes, point, partner, weight = self._pairs(light, stream)
+        other, exists = light.points(partner), weight > 0
+        scene, rates = lanes.pick((self.scene, self.rates))
         direction, distance, transmittance, pending = self._segment(point, other.point)
         x = self._inverse_scattering_density(point.point, point.direction, direction, exists)
         y = self._inverse_scattering_density(other.point, other.direction, -direction, exists)
@@ -142,54 +129,53 @@ class WaterConnections:
         total += x * (rates.volume(point.point) + rates.in_water * point.inverse_density)
         total += y * (rates.volume(other.point) + rates.in_water * other.inverse_density)
         total += rates.in_water * x * y * pending
-        scale = rates.in_water * pairs.weight
-        received, sent = point.contribution, other.contribution
-        energy = scale * received.throughput * sent.throughput * transmittance / total
+        scale = rates.in_water * weight
+        energy = scale * point.throughput * other.throughput * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance
         empty = scene.is_empty(point.point.z) & scene.is_empty(other.point.z)
         active &= ~scene.ray_test(ray, active & ~empty)
-        length, depth, perturbed = point.length + other.length, -point.point.z, scene.perturbations
-        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
+        depth, perturbed = point.depth, scene.perturbations
+        sums = perturbed.along(joined(point.sums, other.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
-        sums = perturbed.at_event(sums, -other.point.z, other.direction, -direction)
-        self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active, sums)
+        sums = perturbed.at_event(sums, other.depth, other.direction, -direction)
+        length = point.length + other.length + distance * self._group
+        receive(self.record, point, other, 2, length, energy, active, sums, between=[direction])
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some photons on solids."""
-        pairs = self._pairs(light.photons, stream)
-        point, patches = pairs.point, patches.of(pairs.lanes)
-        place, photon = light.connectable(pairs.partner)
-        received, sent = point.contribution, photon.contribution
-        exists = (pairs.weight > 0) & (sent.throughput != 0)
-        direction, distance, transmittance, pending = self._segment(point, place)
+        lanes, point, partner, weight = self._pairs(light.photons, stream)
+        scene, patches = lanes.pick((self.scene, patches))
+        photon = light.connectable(partner)
+        exists = (weight > 0) & (photon.throughput != 0)
+        direction, distance, transmittance, pending = self._segment(point, photon.point)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance + tolerance
-        si = self.scene.of(pairs.lanes).ray_intersect(ray, exists)
+        si = scene.ray_intersect(ray, exists)
         active = exists & si.is_valid() & (dr.abs(si.t - distance) < tolerance)
         outgoing = si.to_local(-photon.direction)
         bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / dr.abs(dr.dot(si.n, photon.direction))
         x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
-        scale = self.rates.on_solids * pairs.weight
-        energy = scale * received.throughput * sent.throughput * bsdf * transmittance / total
+        scale = self.rates.on_solids * weight
+        energy = scale * point.throughput * photon.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
-        solid, length = self.record.classes.solid(met_shape(si)), point.length + photon.length
-        depth, perturbed = -point.point.z, self.scene.perturbations
-        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
+        depth, perturbed = point.depth, self.scene.perturbations
+        sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_solid(sums, met_shape(si))
-        self._receive(point, photon, solid, direction, 1, length, distance, energy, active, sums, on_solid=True)
+        solid, length = self.record.classes.solid(met_shape(si)), point.length + photon.length + distance * self._group
+        receive(self.record, point, photon, 1, length, energy, active, sums, solid, [direction])
 
-    def _segment(self, point: SegmentPoints, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
+    def _segment(self, point: PathPoint, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""
         offset = place - point.point
         distance = dr.norm(offset)
         direction = offset / distance
-        depth, downward = -point.point.z, -direction.z
+        depth, downward = point.depth, -direction.z
         absorption = self._water.absorption_flight.optical_depth(depth, downward, distance)
         scattering = self._water.scattering_flight.optical_depth(depth, downward, distance)
         return direction, distance, dr.exp(-absorption), dr.square(distance) * dr.exp(scattering)
@@ -199,29 +185,6 @@ class WaterConnections:
     ) -> mi.Float:
         """Return 1 / (b p) of scattering events from one direction to another."""
         water = self._water
-        mei = dr.zeros(mi.MediumInteraction3f)
-        mei.p, mei.wi = point, -before
-        mei.sh_frame = mi.Frame3f(mei.wi)
-        layer = water.flight.layer_at(-point.z)
+        layer, mei = water.flight.layer_at(-point.z), interaction_at(point, before)
         value, _ = water.phases.at(layer).eval_pdf(mi.PhaseFunctionContext(), mei, after, active)
         return dr.rcp(water.scattering_flight.coefficient(layer) * value[0])
-
-    def _receive(
-        self,
-        point: SegmentPoints,
-        light: SegmentPoints | Photon,
-        solid: mi.UInt32,
-        direction: mi.Vector3f,
-        events: int,
-        length: mi.Float,
-        distance: mi.Float,
-        energy: mi.Float,
-        active: mi.Bool,
-        sums: Sums,
-        on_solid: bool = False,
-    ) -> None:
-        """Add the energy of connected paths to the record."""
-        subpath = SensorSubpath.at(self.record, point, solid)
-        group = self._water.index_layers.group(mi.UInt32(0))
-        length = length + distance * group
-        subpath.add(self.record, light, events, length, energy, active, sums, [direction], on_solid)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,8 +12,8 @@ import numpy as np
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
-from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_index
-from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.opaque import aligned, changed, is_one_of, opaque, opaque_index
+from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape
 
@@ -81,7 +80,7 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
     """Return solids with parts above each other in the region of any shot, found with vertical rays."""
     rays = PROBE_RAYS if shots == 1 else _PROBE_RAYS_OF_SHOTS
     lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * rays), shots, rays)
-    scene, (x, y) = scene.with_parts_of(scene.solids).of(lanes), region.probe_points(lanes.number)
+    scene, (x, y) = lanes.pick(scene.with_parts_of(scene.solids)), region.probe_points(lanes.number)
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
     looking = dr.full(mi.Bool, True, shots * rays)
@@ -95,8 +94,9 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
     return [solid for solid, count in zip(scene.solids, met, strict=True) if bool(dr.any(count > 1)[0])]
 
 
+@dataclass(eq=False)
 class SolidPatches:
-    """Patches of one pass, in projection along the beam, or along x or y where steep, shifted at random in each shot.
+    """Patches in projection along the beam, or along x or y where steep.
 
     In projection along the refracted beam patches are sectors of rings about it, whatever their depth, along the others
     squares. The beam's light is even over its own projection, however curved the surface is. Along x or y it is not:
@@ -104,6 +104,8 @@ class SolidPatches:
 
     Parameters
     ----------
+    scene
+        Scene with the solids.
     region
         Region that is lit or seen.
     rings
@@ -112,8 +114,6 @@ class SolidPatches:
         Depth of the plane in which rings are cut [m], and the largest at which their core is taken.
     width
         Side of a square, and of a sector on the axis at the surface [m].
-    shift
-        Two uniform random numbers of each shot.
     uneven
         Solids that `solids_of_several_levels` found.
     side_bits
@@ -126,58 +126,51 @@ class SolidPatches:
         Largest further growth of sectors with depth, of those that a narrow view limits at the surface.
     """
 
-    def __init__(
-        self,
-        scene: LidarScene,
-        region: Region,
-        rings: BeamRings,
-        depth: float,
-        width: float,
-        shift: mi.Point2f,
-        uneven: Sequence[mi.Shape] = (),
-        side_bits: int = MOST_SIDE_BITS,
-        least: float = 0.0,
-        growth: float | None = None,
-        widening: float = 1.0,
-    ) -> None:
-        self.scene, self._rings, self._side_bits = scene, rings, side_bits
-        self._start = mi.UInt32(0)
-        self.width, self._depth = opaque(max(width, least)), opaque(depth)
+    OF_SHOTS = ("scene", "rings", "_shift", "_start")
+
+    scene: LidarScene
+    region: Region
+    rings: BeamRings
+    depth: float
+    width: float
+    uneven: Sequence[mi.Shape] = ()
+    side_bits: int = MOST_SIDE_BITS
+    least: float = 0.0
+    growth: float | None = None
+    widening: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._shift, self._start = mi.Point2f(0), mi.UInt32(0)
+        self._side, self._plane = opaque(max(self.width, self.least)), opaque(self.depth)
         # Sizes suit the light at the middle of a solid.
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))[0]) for solid in scene.solids]
+        solids = self.scene.solids
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))[0]) for solid in solids]
         depths = np.zeros(max(numbers, default=0) + 1)
-        for number, solid in zip(numbers, scene.solids, strict=True):
-            depths[number] = np.clip(-float(solid.bbox().center().z), 0, depth)
-        core = rings.core(mi.Float(0))
-        growths = np.hypot(1, (growth or 0.0) * depths)
-        ring_widths = opaque(width) * aligned(mi.Float, np.minimum(growths, widening)) / core
-        cores = rings.core(aligned(mi.Float, depths))
-        if growth is not None:
+        for number, solid in zip(numbers, solids, strict=True):
+            depths[number] = np.clip(-float(solid.bbox().center().z), 0, self.depth)
+        core = self.rings.core(mi.Float(0))
+        growths = np.hypot(1, (self.growth or 0.0) * depths)
+        ring_widths = opaque(self.width) * aligned(mi.Float, np.minimum(growths, self.widening)) / core
+        cores = self.rings.core(aligned(mi.Float, depths))
+        if self.growth is not None:
             cores = dr.minimum(cores, _MOST_GROWTH * core * aligned(mi.Float, growths))
-        cores = dr.maximum(cores, opaque(least) / ring_widths)
+        cores = dr.maximum(cores, opaque(self.least) / ring_widths)
         # Of each solid: core radius, and width of rings over it.
         self._sizes = dr.ravel(mi.Point2f(cores, ring_widths))
-        self._shift = shift
         self._bounded = [
             solid
-            for solid in scene.solids
-            if not region.is_below(solid.bbox(), scene) or any(solid is other for other in uneven)
+            for solid in solids
+            if not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
         ]
+
+    def of_pass(self, scene: LidarScene, shift: mi.Point2f) -> SolidPatches:
+        """Return the patches of a pass over a scene, shifted by two uniform random numbers of each shot."""
+        return changed(self, scene=scene, _shift=shift, _start=starts(dr.width(shift), self.buckets))
 
     @property
     def buckets(self) -> int:
         """Number of buckets of a shot."""
-        return 1 << (2 * self._side_bits)
-
-    def of(self, lanes: Lanes) -> SolidPatches:
-        """Return the patches of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        patches = copy.copy(self)
-        patches.scene, patches._rings = self.scene.of(lanes), self._rings.of(lanes)
-        patches._shift = lanes.pick(self._shift)
-        patches._start = lanes.shot << (2 * self._side_bits)
-        return patches
+        return 1 << (2 * self.side_bits)
 
     def locate(self, si: mi.SurfaceInteraction3f) -> SolidPatch:
         """Return the patches of points on solids."""
@@ -186,18 +179,18 @@ class SolidPatches:
         u = dr.select(along_x, si.p.y, si.p.x)
         v = dr.select(along_x | along_y, si.p.z, si.p.y)
         w = dr.select(along_x, si.p.x, dr.select(along_y, si.p.y, si.p.z))
-        cu, cv = dr.floor(u / self.width + self._shift.x), dr.floor(v / self.width + self._shift.y)
+        cu, cv = dr.floor(u / self._side + self._shift.x), dr.floor(v / self._side + self._shift.y)
         i, j = mi.UInt32(mi.Int32(cu) + ORIGIN), mi.UInt32(mi.Int32(cv) + ORIGIN)
         along, across, (core, ring_width) = self._offset(si)
-        sector = self._rings.sector(along, across, core, ring_width, self._shift)
+        sector = self.rings.sector(along, across, core, ring_width, self._shift)
         level_patch = axis == 2
         i, j = dr.select(level_patch, sector.ring, i), dr.select(level_patch, sector.number, j)
-        projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
-        bits = self._side_bits
+        projected = dr.select(level_patch, self.rings.area(sector), self._side * self._side)
+        bits = self.side_bits
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
         shape = dr.reinterpret_array(mi.UInt32, met_shape(si))
         # Solids with overhangs have several levels over one square. Sectors far from the beam are wide, and so high.
-        height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self.width)
+        height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self._side)
         start = dr.floor(w / height + self._shift.x)
         level = dr.select(self._is_bounded(met_shape(si)), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
         return SolidPatch(
@@ -209,7 +202,7 @@ class SolidPatches:
             | (low_bits(shape, 9) << 23),
             area=projected / dr.abs(normal),
             corner=mi.Point3f(
-                (cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, (start - self._shift.x) * height
+                (cu - self._shift.x) * self._side, (cv - self._shift.y) * self._side, (start - self._shift.x) * height
             ),
             height=height,
             sector=sector,
@@ -222,12 +215,12 @@ class SolidPatches:
         axis, normal = self._projection(si)
         along, across, (core, ring_width) = self._offset(si)
         scale = dr.square(core) + along * along + across * across
-        sector = dr.square(ring_width) * scale / self._rings.cosine
-        return dr.select(axis == 2, sector, self.width * self.width) / dr.abs(normal)
+        sector = dr.square(ring_width) * scale / self.rings.cosine
+        return dr.select(axis == 2, sector, self._side * self._side) / dr.abs(normal)
 
     def _projection(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         """Return the direction of projection at points on solids, and the normal's component against it."""
-        x, y = self._rings.slant
+        x, y = self.rings.slant
         against = si.n.z - x * si.n.x - y * si.n.y
         size = mi.Vector3f(dr.abs(si.n.x), dr.abs(si.n.y), dr.abs(against) * dr.rsqrt(1 + x * x + y * y))
         along_x = (size.x > size.y) & (_STEEP * size.x > size.z)
@@ -237,9 +230,9 @@ class SolidPatches:
 
     def _offset(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float, mi.Point2f]:
         """Return offsets of points on solids from the beam [m], and core radius [m] and ring width of their solid."""
-        x, y = self._rings.slant
-        below = -si.p.z - self._depth
-        along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._rings.depth_at(-self._depth))
+        x, y = self.rings.slant
+        below = -si.p.z - self._plane
+        along, across = self.rings.offset(si.p.x - x * below, si.p.y - y * below, self.rings.depth_at(-self._plane))
         number = dr.minimum(
             dr.reinterpret_array(mi.UInt32, met_shape(si)), opaque_index(dr.width(self._sizes) // 2 - 1)
         )
@@ -261,7 +254,7 @@ class SolidPatches:
         # From the side that the patch faces to the other side of its level.
         first = patch.corner.z - margin + dr.select(patch.faces > 0, patch.height + 2 * margin, 0)
         is_x, is_y, is_z = (patch.axis == axis for axis in range(3))
-        slant = mi.Vector2f(*self._rings.slant)
+        slant = mi.Vector2f(*self.rings.slant)
         # Lengths along it are those of w.
         inwards = -patch.faces * mi.Vector3f(
             dr.select(is_x, 1, dr.select(is_z, -slant.x, 0)),
@@ -273,12 +266,12 @@ class SolidPatches:
             samples: mi.Float, rng: mi.PCG32, searching: mi.Bool, uvw: mi.Point3f, fresh: mi.Bool
         ) -> tuple[mi.Float, mi.PCG32, mi.Bool, mi.Point3f, mi.Bool]:
             along, across = rng.next_float32(fresh), rng.next_float32(fresh)
-            u, v = patch.corner.x + self.width * along, patch.corner.y + self.width * across
-            drawn = self._rings.draw(patch.sector, self._shift, along, across)
-            x, y = self._rings.point(*drawn, self._rings.depth_at(-self._depth))
+            u, v = patch.corner.x + self._side * along, patch.corner.y + self._side * across
+            drawn = self.rings.draw(patch.sector, self._shift, along, across)
+            x, y = self.rings.point(*drawn, self.rings.depth_at(-self._plane))
             uvw = dr.select(fresh, mi.Point3f(dr.select(is_z, x, u), dr.select(is_z, y, v), first), uvw)
             u, v, w = uvw
-            below = dr.select(is_z, -w - self._depth, 0)
+            below = dr.select(is_z, -w - self._plane, 0)
             u, v = u + slant.x * below, v + slant.y * below
             origin = mi.Point3f(dr.select(is_x, w, u), dr.select(is_x, u, dr.select(is_y, w, v)), dr.select(is_z, w, v))
             ray = mi.Ray3f(origin, inwards)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -12,11 +11,11 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.receiver import SensorSample, SensorSampler
 
 #: Number of rays that find the region and the solids below it.
 PROBE_RAYS = 4096
@@ -26,6 +25,9 @@ _ENTRY_RAYS = 64
 
 #: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
+
+#: Least margin of a region under water [m].
+_LEAST_MARGIN = 1.0
 
 #: Distance beside the view within which light counts, over the size of the view and over the longest way in the water:
 #: tables of the heights below all of a very wide beam would not resolve its waves.
@@ -43,10 +45,6 @@ _MOST_CROSSINGS = 4
 #: Largest distance below the sea at which vertical rays to solids start [m].
 _MARGIN_BELOW_SEA = 1.0
 
-#: Least width of patches over the size of the largest solid, eight times the rounding of positions on it; and that of
-#: cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
-_PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
-
 #: Height of the bed of columns without a solid below [m].
 _NO_BED = -1e9
 
@@ -61,8 +59,7 @@ class Region:
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
         """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
-        seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
-        tangents = mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
+        seen, tangents = _view_and_beam(scene, sampler)
         places = [
             meet_sea(scene, scene.receiver.pose, seen.angles)[np.array(seen.weight) > 0],
             meet_sea(scene, scene.transmitter.pose, tangents),
@@ -126,6 +123,35 @@ class Region:
         )
 
 
+def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region, float, float]:
+    """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
+
+    Rays end at the first surface, or where their light returns at the end of the record.
+    """
+    seen, tangents = _view_and_beam(scene, sampler)
+    beam = scene.transmitter.pose.direction(*tangents)
+    longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
+    places, lengths = [], np.full(1, longest)
+    shortest = longest
+    for pose, direction in ((scene.receiver.pose, seen.direction), (scene.transmitter.pose, beam)):
+        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), direction))
+        length = dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), longest)
+        lengths = np.array(length, dtype=np.float64)
+        solid = si.is_valid() & ~scene.is_surface(si.shape)
+        shortest = min(shortest, float(np.min(np.where(np.array(solid), lengths, np.inf))))
+        places += [pose.origin[:2], np.array(opaque_point(pose.origin) + direction * length).T[:, :2]]
+    points = np.vstack(places)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = np.maximum(_REGION_MARGIN * (high - low), _LEAST_MARGIN)
+    return Region.between(low, high, margin), float(lengths.mean()), shortest
+
+
+def _view_and_beam(scene: LidarScene, sampler: SensorSampler) -> tuple[SensorSample, mi.Point2f]:
+    """Return samples of the view, and tangent-plane angles of the beam."""
+    seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+    return seen, mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
+
+
 def _longest_way(scene: LidarScene) -> float:
     """Return the distance in the water along the axis to the depth of the record's end, at least 0.1 m [m]."""
     transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
@@ -153,7 +179,7 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
     Means over the beam, shape (shots, 3).
     """
     lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * _ENTRY_RAYS), shots, _ENTRY_RAYS)
-    moved = scene.of(lanes)
+    moved = lanes.pick(scene)
     pose = moved.transmitter_pose
     angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
     direction = np.array(pose.direction(*angles), np.float64).T
@@ -178,8 +204,10 @@ class _Grid:
     cells
         Number of cells on each side.
     start
-        Number of the first cell.
+        Number of the first cell of each shot.
     """
+
+    OF_SHOTS = ("low", "start")
 
     values: mi.Float
     kind: type[mi.Float] | type[mi.UInt32]
@@ -187,17 +215,6 @@ class _Grid:
     per_metre: mi.Point2f
     cells: int
     start: mi.UInt32
-
-    def repeated(self, copies: int) -> _Grid:
-        """Return the grid of each shot several times in turn."""
-        low = dr.repeat(self.low, copies)
-        dr.eval(low)
-        return replace(self, low=low)
-
-    def of(self, lanes: Lanes, copies: mi.UInt32) -> _Grid:
-        """Return the grid of each lane's shot, of which `copies` successive ones share one."""
-        start = (lanes.shot // copies) * (self.cells * self.cells)
-        return replace(self, low=lanes.pick(self.low), start=start)
 
     def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
@@ -221,24 +238,16 @@ class SurfaceHeights:
         Displacements of the region (x, y) of each shot [m], shape (shots, 2).
     """
 
+    OF_SHOTS = ("_surface", "_bed", "_veil")
+
     def __init__(self, scene: LidarScene, region: Region, depth: float, moves: FloatArray | None = None) -> None:
         moves = np.zeros((1, 2)) if moves is None else moves
-        #: Number of successive shots that share a grid.
-        self._copies = opaque_index(1)
         self._surface = self._look_down(scene, region, moves, solids=False)
         below = region.below(scene, depth)
         self._bed = self._look_down(scene, below, moves, solids=True)
         #: Whether there are heights of veils: solids that let a part of the light pass unchanged.
         self.has_veils = scene.has_veils
         self._veil = self._look_down(scene, below, moves, solids=True, veils=True) if self.has_veils else self._bed
-
-    def repeated(self, copies: int) -> SurfaceHeights:
-        """Return the heights of each shot several times in turn, which share them."""
-        heights = copy.copy(self)
-        heights._copies = opaque_index(copies)
-        grids = (grid.repeated(copies) for grid in (self._surface, self._bed, self._veil))
-        heights._surface, heights._bed, heights._veil = grids
-        return heights
 
     def _look_down(
         self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool, veils: bool = False
@@ -253,7 +262,7 @@ class SurfaceHeights:
         low = mi.Point2f(*(aligned(mi.Float, column) for column in corner.T))
         per_metre = mi.Point2f(*(opaque(n / size) for size in region.size))
         lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * n * n), shots, n * n)
-        index, scene = lanes.number, scene.of(lanes)
+        index, scene = lanes.number, lanes.pick(scene)
         x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
         y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
         top = max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0
@@ -295,16 +304,7 @@ class SurfaceHeights:
         _, found, _, _ = dr.while_loop(state, lambda *state: state[-1], look_down, label="heights")
         values = found.x if solids else dr.ravel(found)
         dr.eval(values)
-        return _Grid(values, mi.Float if solids else mi.Vector4f, low, per_metre, n, mi.UInt32(0))
-
-    def of(self, lanes: Lanes) -> SurfaceHeights:
-        """Return the heights of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        heights = copy.copy(self)
-        grids = (grid.of(lanes, self._copies) for grid in (self._surface, self._bed, self._veil))
-        heights._surface, heights._bed, heights._veil = grids
-        return heights
+        return _Grid(values, mi.Float if solids else mi.Vector4f, low, per_metre, n, starts(shots, n * n))
 
     def surface_at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Vector2f]:
         """Return height [m] and slopes of the surface at (x, y) [m]: outside the region, level at the edge's height."""
@@ -322,15 +322,3 @@ class SurfaceHeights:
         """Return the height of the first veil below the surface at (x, y) [m], -1e9 where there is none."""
         height, _, _ = self._veil.at(x, y)
         return height
-
-
-def least_cell(scene: LidarScene, reach: float) -> float:
-    """Return the least width of cells that a narrow view limits [m]."""
-    spots = [pose.ground_point()[:2] for pose in (scene.transmitter.pose, scene.receiver.pose)]
-    return _CELL_PER_COORDINATE * float(np.abs(spots).max() + reach)
-
-
-def least_patch(scene: LidarScene) -> float:
-    """Return the least width of the patches of solids [m]."""
-    sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
-    return float(_PATCH_PER_SOLID * max(sizes, default=0.0))

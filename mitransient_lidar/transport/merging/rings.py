@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -15,8 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import refract as refract_at_facet
-from mitransient_lidar.transport.opaque import aligned, opaque
-from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.opaque import aligned, changed, opaque
 from mitransient_lidar.transport.snell import refract
 
 #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
@@ -112,6 +109,8 @@ class BeamRings:
     The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """
 
+    OF_SHOTS = ("_entry", "shear", "slant", "_level", "tilt")
+
     def __init__(
         self,
         pose: Pose,
@@ -138,7 +137,7 @@ class BeamRings:
 
     def alike(self, pose: Pose, entries: FloatArray, tilt: FloatArray) -> BeamRings:
         """Return the same rings about the axis of another pose, below a sea of other mean slopes."""
-        rings = copy.copy(self)
+        rings = changed(self)
         rings._aim(pose, tilt)
         return rings.of_entries(entries)
 
@@ -150,8 +149,7 @@ class BeamRings:
         Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own, below
         seas of mean slopes `tilts`, shape (shots, 2).
         """
-        rings = copy.copy(self)
-        rings._entry = mi.Vector3f(*_columns(entries))
+        rings = changed(self, _entry=mi.Vector3f(*_columns(entries)))
         if axes is not None and tilts is not None:
             rings._set_axes(axes, tilts)
         return rings
@@ -174,35 +172,6 @@ class BeamRings:
         self._level = _columns(level)
         #: Mean slopes of the sea along x and y.
         self.tilt = _columns(tilts)
-
-    def repeated(self, copies: int) -> BeamRings:
-        """Return the rings of each shot several times in turn."""
-        rings = copy.copy(self)
-        rings._entry = dr.repeat(self._entry, copies)
-        if self._differ:
-            rings._of_shots(lambda each: dr.repeat(each, copies))
-        dr.eval(rings._entry, rings.shear, rings.slant, rings._level, rings.tilt)
-        return rings
-
-    def of(self, lanes: Lanes) -> BeamRings:
-        """Return the rings of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        rings = copy.copy(self)
-        rings._entry = lanes.pick(self._entry)
-        if self._differ:
-            rings._of_shots(lanes.pick)
-        return rings
-
-    @property
-    def _differ(self) -> bool:
-        """Whether axes differ between shots."""
-        return any(dr.width(each) > 1 for each in self.shear)
-
-    def _of_shots(self, change: Callable[[mi.Float], mi.Float]) -> None:
-        """Change the numbers that differ between shots."""
-        for name in ("shear", "slant", "_level", "tilt"):
-            setattr(self, name, [change(each) for each in getattr(self, name)])
 
     def depth_at(self, z: mi.Float) -> mi.Float:
         """Return the depth of a height [m] below the beginning of the axis [m]."""

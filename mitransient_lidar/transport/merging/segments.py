@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.contribution import Contribution
+from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.opaque import opaque, opaque_index
+from mitransient_lidar.transport.path import PathPoint
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.perturbations import SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
@@ -31,111 +31,14 @@ def memory_of_path(segments: float, points: float, perturbations: int, hits: flo
     return size if hits is None else size + points * (_BYTES_IN_CELL + sums) + hits * (_BYTES_PER_HIT + sums)
 
 
-@dataclass(frozen=True)
-class SegmentPoints:
-    """Points along segments, one a lane.
-
-    Attributes
-    ----------
-    point
-        Position [m].
-    direction
-        Unit direction of the segment.
-    length
-        Optical length of the path up to the point [m].
-    contribution
-        What the path carries up to the point, with its throughput times the track length of the point [m].
-    mis_partial_sum
-        As in `RandomWalkPath`.
-    inverse_density
-        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]:
-        1 / (b p) times the squared distance from it over the transmittance of scattering on the way; 0 if the segment
-        starts elsewhere.
-    label
-        Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
-    surface_length
-        As of the path [m].
-    """
-
-    point: mi.Point3f
-    direction: mi.Vector3f
-    length: mi.Float
-    contribution: Contribution
-    mis_partial_sum: mi.Float
-    inverse_density: mi.Float
-    label: mi.UInt32
-    surface_length: mi.Float
-
-    @property
-    def unscattered(self) -> mi.Bool:
-        """Whether no event in the water has scattered the path: its sum has no terms."""
-        return self.mis_partial_sum == 0
-
-
-@dataclass(frozen=True)
-class _Segment:
-    """A stored segment: its start [m], and the path's properties there as in `RandomWalkPath`."""
-
-    start: mi.Point3f
-    offset: mi.Float
-    direction: mi.Vector3f
-    length: mi.Float
-    contribution: Contribution
-    mis_partial_sum: mi.Float
-    inverse_scattering_density: mi.Float
-    surface_length: mi.Float
-    label: mi.UInt32
-
-
-class _SegmentStore:
-    """Stored segments.
-
-    Each is three packets of four numbers that are read together, a label, and sums of perturbations:
-
-    ==============  ==============================================================================================
-    ``_start``      x, y and z of the start, offset of the first point
-    ``_direction``  x, y and z of the direction, length
-    ``_factors``    `Contribution.packed`, ``mis_partial_sum``, ``inverse_scattering_density``, ``surface_length``
-    ==============  ==============================================================================================
-    """
-
-    def __init__(self, size: int, perturbations: int) -> None:
-        self._start, self._direction, self._factors = (dr.empty(mi.Float, 4 * size) for _ in range(3))
-        self._label = dr.empty(mi.UInt32, size)
-        self._sums = SumStore(size, perturbations)
-
-    def write(self, path: RandomWalkPath, label: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
-        """Store the next segment of each path."""
-        start, direction = path.point, path.direction
-        factors = path.packed(), path.mis_partial_sum, path.inverse_scattering_density, path.surface_length
-        dr.scatter(self._label, label, place, active)
-        dr.scatter(self._start, mi.Vector4f(start.x, start.y, start.z, path.offset), place, active)
-        dr.scatter(self._direction, mi.Vector4f(direction.x, direction.y, direction.z, path.length), place, active)
-        dr.scatter(self._factors, mi.Vector4f(*factors), place, active)
-        self._sums.write(path.sums, place, active)
-
-    def read(self, place: mi.UInt32) -> _Segment:
-        """Return segments."""
-        x, y, z, offset = dr.gather(mi.Vector4f, self._start, place)
-        dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, place)
-        packed, mis_partial_sum, inverse, surface_length = dr.gather(mi.Vector4f, self._factors, place)
-        carried = Contribution.unpacked(packed, self._sums.read(place))
-        label = dr.gather(mi.UInt32, self._label, place)
-        return _Segment(
-            mi.Point3f(x, y, z),
-            offset,
-            mi.Vector3f(dx, dy, dz),
-            length,
-            carried,
-            mis_partial_sum,
-            inverse,
-            surface_length,
-            label,
-        )
-
-    def evaluate(self) -> None:
-        """Compute what is stored."""
-        dr.eval(self._label, self._start, self._direction, self._factors, self._sums.packets)
+#: What is stored of a segment: its start [m], and the path there (`RandomWalkPath`).
+_FIELDS = {
+    **{"point": "Point3f", "offset": "Float"},
+    **{"direction": "Vector3f", "length": "Float"},
+    **{"throughput|lost": "Float", "mis_partial_sum": "Float"},
+    **{"inverse_scattering_density": "Float", "surface_length": "Float"},
+    "label": "UInt32",
+}
 
 
 class SegmentBuffer:
@@ -154,19 +57,19 @@ class SegmentBuffer:
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
-        self._segments = _SegmentStore(capacity, self._perturbations.count)
+        self._segments = PackedStore(capacity, {**_FIELDS, "sums": self._perturbations.count})
         self._end = mi.UInt32()
         self._first = mi.UInt32()
         self._slot = mi.UInt32()
 
-    def add(self, path: RandomWalkPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+    def add(self, path: RandomWalkPath, length: mi.Float, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path, of a length [m]; return the offset of the first point beyond it [m]."""
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
         keep = (number > 0) & (slot < self._capacity)
         dr.scatter(self._place, mi.Point2u(path.lane, path.points), slot, keep)
-        self._segments.write(path, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
+        self._segments.write({**vars(path), "label": self._classes.pack(path)}, slot, keep)
         path.points += number
         dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
@@ -209,28 +112,27 @@ class SegmentBuffer:
         key = lanes.number * _KEYS_PER_PATH + before + index - first
         return mi.sample_tea_float32(key, shots.keys(lanes))
 
-    def points(self, index: mi.UInt32) -> SegmentPoints:
+    def points(self, index: mi.UInt32) -> PathPoint:
         """Return points by number."""
         first = dr.gather(mi.UInt32, self._first, index)
-        segment = self._segments.read(dr.gather(mi.UInt32, self._slot, first))
-        along = dr.fma(mi.Float(index - first), self.spacing, segment.offset)
-        depth, downward = -segment.start.z, -segment.direction.z
+        start = SimpleNamespace(**self._segments.read(dr.gather(mi.UInt32, self._slot, first)))
+        along = dr.fma(mi.Float(index - first), self.spacing, start.offset)
+        depth, downward = -start.point.z, -start.direction.z
         absorption = self._water.absorption_flight.optical_depth(depth, downward, along)
         scattering = self._water.scattering_flight.optical_depth(depth, downward, along)
-        inverse, carried = segment.inverse_scattering_density, segment.contribution
-        inverse_density = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
+        inverse = start.inverse_scattering_density
         # A segment lies in one index layer, and may begin on its boundary.
         layers = self._water.index_layers
         group = layers.group(layers.at(depth + 0.5 * downward * along))
-        throughput = carried.throughput * dr.exp(-absorption) * self.spacing
-        sums = self._perturbations.along(carried.sums, depth, downward, along)
-        return SegmentPoints(
-            segment.start + segment.direction * along,
-            segment.direction,
-            segment.length + along * group,
-            Contribution(throughput, carried.lost, sums),
-            segment.mis_partial_sum,
-            inverse_density,
-            segment.label,
-            segment.surface_length,
+        return PathPoint(
+            point=start.point + start.direction * along,
+            direction=start.direction,
+            length=start.length + along * group,
+            throughput=start.throughput * dr.exp(-absorption) * self.spacing,
+            lost=start.lost,
+            sums=self._perturbations.along(start.sums, depth, downward, along),
+            surface_length=start.surface_length,
+            mis_partial_sum=start.mis_partial_sum,
+            inverse_density=dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0),
+            **self._classes.unpack(start.label),
         )

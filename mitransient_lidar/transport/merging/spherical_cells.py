@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.merging.cells import Cell
-from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
-from mitransient_lidar.transport.opaque import opaque, opaque_point
-from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
+from mitransient_lidar.transport.opaque import changed, opaque, opaque_point
+from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 #: Angular width of rings, over the beam's standard deviation within two of them, and over the angle farther outside.
 _RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
@@ -27,12 +23,9 @@ _SMALLEST_RADIUS = 1e-3
 #: Logarithm to base 2 of the number of buckets, and bits of the number of ring and sector.
 _BUCKET_BITS, _RING_BITS, _SECTOR_BITS = 20, 11, 9
 
-#: Margin of the region about the rays, over its size, and the least [m].
-_MARGIN, _LEAST_MARGIN = 0.15, 1.0
 
-
-class SphericalGrid:
-    """Layout of cells about the laser, which are small where its light is concentrated.
+class SphericalCells:
+    """Cells about the laser, small where its light is concentrated, of a scene or of one pass.
 
     Angles from the axis are measured by the tangent of their half, up to the opposite direction. Rings are of equal
     width in asinh(tan(theta / 2) / core), and shells in log(r) up to the radius where they have their final thickness.
@@ -45,10 +38,13 @@ class SphericalGrid:
         Largest thickness of a shell [m].
     """
 
+    OF_SHOTS = ("_shift", "_start")
+
     #: Logarithm to base 2 of the number of buckets of a shot.
     bits = _BUCKET_BITS
 
     def __init__(self, scene: LidarScene, thickness: float) -> None:
+        self._shift, self._start = mi.Point4f(0), mi.UInt32(0)
         pose, spread = scene.transmitter.pose, float(scene.transmitter.angular_spread)
         self.origin = opaque_point(pose.origin)
         self.sides = [mi.Vector3f(opaque_point(side)) for side in (pose.far, pose.left, pose.axis)]
@@ -57,26 +53,9 @@ class SphericalGrid:
         self.thickness = opaque(thickness)
         self.even = opaque(thickness / _THICKNESS_PER_RADIUS)
 
-    def cells(self, shift: mi.Point4f) -> SphericalCells:
+    def of_pass(self, shift: mi.Point4f) -> SphericalCells:
         """Return the cells of a pass, shifted by the first three of four uniform random numbers of each shot."""
-        return SphericalCells(self, shift)
-
-
-class SphericalCells:
-    """The cells of one pass: a `SphericalGrid` shifted by uniform random numbers of each shot."""
-
-    def __init__(self, grid: SphericalGrid, shift: mi.Point4f) -> None:
-        self.grid = grid
-        self._shift = shift
-        self._start = mi.UInt32(0)
-
-    def of(self, lanes: Lanes) -> SphericalCells:
-        """Return the cells of each lane's shot."""
-        if lanes.shots == 1:
-            return self
-        cells = copy.copy(self)
-        cells._shift, cells._start = lanes.pick(self._shift), lanes.shot << _BUCKET_BITS
-        return cells
+        return changed(self, _shift=shift, _start=starts(dr.width(shift), 1 << _BUCKET_BITS))
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
@@ -86,15 +65,14 @@ class SphericalCells:
         self, point: mi.Point3f, direction: mi.Vector3f | None = None, unscattered: mi.Bool | None = None
     ) -> Cell:
         """Return the cells of points, which do not depend on the directions of their lines."""
-        grid = self.grid
-        offset = point - grid.origin
+        offset = point - self.origin
         radius = dr.maximum(dr.norm(offset), _SMALLEST_RADIUS)
-        x, y, along = (dr.dot(offset, side) for side in grid.sides)
+        x, y, along = (dr.dot(offset, side) for side in self.sides)
         across = dr.sqrt(x * x + y * y)
         tangent = across / dr.maximum(radius + along, 1e-6 * radius)
         # Rings: the innermost one is a disc.
-        ring = dr.floor(dr.asinh(tangent / grid.core) / grid.ring + self._shift.x)
-        inner, outer = (grid.core * dr.sinh(dr.maximum(ring + k - self._shift.x, 0) * grid.ring) for k in (0, 1))
+        ring = dr.floor(dr.asinh(tangent / self.core) / self.ring + self._shift.x)
+        inner, outer = (self.core * dr.sinh(dr.maximum(ring + k - self._shift.x, 0) * self.ring) for k in (0, 1))
         sectors = dr.round(np.pi * (outer + inner) / (outer - inner))
         turn = dr.atan2(y, x) * dr.inv_two_pi + 1 + self._shift.y
         sector = dr.minimum(dr.floor((turn - dr.floor(turn)) * sectors), sectors - 1)
@@ -111,33 +89,10 @@ class SphericalCells:
 
     def _shell_at(self, radius: mi.Float) -> mi.Float:
         """Return the coordinate of shells at a radius [m]."""
-        ratio = radius / self.grid.even
+        ratio = radius / self.even
         return dr.select(ratio < 1, dr.log(ratio), ratio - 1) / _THICKNESS_PER_RADIUS
 
     def _radius_of(self, shell: mi.Float) -> mi.Float:
         """Return the radius [m] at a coordinate of shells."""
         along = shell * _THICKNESS_PER_RADIUS
-        return self.grid.even * dr.select(along < 0, dr.exp(along), 1 + along)
-
-
-def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region, float, float]:
-    """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
-
-    Rays end at the first surface, or where their light returns at the end of the record.
-    """
-    seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
-    beam = scene.transmitter.pose.direction(*scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
-    longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
-    places, lengths = [], np.full(1, longest)
-    shortest = longest
-    for pose, direction in ((scene.receiver.pose, seen.direction), (scene.transmitter.pose, beam)):
-        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), direction))
-        length = dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), longest)
-        lengths = np.array(length, dtype=np.float64)
-        solid = si.is_valid() & ~scene.is_surface(si.shape)
-        shortest = min(shortest, float(np.min(np.where(np.array(solid), lengths, np.inf))))
-        places += [pose.origin[:2], np.array(opaque_point(pose.origin) + direction * length).T[:, :2]]
-    points = np.vstack(places)
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = np.maximum(_MARGIN * (high - low), _LEAST_MARGIN)
-    return Region.between(low, high, margin), float(lengths.mean()), shortest
+        return self.even * dr.select(along < 0, dr.exp(along), 1 + along)
