@@ -76,15 +76,15 @@ FAULTS = (
     Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
     Fault(
         *("merged_light_2_percent_more", f"{_M}/merge.py"),
-        "= throughput * typical / cell",
-        "= 1.02 * throughput * typical / cell",
+        "= points.throughput * typical / cell",
+        "= 1.02 * points.throughput * typical / cell",
         count=2,
     ),
     Fault(
         "phase_index_times_water_leg",
         f"{_T}/volpath.py",
-        "above.t * opaque(scene.group",
-        "above.t * opaque(scene.refractive",
+        "to_surface * opaque(scene.group",
+        "to_surface * opaque(scene.refractive",
     ),
     # All photons enter the water.
     Fault(
@@ -96,7 +96,12 @@ FAULTS = (
     # The last part of a segment that crosses edges has the coefficient of the layer where it starts.
     Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.coefficient(end)", "downward * here"),
     # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
-    Fault("share_of_photons_in_view", f"{_T}/laser/beam_sampler.py", "opaque(1 / self.view", "opaque(1.03 / self.view"),
+    Fault(
+        "share_of_photons_in_view",
+        f"{_T}/laser/beam_sampler.py",
+        "opaque(count // 2 / count)",
+        "opaque(0.97 * (count // 2) / count)",
+    ),
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
     Fault(
         *("left_and_right_exchanged", f"{_T}/sensor/pixels.py"),
@@ -110,7 +115,7 @@ FAULTS = (
     Fault("obscuration_squared", f"{_T}/sensor/receiver.py", "(1 - self.obscuration)", "(1 - self.obscuration**2)"),
     # Probes of the covered share of a patch do not reach the lower half of its level.
     Fault("short_probe_of_patches", f"{_M}/patches.py", "ray.maxt = patch.height", "ray.maxt = 0.5 * patch.height"),
-    Fault("index_without_square_in_layers", f"{_T}/path_step.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
+    Fault("index_without_square_in_layers", f"{_T}/path.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),
         "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)\n",
