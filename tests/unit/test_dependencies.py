@@ -1,10 +1,11 @@
-"""Packages that are imported against those that `pyproject.toml` declares."""
+"""Packages that are imported against those that `pyproject.toml` declares, and code against its planted faults."""
 
 import re
 import sys
 
 from dependency_versions import ROOT, requirements
 from packaging.utils import canonicalize_name
+from planted_faults import FAULTS
 
 #: Packages by their modules, where the names differ.
 PACKAGES = {"PIL": "pillow"}
@@ -41,3 +42,9 @@ def test_the_tests_import_what_their_extra_declares_and_nothing_else():
     found = imported("tests")
     assert found <= declared("movie", "test") | OPTIONAL
     assert declared("test") - declared() - found - declared("movie") == NOT_IMPORTED - declared()
+
+
+def test_planted_faults_are_where_their_code_is():
+    """Those of a code that has moved would plant nothing."""
+    for fault in FAULTS:
+        assert (ROOT / fault.file).read_text("utf-8").count(fault.old) == fault.count, fault.name
