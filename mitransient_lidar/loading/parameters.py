@@ -5,19 +5,27 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+from xml.dom import minidom
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import PLUGINS
+from mitransient_lidar.core.parameters.fields import Parameter
 from mitransient_lidar.core.validation import finite, is_number, shown
-from mitransient_lidar.loading.document import SceneDocument
+from mitransient_lidar.loading.document import SceneDocument, parameters_of
 
 #: Plugins of Mitsuba that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
+
+#: Elements of XML that set a parameter of a plugin, which are the kinds of parameters.
+_TAGS = ("float", "integer", "boolean", "string")
+
+#: Plugins that an instrument brings.
+_LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov", "time_gated_film")
 
 _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
@@ -32,16 +40,22 @@ _ALTERNATIVES: tuple[tuple[tuple[str, ...], ...], ...] = (
 def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocument:
     """Return a scene with given values of parameters in place of its own.
 
+    These are the scene's own parameters, and those of its plugins: ``wind_speed`` of all plugins that have one, or
+    ``sea.wind_speed`` of the one with this id.
+
     Raises
     ------
     UserError
         If the scene has no such parameter or uses it nowhere, or a value is empty or of another type.
     """
     scene = f"{document.name} with instrument {document.instrument}" if document.instrument else document.name
+    document = _with_declared(document, [name for name in params or {} if name not in document.parameters])
     known, given = document.parameters, {}
     for name, value in (params or {}).items():
         if name not in known:
-            raise UserError(f"parameter {name!r} is not one of scene {scene}: {_closest(name, known)}")
+            declared = {one.name for part in _own_plugins(document) for one in PLUGINS[part.getAttribute("type")]}
+            hint = _closest(name, known, declared)
+            raise UserError(f"parameter {name!r} is not one of scene {scene}: {hint}")
         given[name] = _text(name, value)
         if not given[name].strip() and known[name].strip():
             raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {known[name]}")
@@ -49,6 +63,56 @@ def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocu
     if unused := [name for name in given if name not in filled.used]:
         raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {document.name}")
     return filled
+
+
+def _with_declared(document: SceneDocument, names: Sequence[str]) -> SceneDocument:
+    """Return a scene that has parameters of its plugins as its own, with the values that they have."""
+    if not any(_declared(element, name) for element in _own_plugins(document) for name in names):
+        return document
+    found = document.copied()
+    for name in names:
+        chosen = [(element, one) for element in _own_plugins(found) if (one := _declared(element, name)) is not None]
+        values = [_refer(element, one, name) for element, one in chosen]
+        if chosen:
+            root: Any = found.root
+            default = root.ownerDocument.createElement("default")
+            default.setAttribute("name", name)
+            default.setAttribute("value", next((value for value in values if value), ""))
+            others = root.getElementsByTagName("default")
+            root.insertBefore(default, others[-1].nextSibling if others else root.firstChild)
+            found = replace(found, parameters={**document.parameters, **parameters_of(found.root)})
+    return found
+
+
+def _own_plugins(document: SceneDocument) -> list[minidom.Element]:
+    """Return the elements of a scene that are plugins of this package; the lidar of an instrument is as it is."""
+    fixed = _LIDAR if document.instrument else ()
+    types = [one for one in document.settings if one.attribute == "type"]
+    return [one.element for one in types if one.value in PLUGINS and one.value not in fixed]
+
+
+def _declared(element: minidom.Element, name: str) -> Parameter | None:
+    """Return the parameter of a plugin that a name, or an id and a name, stands for."""
+    part, _, own = str(name).rpartition(".")
+    if part and part != element.getAttribute("id"):
+        return None
+    plugin = PLUGINS.get(element.getAttribute("type"), ())
+    return next((one for one in plugin if one.name == own and one.kind in _TAGS), None)
+
+
+def _refer(element: minidom.Element, parameter: Parameter, name: str) -> str:
+    """Let a plugin's parameter refer to one of the scene; return the value that it has."""
+    settings = [one for one in element.childNodes if isinstance(one, minidom.Element) and one.tagName in _TAGS]
+    setting = next((one for one in settings if one.getAttribute("name") == parameter.name), None)
+    if setting is None:
+        assert element.ownerDocument is not None
+        setting = element.ownerDocument.createElement(parameter.kind)
+        setting.setAttribute("name", parameter.name)
+        setting.setAttribute("value", "" if parameter.default is None else _text(parameter.name, parameter.default))
+        element.appendChild(setting)
+    value = setting.getAttribute("value")
+    setting.setAttribute("value", f"${name}")
+    return value
 
 
 def without_alternatives(parameters: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
@@ -135,9 +199,9 @@ def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
     return words, number
 
 
-def _closest(name: object, known: Mapping[str, str]) -> str:
-    """Return what to say of an unknown name: the names that are close to it, or all."""
-    close = difflib.get_close_matches(str(name), known, n=3)
+def _closest(name: object, known: Mapping[str, str], others: Collection[str] = ()) -> str:
+    """Return what to say of an unknown name: the names that are close to it, or all known ones."""
+    close = difflib.get_close_matches(str(name), [*known, *others], n=3)
     return f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known)) or 'none'}"
 
 

@@ -12,6 +12,7 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.sea.double_passage import LEAST_DEPTH
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.path import PathPoint
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.ripple_focusing import Echo
 
@@ -100,11 +101,12 @@ def test_seas_without_it(lidar_scene, parts):
 
 def test_labels_keep_pixel_and_events():
     classes = PathClasses(counted=True)
-    label = classes.pack(mi.UInt32(200_000_000), mi.UInt32([0, 3, 15, 40]), mi.UInt32(7))
-    pixel, events, reversals = classes.unpack(label)
-    np.testing.assert_array_equal(np.array(pixel), 200_000_000)
-    np.testing.assert_array_equal(np.array(events), [0, 3, 15, 15])
-    np.testing.assert_array_equal(np.array(reversals), 0)
+    events = mi.UInt32([0, 3, 15, 40])
+    point = PathPoint(pixel=mi.UInt32(200_000_000), scatterings=events, reversals=mi.UInt32(7))
+    found = classes.unpack(classes.pack(point))
+    assert set(found) == {"pixel", "scatterings"}
+    np.testing.assert_array_equal(np.array(found["pixel"]), 200_000_000)
+    np.testing.assert_array_equal(np.array(found["scatterings"]), [0, 3, 15, 15])
 
 
 @pytest.mark.long

@@ -1,9 +1,13 @@
 """Numbers among the parameters of a scene, by name and index."""
 
+import json
+
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.parameters import value_of, with_value
+from mitransient_lidar.loading.document import parse_document
+from mitransient_lidar.loading.parameters import fill, value_of, with_value
+from mitransient_lidar.loading.scenes import open_scene
 
 PARAMETERS = {
     "layer_tops": "0, 3",
@@ -80,3 +84,44 @@ def test_others_are_refused(name, message):
 def test_scenes_without_parameters_say_so():
     with pytest.raises(UserError, match="'attenuation' is not one of the scene: it has none"):
         value_of({}, "attenuation")
+
+
+OWN = """<scene version="3.0.0"><default name="deep" value="6"/>
+<emitter type="lidar_transmitter"/><sensor type="multipixel_receiver"><film type="time_gated_film"/></sensor>
+<shape type="ocean_surface" id="sea"><float name="wind_speed" value="2"/></shape>
+<shape type="seabed" id="bottom"><float name="depth" value="$deep"/></shape>
+<shape type="seabed" id="lower"/></scene>"""
+
+
+def test_parameters_of_plugins_are_those_of_the_scene(tmp_path):
+    """Without a ``<default>`` in the scene: of all plugins that have one of the name, or of one with an id."""
+    path = tmp_path / "own.xml"
+    path.write_text(OWN)
+    given = {"altitude": 150, "wind_speed": 4.5, "lower.depth": 9, "deep": 5}
+    values = json.loads(open_scene(path, given).attributes()["plugin_parameters"])
+    assert values["lidar_transmitter"]["altitude"] == values["multipixel_receiver"]["altitude"] == 150
+    assert values["sea"]["wind_speed"] == 4.5
+    assert (values["bottom"]["depth"], values["lower"]["depth"]) == (5, 9)
+
+
+def test_values_that_plugins_have_are_the_defaults():
+    document = parse_document("own", OWN)
+    filled = fill(document, {"bottom.depth": 7, "wind_speed": 4, "wavelength_nm": 515})
+    assert (filled.parameters["wind_speed"], filled.parameters["deep"]) == ("4", "6")
+    assert 'name="bottom.depth" value="$deep"' in filled.text
+    assert 'name="wavelength_nm" value="532.0"' in filled.text
+    assert fill(document, {"deep": 7}).text == OWN
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"sea.depth": 3}, "parameter 'sea.depth' is not one of scene own"),
+        ({"hight": 3}, "parameter 'hight' is not one of scene own: it has deep"),
+        ({"altitud": 3}, "parameter 'altitud' is not one of scene own: did you mean altitude"),
+        ({"film": 3}, "parameter 'film' is not one of scene own"),
+    ],
+)
+def test_other_names_are_refused(params, message):
+    with pytest.raises(UserError, match=message):
+        fill(parse_document("own", OWN), params)

@@ -155,11 +155,11 @@ def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
         mi.Point4f(0.3, 0.7, 0.2, 0.6),
         mi.Point3f(mi.Float(0, 1, -2), mi.Float(0, 2, 1), mi.Float(-1, -5, -8)),
     )
-    own, same = (one.grid.cells(shift).locate(points) for one in (base.layout, layout))
+    own, same = (one.cells.of_pass(shift).locate(points) for one in (base.layout, layout))
     assert np.array_equal(own.bucket, same.bucket)
     assert np.array_equal(own.volume, same.volume)
-    assert [shape.id() for shape in layout.uneven] == [shape.id() for shape in base.layout.uneven] == ["target"]
-    assert layout.uneven[0] in moved.scene.shapes()
+    assert [shape.id() for shape in layout.patches.uneven] == [shape.id() for shape in base.layout.patches.uneven] == ["target"]
+    assert layout.patches.uneven[0] in moved.scene.shapes()
 
 
 def test_cells_go_with_the_surfaces_and_the_beam_that_is_refracted():
@@ -172,17 +172,17 @@ def test_cells_go_with_the_surfaces_and_the_beam_that_is_refracted():
     integrator = choose_integrator(session.scene, FEW)
     base = integrator.prepare(session.scene, session.sensor)
     moved = open_scene(session.record, {"surface_slope_x_deg": 2, "bottom_depth": 8.5}, model=session.scene)
-    grid = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout.grid
-    rings, x, y = grid.rings, mi.Float(-1.5, 0.2, 2), mi.Float(0.5, 0, -1)
-    height, slope = grid.heights.surface_at(x, y)
+    cells = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout.cells
+    rings, x, y = cells.rings, mi.Float(-1.5, 0.2, 2), mi.Float(0.5, 0, -1)
+    height, slope = cells.heights.surface_at(x, y)
     assert np.array(height) == pytest.approx(np.tan(np.deg2rad(2)) * np.array(x), abs=1e-4)
     assert np.array(slope.x) == pytest.approx(np.full(3, np.tan(np.deg2rad(2))), abs=1e-4)
-    assert np.array(grid.heights.bed_at(x, y)) == pytest.approx(np.full(3, -8.5), abs=1e-4)
+    assert np.array(cells.heights.bed_at(x, y)) == pytest.approx(np.full(3, -8.5), abs=1e-4)
     tilt = np.deg2rad(2)
     # The normal turns towards the lidar, which is at -x.
     in_water = np.arcsin(np.sin(np.deg2rad(20) - tilt) / 1.34) + tilt
     wanted = np.tan(in_water), np.tan(np.arcsin(np.sin(np.deg2rad(20)) / 1.34))
-    for layout, shear in zip((rings, base.layout.grid.rings), wanted, strict=True):
+    for layout, shear in zip((rings, base.layout.cells.rings), wanted, strict=True):
         assert [float(each[0]) for each in layout.shear] == pytest.approx([shear, 0], abs=1e-6)
         # On the axis 6 m below the point where the beam meets the sea.
         assert [float(each[0]) for each in layout.offset(mi.Float(6 * shear), mi.Float(0), mi.Float(6))] == (
