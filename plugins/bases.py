@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.fields import Plugin
+from mitransient_lidar.core.parameters.fields import Plugin, Read
 from mitransient_lidar.core.parameters.lidar import ANGLES
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
@@ -39,8 +39,7 @@ class RecordedProperties(mi.Properties):
 
     def __init__(self, props: mi.Properties, plugin: Plugin) -> None:
         super().__init__(props)
-        #: Reader of checked values (`core.parameters.fields.Read`).
-        self.read = plugin.reader(self.get)
+        self._plugin = plugin
         #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
         self.values: dict[str, Any] = {}
         #: Place of the frame's origin in the scene [m]: parameters are places in the scene, loaded objects lie in the
@@ -49,6 +48,11 @@ class RecordedProperties(mi.Properties):
         for parameter in plugin:
             if parameter.may_be_empty and parameter.name in self and super().get(parameter.name) == "":
                 del self[parameter.name]
+
+    @property
+    def read(self) -> Read:
+        """Reader of checked values; to keep it would make a circle that keeps the nested objects alive."""
+        return self._plugin.reader(self.get)
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a parameter, or the default."""
