@@ -1,5 +1,6 @@
 """Parameters that the objects of the plugins keep: every one of their manual pages, with its default."""
 
+import gc
 import importlib
 import json
 import re
@@ -140,3 +141,15 @@ def test_textures_of_every_kind_are_recorded(tmp_path):
         assert matrices, bsdf["type"]
         for matrix in matrices:
             np.testing.assert_allclose(matrix, [[3**0.5, -1.5, 0], [1, 1.5 * 3**0.5, 0], [0, 0, 1]], atol=1e-6)
+
+
+def test_parameters_are_freed_when_their_object_is_made():
+    """A circle kept them, and the objects in them, until the next garbage collection: kernels had other numbers."""
+    gc.collect()
+    gc.disable()
+    try:
+        made = mi.load_dict({"type": "seabed", "bsdf": {"type": "retroreflector"}})
+        assert not [one for one in gc.get_objects() if type(one).__name__ == "RecordedProperties"]
+    finally:
+        gc.enable()
+    assert made.bsdf().parameters["width_deg"] == 2

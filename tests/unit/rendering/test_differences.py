@@ -158,7 +158,11 @@ def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
     own, same = (one.cells.of_pass(shift).locate(points) for one in (base.layout, layout))
     assert np.array_equal(own.bucket, same.bucket)
     assert np.array_equal(own.volume, same.volume)
-    assert [shape.id() for shape in layout.patches.uneven] == [shape.id() for shape in base.layout.patches.uneven] == ["target"]
+    assert (
+        [shape.id() for shape in layout.patches.uneven]
+        == [shape.id() for shape in base.layout.patches.uneven]
+        == ["target"]
+    )
     assert layout.patches.uneven[0] in moved.scene.shapes()
 
 
