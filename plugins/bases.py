@@ -84,13 +84,12 @@ def register(
 ) -> None:
     """Register a plugin of a kind of Mitsuba, made by its class or a function of the class that describes it.
 
-    The manual, the docstring of the class, gets the table of its parameters, and its objects a description.
+    The manual, the docstring of the class, gets the table of its parameters.
 
     Its objects have ``parameters``: the plugin's name as ``type``, the value of each parameter that they have read, and
-    nested objects.
+    nested objects; and a description of these.
     """
     manual: Any = make if described is None else described
-    manual.to_string = _described
     if manual.__doc__:
         manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
 
@@ -98,6 +97,7 @@ def register(
         own = RecordedProperties(props, plugin)
         children = dict(props.objects(False))
         made = make(own)
+        type(made).to_string = _described
         # Mitsuba refuses parameters of `props` that nobody has read: the class has read, or removed, those of the copy.
         given, left = list(props.keys()), set(own.keys())
         used = [name for name in given if name not in left or own.was_queried(name)]

@@ -153,3 +153,11 @@ def test_parameters_are_freed_when_their_object_is_made():
     finally:
         gc.enable()
     assert made.bsdf().parameters["width_deg"] == 2
+
+
+@pytest.mark.parametrize("model", ["lambertian", "hapke"])
+def test_objects_are_described_by_their_parameters(model):
+    """A class without a description ended in "lookup failed!" of its C++ base."""
+    bottom = mi.load_dict({"type": "seabed", "depth": 5.0, "bsdf": {"type": "sediment", "model": model}})
+    assert re.fullmatch(r"Seabed\[type=seabed, .*depth=5.0, .*\]", str(bottom))
+    assert f"Sediment[type=sediment, model={model}, " in str(bottom.bsdf())
