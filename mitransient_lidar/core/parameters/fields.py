@@ -143,10 +143,11 @@ class Plugin:
     def table(self) -> str:
         """Return the table of the manual in reStructuredText."""
         lines = [".. list-table::", "   :header-rows: 1", "   :widths: auto", ""]
-        rows = [("Parameter", "Type", "Allowed", "Default", "Meaning")]
+        rows = [("Parameter", "Type", "Meaning")]
         for each in self.parameters:
             default = each.otherwise or ("" if each.default in (None, "") else f"``{_shown(each.default)}``")
-            rows.append((f"``{each.name}``", each.kind, each.allowed, default, each.meaning))
+            told = [each.meaning, each.allowed and f"Allowed: {each.allowed}", default and f"Default: {default}"]
+            rows.append((f"``{each.name}``", each.kind, ". ".join(filter(None, told))))
         for row in rows:
             lines += [f"   {'* - ' if not number else '  - '}{cell}".rstrip() for number, cell in enumerate(row)]
         return "\n".join(lines)
