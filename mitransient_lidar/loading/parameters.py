@@ -101,7 +101,7 @@ def _declared(element: minidom.Element, name: str) -> Parameter | None:
 
 
 def _refer(element: minidom.Element, parameter: Parameter, name: str) -> str:
-    """Let a plugin's parameter refer to one of the scene; return the value that it has."""
+    """Make a plugin take a parameter from that of the scene with a name; return the value that it had."""
     settings = [one for one in element.childNodes if isinstance(one, minidom.Element) and one.tagName in _TAGS]
     setting = next((one for one in settings if one.getAttribute("name") == parameter.name), None)
     if setting is None:
