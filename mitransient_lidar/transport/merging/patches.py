@@ -32,6 +32,10 @@ _PROBE_RAYS_OF_SHOTS = 512
 #: Largest number of hits of a vertical ray in the search for solids of several levels.
 _MOST_LEVELS = 8
 
+#: Distance before a point within which rays meet nothing else [m], and the same over its largest coordinate: half of that
+#: by which coincident faces are moved apart.
+_JUST_BEFORE, _JUST_BEFORE_ROUNDING = 5e-5, 2.0**-21
+
 #: Margin of the probes beyond a level, and of their steps beyond a surface, over the height of the level.
 _PROBE_MARGIN = 1e-3
 
@@ -157,10 +161,12 @@ class SolidPatches:
         cores = dr.maximum(cores, opaque(self.least) / ring_widths)
         # Of each solid: core radius, and width of rings over it.
         self._sizes = dr.ravel(mi.Point2f(cores, ring_widths))
+        self._near = self._near_others(solids)
+        cut = [*self.uneven, *self._near]
         self._bounded = [
             solid
             for solid in solids
-            if not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
+            if not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in cut)
         ]
 
     def of_pass(self, scene: LidarScene, shift: mi.Point2f) -> SolidPatches:
@@ -192,22 +198,26 @@ class SolidPatches:
         # Solids with overhangs have several levels over one square. Sectors far from the beam are wide, and so high.
         height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self._side)
         start = dr.floor(w / height + self._shift.x)
-        level = dr.select(self._is_bounded(met_shape(si)), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
+        level = dr.select(is_one_of(met_shape(si), self._bounded), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
+        corner = mi.Point3f(
+            (cu - self._shift.x) * self._side, (cv - self._shift.y) * self._side, (start - self._shift.x) * height
+        )
+        faces = dr.sign(normal)
+        hidden = self._is_hidden(si, axis, faces, dr.select(normal > 0, corner.z + height, corner.z))
         return SolidPatch(
             bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
             | (low_bits(j >> bits, 6) << 6)
-            | (low_bits(level, 8) << 12)
+            | (low_bits(level, 7) << 12)
+            | dr.select(hidden, mi.UInt32(1 << 19), 0)
             | (side << 20)
             | (low_bits(shape, 9) << 23),
             area=projected / dr.abs(normal),
-            corner=mi.Point3f(
-                (cu - self._shift.x) * self._side, (cv - self._shift.y) * self._side, (start - self._shift.x) * height
-            ),
+            corner=corner,
             height=height,
             sector=sector,
             axis=axis,
-            faces=dr.sign(normal),
+            faces=faces,
         )
 
     def typical_area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
@@ -238,9 +248,37 @@ class SolidPatches:
         )
         return along, across, dr.gather(mi.Point2f, self._sizes, number)
 
-    def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
-        """Return whether a solid may end inside the region."""
-        return is_one_of(shape, self._bounded)
+    def _near_others(self, solids: Sequence[mi.Shape]) -> list[mi.Shape]:
+        """Return solids that others may cover closely: boxes about both are less than a level apart."""
+        boxes = np.array([[solid.bbox().min, solid.bbox().max] for solid in solids], np.float64).reshape(-1, 2, 3)
+        distance = 0.5 * _LEVEL_WIDTHS * max(self.width * self.widening, self.least)
+        low, high = boxes[:, 0] - distance, boxes[:, 1] + distance
+        meets = np.all((low[:, None] < high) & (low < high[:, None]), axis=-1)
+        return [solid for solid, others in zip(solids, meets.sum(axis=0), strict=True) if others > 1]
+
+    def _is_hidden(
+        self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, edge: mi.Float
+    ) -> mi.Bool:
+        """Return whether another solid lies before points, in projection, up to the `edge` of their level.
+
+        Light that such a solid stops is not spread over what it hides.
+        """
+        if not self._near:
+            return mi.Bool(False)
+        inwards = self._inwards(axis, faces)
+        length = dr.abs(edge - dr.select(axis == 0, si.p.x, dr.select(axis == 1, si.p.y, si.p.z)))
+        ray = mi.Ray3f(si.p - inwards * length, inwards)
+        ray.maxt = length - dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(si.p)))
+        before = self.scene.ray_intersect(ray, is_one_of(met_shape(si), self._near) & (ray.maxt > 0))
+        return before.is_valid() & ~self.scene.is_surface(before.shape)
+
+    def _inwards(self, axis: mi.UInt32, faces: mi.Float) -> mi.Vector3f:
+        """Return the direction of a projection towards faces, of length 1 along x, y or z."""
+        x, y = self.rings.slant
+        is_x, is_y, is_z = (axis == number for number in range(3))
+        return -faces * mi.Vector3f(
+            dr.select(is_x, 1, dr.select(is_z, -x, 0)), dr.select(is_y, 1, dr.select(is_z, -y, 0)), dr.select(is_z, 1, 0)
+        )
 
     def inverse_share(self, patch: SolidPatch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
         """Return an estimate of 1 / (covered share of the patch's square), for patches cut by edges.
@@ -255,12 +293,7 @@ class SolidPatches:
         first = patch.corner.z - margin + dr.select(patch.faces > 0, patch.height + 2 * margin, 0)
         is_x, is_y, is_z = (patch.axis == axis for axis in range(3))
         slant = mi.Vector2f(*self.rings.slant)
-        # Lengths along it are those of w.
-        inwards = -patch.faces * mi.Vector3f(
-            dr.select(is_x, 1, dr.select(is_z, -slant.x, 0)),
-            dr.select(is_y, 1, dr.select(is_z, -slant.y, 0)),
-            dr.select(is_z, 1, 0),
-        )
+        inwards = self._inwards(patch.axis, patch.faces)
 
         def probe(
             samples: mi.Float, rng: mi.PCG32, searching: mi.Bool, uvw: mi.Point3f, fresh: mi.Bool
@@ -284,7 +317,7 @@ class SolidPatches:
             searching &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
             return samples + dr.select(searching & fresh, mi.Float(1), 0), rng, searching, uvw, fresh
 
-        state = mi.Float(1), mi.PCG32(rng), active & self._is_bounded(shape), mi.Point3f(0), mi.Bool(True)
+        state = mi.Float(1), mi.PCG32(rng), active & is_one_of(shape, self._bounded), mi.Point3f(0), mi.Bool(True)
         samples, advanced, *_ = dr.while_loop(state, lambda *state: state[2], probe, label="coverage")
         rng.state = advanced.state
         return samples
