@@ -212,27 +212,36 @@ def test_points_fall_into_cells_by_their_volume(wavy_sea, shift, direction):
     assert np.sum(z**2) < 1.3 * largest_chi2(z.size)
 
 
-def test_inverse_share_counts_edges_in_full(lidar_scene):
-    """Points uniform on a plate: for each patch the mean inverse share times the share of the points is 1."""
-    half = 0.31
-    scene = lidar_scene(integrator=MERGING, extra={"target": plate(0.1, 0.05, -4.0, half)})
+@pytest.mark.parametrize("height", [None, 0.03], ids=["on a plate", "on a bottom below it"])
+def test_inverse_share_counts_edges_in_full(lidar_scene, height):
+    """Points uniform on a plate, or on the bottom: for each patch the mean inverse share times their share is 1.
+
+    On the bottom, what a plate hides that lies 3 cm above it makes patches of its own.
+    """
+    half, bottom = 0.31, -8.0
+    extra = {"target": plate(0.1, 0.05, -4.0 if height is None else bottom + height, half)}
+    scene = lidar_scene(integrator=MERGING, extra=extra)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
-    width, count = 0.1, 2**18
+    width, count, side = 0.1, 2**18, half if height is None else 0.7
     rings, shift = BeamRings(lidar.transmitter.pose, 1.0, 1.34), mi.Point2f(0.37, 0.61)
     patches = SolidPatches(lidar, region, rings, 8.0, width).of_pass(lidar, shift)
     rng = pass_streams(3, 0, count)
-    x, y = (half * (2 * rng.next_float32() - 1) for _ in range(2))
-    ray = mi.Ray3f(mi.Point3f(x + 0.1, y + 0.05, -3), mi.Vector3f(0, 0, -1))
+    x, y = (side * (2 * rng.next_float32() - 1) for _ in range(2))
+    ray = mi.Ray3f(
+        mi.Point3f(x + 0.1, y + 0.05, -3 if height is None else bottom + 0.5 * height), mi.Vector3f(0, 0, -1)
+    )
     si = scene.ray_intersect(ray)
     patch = patches.locate(si)
     share = patches.inverse_share(patch, si.shape, rng, si.is_valid())
     patches_of_points = np.array(patch.tag).astype(np.uint64) << 32 | np.array(patch.bucket)
     _, first, inverse, number = np.unique(patches_of_points, return_index=True, return_inverse=True, return_counts=True)
-    covered = number / count * (2 * half) ** 2 / np.array(patch.area, dtype=np.float64)[first]
+    covered = number / count * (2 * side) ** 2 / np.array(patch.area, dtype=np.float64)[first]
     mean = np.bincount(inverse, np.array(share, dtype=np.float64)) / number
-    # Of slivers too few points are known. The number of draws up to the first hit has the variance (1 - s)/s^2.
-    known = number > 1000
+    # Of slivers too few points are known, and of patches beyond the points only parts. The number of draws up to the
+    # first hit has the variance (1 - s)/s^2.
+    beyond = np.maximum(np.abs(x), np.abs(y)) > (1.0 if height is None else 0.7) * side
+    known = (number > 1000) & (np.bincount(inverse, beyond) == 0)
     z = (mean * covered - 1)[known] / np.sqrt((2 - np.minimum(covered, 1)) / number)[known]
     assert known.sum() > 30
     assert np.abs(z).max() < largest_z(10**6, z.size)

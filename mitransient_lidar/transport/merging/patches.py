@@ -32,8 +32,8 @@ _PROBE_RAYS_OF_SHOTS = 512
 #: Largest number of hits of a vertical ray in the search for solids of several levels.
 _MOST_LEVELS = 8
 
-#: Distance before a point within which rays meet nothing else [m], and the same over its largest coordinate: half of that
-#: by which coincident faces are moved apart.
+#: Distance before a point at which rays to it end [m], and the same over its largest coordinate: half of that by which
+#: coincident faces are moved apart.
 _JUST_BEFORE, _JUST_BEFORE_ROUNDING = 5e-5, 2.0**-21
 
 #: Margin of the probes beyond a level, and of their steps beyond a surface, over the height of the level.
@@ -203,7 +203,7 @@ class SolidPatches:
             (cu - self._shift.x) * self._side, (cv - self._shift.y) * self._side, (start - self._shift.x) * height
         )
         faces = dr.sign(normal)
-        hidden = self._is_hidden(si, axis, faces, dr.select(normal > 0, corner.z + height, corner.z))
+        hidden = self._is_hidden(si, axis, faces, height)
         return SolidPatch(
             bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
@@ -256,19 +256,16 @@ class SolidPatches:
         meets = np.all((low[:, None] < high) & (low < high[:, None]), axis=-1)
         return [solid for solid, others in zip(solids, meets.sum(axis=0), strict=True) if others > 1]
 
-    def _is_hidden(
-        self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, edge: mi.Float
-    ) -> mi.Bool:
-        """Return whether another solid lies before points, in projection, up to the `edge` of their level.
+    def _is_hidden(self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, height: mi.Float) -> mi.Bool:
+        """Return whether another solid lies before points, in projection, within the height of a level [m].
 
         Light that such a solid stops is not spread over what it hides.
         """
         if not self._near:
             return mi.Bool(False)
         inwards = self._inwards(axis, faces)
-        length = dr.abs(edge - dr.select(axis == 0, si.p.x, dr.select(axis == 1, si.p.y, si.p.z)))
-        ray = mi.Ray3f(si.p - inwards * length, inwards)
-        ray.maxt = length - dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(si.p)))
+        ray = mi.Ray3f(si.p - inwards * height, inwards)
+        ray.maxt = height - dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(si.p)))
         before = self.scene.ray_intersect(ray, is_one_of(met_shape(si), self._near) & (ray.maxt > 0))
         return before.is_valid() & ~self.scene.is_surface(before.shape)
 
@@ -277,7 +274,9 @@ class SolidPatches:
         x, y = self.rings.slant
         is_x, is_y, is_z = (axis == number for number in range(3))
         return -faces * mi.Vector3f(
-            dr.select(is_x, 1, dr.select(is_z, -x, 0)), dr.select(is_y, 1, dr.select(is_z, -y, 0)), dr.select(is_z, 1, 0)
+            dr.select(is_x, 1, dr.select(is_z, -x, 0)),
+            dr.select(is_y, 1, dr.select(is_z, -y, 0)),
+            dr.select(is_z, 1, 0),
         )
 
     def inverse_share(self, patch: SolidPatch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
