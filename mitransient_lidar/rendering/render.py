@@ -238,7 +238,7 @@ def _render(
         accumulator.add(record.histogram)
         if differences is not None:
             differences.add_pass(seed, share)
-        return float(record.edge_loss[0])
+        return record.edge_loss
 
     log = run_passes(
         render_pass,

@@ -253,7 +253,7 @@ def _render(
             renderer = chosen.prepare(session.scene, session.sensor, receiver=ring)
         record = renderer.render_pass(seed)
         rings.append(record.histogram.energy()[0])
-        return float(record.edge_loss[0])
+        return float(record.edge_loss)
 
     goal = replace(of_field, passes=fields.size * passes)
     log = run_passes(render_pass, goal, seed=seed, smallest=passes, progress=progress)

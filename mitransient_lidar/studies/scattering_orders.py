@@ -85,7 +85,7 @@ def scattering_orders(
         energy.add(histogram)
         totals.add(histogram.reshape(shape).sum(axis=(0, 3)))
         power.add(waveform(histogram, axis.bin_width_ns, kernel))
-        return float(record.edge_loss[0])
+        return record.edge_loss
 
     log = run_passes(render_pass, Goal(passes=passes, max_time=options.max_time), seed=seed, progress=progress)
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))

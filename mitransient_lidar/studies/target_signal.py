@@ -102,7 +102,7 @@ def target_signal(
     def render_pass(number: int, seed: int) -> float:
         records = [renderer.render_pass(seed) for renderer in (with_target, without)]
         pairs.append((records[0].histogram.energy(), records[1].histogram.energy()))
-        return float(records[0].edge_loss[0])
+        return records[0].edge_loss
 
     goal = Goal(passes=passes, max_time=options.max_time)
     log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)

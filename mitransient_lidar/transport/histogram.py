@@ -126,8 +126,9 @@ class TransientHistogram:
         self.shape = (*shape, self.record_length)
         self._each = pixels * self.record_length
         self._count = channels * self._each
-        sizes = self.record_length, self.record_length - 1, self._count
-        self._length, self._last, self._fine_sums = map(opaque_index, sizes)
+        # A last sum holds what is lost.
+        sizes = self.record_length, self.record_length - 1, self._count, self._count + 1
+        self._length, self._last, self._lost, self._fine_sums = map(opaque_index, sizes)
         self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (axis.bin_width_ns * 1e-9 * C0))
         self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
@@ -137,7 +138,7 @@ class TransientHistogram:
     def clear(self) -> None:
         """Set all sums to zero."""
         # Kernels are compiled for the sizes of small arrays to which they add: records of similar length share them.
-        size = 2 * self._count
+        size = 2 * (self._count + 1)
         self._sums = dr.zeros(mi.Int64, 1 << (size - 1).bit_length() if size < dr.expand_threshold() else size)
         # Marks of energies, and of perturbations that are not finite.
         self._invalid = dr.zeros(mi.UInt32, self._each * (2 if self.perturbations.count else 1))
@@ -175,6 +176,15 @@ class TransientHistogram:
         for channel, change in enumerate(perturbed, 1):
             self._add_share(index + channel * opaque_index(self._each), change, active & finite)
 
+    def lose(self, energy: mi.Float, active: mi.Bool) -> None:
+        """Add energy [J] that is lost because the surface mesh ends."""
+        self._add_share(self._lost, energy, active & dr.isfinite(energy))
+
+    @property
+    def lost(self) -> float:
+        """Energy that is lost because the surface mesh ends [J]."""
+        return float(self._both_sums()[:, -1] @ np.array(self._units))
+
     def _add_share(self, index: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         # Units themselves are too small for single precision where pulses are weak.
         share = energy * self._per_emitted
@@ -192,17 +202,21 @@ class TransientHistogram:
 
     def _channels(self, chosen: slice) -> np.ndarray:
         """Return energies or their derivatives as float64, shape (channel, *shape)."""
-        sums = np.array(self._sums)[: 2 * self._count].reshape(2, -1, self._each)[:, chosen]
+        sums = self._both_sums()[:, :-1].reshape(2, -1, self._each)[:, chosen]
         found = sums[0] * self._units[0] + sums[1] * self._units[1]
         invalid = np.array(self._invalid).reshape(-1, self._each) > 0
         found[:, invalid[0 if chosen.start == 0 else -1]] = np.nan
         return np.asarray(found.reshape(-1, *self.shape))
 
+    def _both_sums(self) -> np.ndarray:
+        """Return coarse and fine sums, shape (2, sums + 1)."""
+        return np.array(self._sums)[: 2 * (self._count + 1)].reshape(2, -1)
+
     def rounded_energy(self) -> np.ndarray:
         """Return `energy` as float32, at a quarter of the cost."""
         coarse, fine = (mi.Float64(unit) for unit in self._units)
         index = dr.arange(mi.UInt32, self._each)
-        sums = (mi.Float64(dr.gather(mi.Int64, self._sums, index + first)) for first in (0, self._count))
+        sums = (mi.Float64(dr.gather(mi.Int64, self._sums, index + first)) for first in (0, self._count + 1))
         energy = mi.Float(next(sums) * coarse + next(sums) * fine)
         energy = dr.select(dr.gather(mi.UInt32, self._invalid, index) > 0, dr.nan, energy)
         return np.array(energy).reshape(self.shape)

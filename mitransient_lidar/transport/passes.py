@@ -26,8 +26,6 @@ class PassRecord:
 
     Attributes
     ----------
-    edge_loss
-        Energy that would have been received if the surface mesh did not end [J], shape (1,).
     rays
         Number of rays traced.
     """
@@ -41,7 +39,6 @@ class PassRecord:
     def clear(self) -> None:
         """Empty the record."""
         self.histogram.clear()
-        self.edge_loss = dr.zeros(mi.Float64, 1)
         self.rays = mi.Float64(0)
 
     def receive(
@@ -68,14 +65,15 @@ class PassRecord:
             sums = self.focusing.perturb(sums or [], factor, echo, order, length)
         self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active, sums)
 
-    def lose(self, energy: mi.Float, active: mi.Bool) -> None:
-        """Add energy [J] that is lost because the surface mesh ends."""
-        dr.scatter_add(self.edge_loss, mi.Float64(energy), mi.UInt32(0), active)
+    @property
+    def edge_loss(self) -> float:
+        """Energy that would have been received if the surface mesh did not end [J]."""
+        return self.histogram.lost
 
     def evaluate(self) -> None:
         """Compute the record."""
         self.histogram.evaluate()
-        dr.eval(self.edge_loss, self.rays)
+        dr.eval(self.rays)
 
 
 class PassRenderer(ABC):

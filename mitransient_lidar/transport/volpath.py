@@ -193,7 +193,7 @@ class LaserLight(PathLight):
         offset = pose.point - crossing
         intensity = self.scene.transmitter.intensity_at(*pose.tangent(-dr.normalize(offset)))
         missing = share * level_transmittance(self.scene, emitter) * intensity / dr.squared_norm(offset)
-        self.record.lose(missing, missing > 0)
+        self.record.histogram.lose(missing, missing > 0)
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths whose light would arrive after the record."""

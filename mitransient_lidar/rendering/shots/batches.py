@@ -320,7 +320,7 @@ class ShotBatches:
                     renderer, copies = several(here), here
                 numbers = [pass_seed(seed, done + number) for seed in seeds for number in range(here)]
                 record = renderer.render_pass(numbers)
-                lost += float(record.edge_loss[0])
+                lost += record.edge_loss
                 shape = shots, here, -1, self._origins, renderer.scene.axis.bin_count
                 found, changes = record.histogram.energy().reshape(shape), None
                 if self._perturbations:

@@ -147,4 +147,4 @@ def receive(
         reversals = reversals + light.reversals
     echo, number = Echo(point.surface_length, solid is not None), mi.UInt32(0) if solid is None else solid
     record.receive(point.pixel, order, reversals, number, length, energy, active & ~lost, echo, sums)
-    record.lose(energy, active & lost)
+    record.histogram.lose(energy, active & lost)
