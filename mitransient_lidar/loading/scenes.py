@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
-from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_path
@@ -22,7 +21,7 @@ from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_docum
 from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
-from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters
+from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters, values_of
 from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
@@ -39,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A loaded scene, its name, the parameters of an XML scene with their values as text, and what loads it again.
+    """A loaded scene, its name, all parameters of an XML scene with their values as text, and what loads it again.
 
     The record is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
     """
@@ -293,7 +292,7 @@ def _load_xml(
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
-    return LoadedScene(loaded, document.name, dict(document.parameters), record)
+    return LoadedScene(loaded, document.name, values_of(document), record)
 
 
 def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
@@ -323,8 +322,6 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
         props = node.props
         for name in list(props.keys()):
             value = props[name]
-            if name in FILE_PARAMETERS and isinstance(value, (bool, int, float)):
-                raise UserError(f"{name} = {value} must be a text, the name of a file")
             if isinstance(value, str) and DOLLAR in value:
                 props[name] = value.replace(DOLLAR, "$")
         if props.plugin_name() == "ocean_surface":

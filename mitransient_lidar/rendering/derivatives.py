@@ -12,14 +12,11 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
+from mitransient_lidar.core.parameters.water import COEFFICIENTS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.parameters import parameter_of, value_of
 from mitransient_lidar.transport.perturbations import Perturbation
-from mitransient_lidar.transport.water_changes import (
-    COEFFICIENTS,
-    coefficient_derivative,
-    mean_cosine_derivative,
-)
+from mitransient_lidar.transport.water_changes import coefficient_derivative, mean_cosine_derivative
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -32,21 +32,25 @@ POSE = (
 )
 
 
-def divergences(default: float | None) -> tuple[Parameter, Parameter, Parameter]:
+def divergences(default: float | None, **more: bool) -> tuple[Parameter, Parameter, Parameter]:
     """Return the three ways to give the width of a beam; the default is that of the first."""
+    more["may_be_empty"] = True
     return (
         number("divergence_mrad", default, "mrad", 1e-3, 2000,
             "Full angle between the points where the irradiance of a Gaussian beam has fallen to e^-1/2 of its peak "
-            "(its sigma is half of it); the full angle of a top-hat beam", may_be_empty=True),
+            "(its sigma is half of it); the full angle of a top-hat beam", **more),
         number("divergence_fwhm_mrad", None, "mrad", 1e-3, 2000,
             "The same beam by its full width at half maximum; give one of the three. Each is the full angle of a "
             "top-hat beam, whose irradiance falls from its peak to 0 at the edge. An empty text counts as not given",
-            may_be_empty=True),
+            **more),
         number("divergence_1e2_mrad", None, "mrad", 1e-3, 2000,
             "The same beam by its full width at e^-2 of the peak. An empty text counts as not given",
-            may_be_empty=True),
+            **more),
     )
 
+
+#: They describe one thing.
+DIVERGENCES = tuple((each.name,) for each in divergences(None))
 
 LIDAR_TRANSMITTER = plugin(
     "lidar_transmitter",
@@ -70,6 +74,7 @@ LIDAR_TRANSMITTER = plugin(
     file("pulse_file",
         "Instead: text file with two columns, time [ns] and power (any unit), or in any order and unit of time below a "
         "heading such as ``t [ps], V``"),
+    alternatives=(DIVERGENCES,),
 )
 
 OPTICS = (

@@ -77,7 +77,7 @@ TABLE1 = {
     ("9999x9999", "at most 1048576"): "layout",
     ("hex8", "hexagons"): "layout",
     ("swell", "must be one of"): "spectrum",
-    ("mie", "must be one of"): "phase",
+    ("mie", "must be one of"): "phase_function",
     ("1", "must lie between -0.999 and 0.999"): "phase_g",
     ("some", "must be"): "slope_variance surface_cell_size surface_refined_size",
     ("0.9", "must lie between 1"): "refractive_index group_index",
@@ -237,9 +237,10 @@ def test_commands_and_files(folder, arguments, part):
 
 
 def without(tag):
-    """Return table1 without its first element of a tag."""
+    """Return table1 with a parameter of no use in place of its first element of a tag."""
     end = tag.split()[0]
-    return lambda text: re.sub(rf"<{tag}(?=[ />])[^>]*?(/>|>.*?</{end}>)", "", text, count=1, flags=re.DOTALL)
+    unused = '<default name="kd" value=""/>'
+    return lambda text: re.sub(rf"<{tag}(?=[ />])[^>]*?(/>|>.*?</{end}>)", unused, text, count=1, flags=re.DOTALL)
 
 
 def replaced(old, new):
@@ -261,15 +262,21 @@ def replaced(old, new):
         (without("medium"), "medium below a sea surface: the scene has none"),
         (without('shape type="ocean_surface"'), "medium below a sea surface: the scene has none"),
         (without("integrator"), "integrator: the scene has no lidar integrator"),
-        (replaced('<float name="aperture_area"', '<float name="apertur_area"'), "did you mean aperture_area"),
-        (replaced('<string name="attenuation"', '<string name="atenuation"'), "did you mean attenuation"),
-        (replaced('<string name="divergence_mrad"', '<string name="divergense"'), "there is no parameter divergense"),
+        (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
+        (
+            replaced('name="interior"/>', 'name="interior"><float name="atenuation" value="1"/></medium>'),
+            "did you mean attenuation",
+        ),
+        (
+            replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
+            "there is no parameter divergense",
+        ),
         (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
         (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
         (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
-        (replaced('"$aperture_area"', '"$aperture"'), "aperture_area = '$aperture' refers to an unknown parameter"),
-        (replaced('"$aperture_area"', '"inf"'), "aperture_area = inf must be finite"),
-        (replaced('"$aperture_area"', '""'), "aperture_area = '' is empty"),
+        (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "translate z = '-$bottom_dept' refers to an unknown parameter"),
+        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
+        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
         (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
         (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
         (replaced("<film", "<fillm"), "not well-formed"),
