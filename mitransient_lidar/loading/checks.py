@@ -54,6 +54,8 @@ _NUMBERS = {
     "lookat": ("origin", "target", "up"),
     "look_at": ("origin", "target", "up"),
     "matrix": ("value",),
+    "spectrum": ("value",),
+    "rgb": ("value",),
 }
 #: Rule of spectra, which Mitsuba would replace by their luminance.
 _AT_ONE_WAVELENGTH = "must be one number, the value at the laser's wavelength: others would be averaged by colour"
@@ -92,8 +94,6 @@ def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
     label = _Label(first[0] if first else own, parameters[first[0]] if first else setting.template, setting.template)
     if attribute in _NUMBERS.get(element.tagName, ()):
         _check_numbers(label, element.tagName, attribute, value)
-    elif element.tagName in ("spectrum", "rgb") and attribute == "value":
-        _check_spectrum(label, value)
     elif element.tagName == "spectrum" and attribute == "filename":
         raise label.refusal(_AT_ONE_WAVELENGTH)
     if attribute == "value" and element.tagName in ("float", "integer", "string", "spectrum", "rgb"):
@@ -189,11 +189,16 @@ class _Label:
 
 
 def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
-    """Check the numbers of one attribute."""
+    """Check the numbers of one attribute; a colour may be ``#rrggbb``."""
     words = value.replace(",", " ").split()
     if not words:
         raise label.refusal("is empty: it must be a number")
     for word in words:
+        if tag in ("spectrum", "rgb"):
+            if ":" in word:
+                raise label.refusal(_AT_ONE_WAVELENGTH)
+            if word.startswith("#"):
+                continue
         if not is_number(word):
             if is_number(label.value) and float(label.value) < 0:
                 raise label.refusal(f"must not be negative: the scene uses it as {label.text}")
@@ -212,17 +217,6 @@ def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
             raise label.refusal("must be greater than 0: it is the size of a shape")
     if len(words) > 1 and tag in ("float", "integer"):
         raise label.refusal("must be one number")
-
-
-def _check_spectrum(label: _Label, value: str) -> None:
-    """Check a spectrum, one number, or a colour, three numbers or ``#rrggbb``."""
-    for number in value.replace(",", " ").split() or [""]:
-        if ":" in number:
-            raise label.refusal(_AT_ONE_WAVELENGTH)
-        if not number.startswith("#") and not is_number(number):
-            raise label.refusal("must be a number")
-        if is_number(number) and not np.isfinite(float(number)):
-            raise label.refusal("must be finite")
 
 
 def _check_value(label: str, name: str, plugin: str, value: Any) -> None:

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 from xml.dom import minidom
 
@@ -64,8 +65,17 @@ class ScenePlugin:
         setting = self.settings.get(parameter.name)
         if setting is not None and setting.value != "":
             return setting.value
+        return "" if parameter.name in self._replaced else parameter.text
+
+    @cached_property
+    def _replaced(self) -> set[str]:
+        """Names of parameters that others describe, which are given: values, or objects by their names and kinds."""
+        children = [one for one in self.element.childNodes if isinstance(one, minidom.Element)]
+        objects = [one for one in children if one.tagName not in _TAGS]
         given = [name for name, one in self.settings.items() if one.value != ""]
-        return "" if parameter.name in self.declared.replaced(given) else parameter.text
+        return self.declared.replaced(
+            [*given, *(one.getAttribute("name") for one in objects), *(f"({one.tagName})" for one in objects)]
+        )
 
     def refer(self, parameter: Parameter, name: str) -> str:
         """Take a parameter from that of the scene with a name; return the text of the value that it had."""

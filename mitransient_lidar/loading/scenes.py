@@ -104,7 +104,8 @@ def open_scene(
         Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
         scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
     params
-        Values for the ``<default>`` parameters of an XML scene, and of the instrument.
+        Values for the parameters of an XML scene, its own (``<default>``) and those of its plugins, as of
+        `loading.parameters.fill`, and of the instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
     variant
@@ -398,4 +399,4 @@ def _no_parameters(params: Mapping[str, Any] | None, instrument: str | None, wha
     if instrument is not None:
         raise UserError(f"instrument = {shown(instrument)} needs an XML scene, not {what}")
     if params:
-        raise UserError(f"params = {sorted(params)} need an XML scene; {what} has no <default> parameters to fill")
+        raise UserError(f"params = {sorted(params)} need an XML scene; {what} has its values in it")

@@ -70,6 +70,7 @@ SEDIMENT = plugin(
         "hapke: share *s* of the lobe towards the source; (1 + c)/2 with Hapke's c"),
     number("opposition_amplitude", 1.0, "1", 0, 3, "hapke: opposition effect :math:`B_0`"),
     number("opposition_width", 0.06, "rad", 1e-3, 1, "hapke: its half width *h*"),
+    alternatives=((("reflectance",), ("single_scattering_albedo",)),),
 )
 
 RETROREFLECTOR = plugin(

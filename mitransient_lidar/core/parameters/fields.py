@@ -140,7 +140,8 @@ class Parameter:
 class Plugin:
     """Name of a plugin, its parameters in the order of the manual, and those that describe one thing in several ways.
 
-    Each of `alternatives` is a list of the ways, and each way the names of its parameters.
+    Each of `alternatives` is a list of the ways, and each way the names of its parameters; ``(sensor)`` stands for any
+    object of this kind.
     """
 
     name: str

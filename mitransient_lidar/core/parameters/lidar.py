@@ -49,8 +49,10 @@ def divergences(default: float | None, **more: bool) -> tuple[Parameter, Paramet
     )
 
 
-#: They describe one thing.
+#: Ways to give a width of a beam, a place and direction, and a point-spread function.
 DIVERGENCES = tuple((each.name,) for each in divergences(None))
+_PLACE = tuple(each.name for each in ANGLES), ("to_world",)
+_BLURS = ("blur_mrad",), ("blur_file", "blur_file_mrad")
 
 LIDAR_TRANSMITTER = plugin(
     "lidar_transmitter",
@@ -74,7 +76,7 @@ LIDAR_TRANSMITTER = plugin(
     file("pulse_file",
         "Instead: text file with two columns, time [ns] and power (any unit), or in any order and unit of time below a "
         "heading such as ``t [ps], V``"),
-    alternatives=(DIVERGENCES,),
+    alternatives=(DIVERGENCES, _PLACE, (("pulse_fwhm_ns",), ("pulse_file",))),
 )
 
 OPTICS = (
@@ -124,6 +126,12 @@ MULTIPIXEL_RECEIVER = plugin(
     *OPTICS,
     *POSE,
     nested("(nested)", "film", "``time_gated_film``"),
+    alternatives=(
+        _PLACE,
+        _BLURS,
+        (("layout",), ("pixel_map",), ("(sensor)",)),
+        (("field_of_view_mrad",), ("focal_length_mm", "pixel_pitch_um"), ("(sensor)",)),
+    ),
 )
 
 PIXEL_FOV = plugin(
@@ -148,6 +156,7 @@ PIXEL_FOV = plugin(
     text("pixel_name", "", "Name in the result", otherwise="``pixel`` (numbered by ``multipixel_receiver``)"),
     *OPTICS,
     *POSE,
+    alternatives=(_PLACE, _BLURS),
 )
 
 TIME_GATED_FILM = plugin(
@@ -168,4 +177,8 @@ TIME_GATED_FILM = plugin(
         "Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in other units below a "
         "heading that names them"),
     count("pulses", 1, 1, 10**9, "Number of pulses that each gate accumulates"),
+    alternatives=(
+        (("gate_start_ns",), ("gate_start_depth",)),
+        (("gate_width_ns", "gate_rise_ns", "gate_fall_ns"), ("gate_profile",)),
+    ),
 )

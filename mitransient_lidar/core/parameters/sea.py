@@ -79,5 +79,5 @@ OCEAN_SURFACE = plugin(
     *divergences(None, by_id=True),
     nested("(nested)", "bsdf", "Any BSDF instead of the ripples"),
     nested("interior", "medium", "The water: ``layered_water``"),
-    alternatives=(DIVERGENCES,),
+    alternatives=(DIVERGENCES, (("fetch",), ("inverse_wave_age",))),
 )

@@ -274,7 +274,10 @@ def replaced(old, new):
         (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
         (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
         (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
-        (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "translate z = '-$bottom_dept' refers to an unknown parameter"),
+        (
+            replaced('"-$bottom_depth"', '"-$bottom_dept"'),
+            "translate z = '-$bottom_dept' refers to an unknown parameter",
+        ),
         (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
         (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
         (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
