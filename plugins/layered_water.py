@@ -169,19 +169,14 @@ def _column(props: RecordedProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     """
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
-    ways = [name for name in (*WATER_KINDS, "profile") if _is_given(props, name)]
-    own = [name for name in ("layer_tops", *COEFFICIENTS) if name in props]
-    if not ways:
+    way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
+    if way is None:
         values = {name: read(name) for name in COEFFICIENTS}
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
             values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
         return WaterColumn.from_text(layer_tops, **values), np.zeros(1), None
-    way = ways[0]
-    excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
-    if excluded:
-        raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
         return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
     tops = number_list("layer_tops", layer_tops)

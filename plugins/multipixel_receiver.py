@@ -54,14 +54,10 @@ class MultipixelReceiver(ReceiverSensor):
 
 #: Parameters of pixels that are not nested.
 _LENS = ("focal_length_mm", "pixel_pitch_um")
-_OWN = ("layout", "pixel_map", "field_of_view_mrad", "field_of_view_shape", "fill_factor", "imager", *_LENS)
 
 
 def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     """Build the pixels from nested sensors."""
-    for name in _OWN:
-        if name in props:
-            raise UserError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
     if not all(isinstance(pixel, PixelSensor) for pixel in nested):
         raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
@@ -78,14 +74,12 @@ def _own_pixels(props: RecordedProperties) -> PixelArray:
 
     field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
-        only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager", *_LENS)
         return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
     layout, fill_factor, imager = str(props.read("layout")), props.read("fill_factor"), props.read("imager")
     if layout.startswith("hex"):
         only_for("layouts of rows x columns", "field_of_view_shape", "imager", *_LENS)
         return HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
-        only_for("receivers without a focal length", "field_of_view_mrad")
         shape = props.read("field_of_view_shape", "square")
         return LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
     shape = props.read("field_of_view_shape", "circle")

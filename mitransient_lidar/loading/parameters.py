@@ -74,7 +74,7 @@ class ScenePlugin:
         objects = [one for one in children if one.tagName not in _TAGS]
         given = [name for name, one in self.settings.items() if one.value != ""]
         return self.declared.replaced(
-            [*given, *(one.getAttribute("name") for one in objects), *(f"({one.tagName})" for one in objects)]
+            [*given, *(one.getAttribute("name") for one in objects), *(f"a nested {one.tagName}" for one in objects)]
         )
 
     def refer(self, parameter: Parameter, name: str) -> str:

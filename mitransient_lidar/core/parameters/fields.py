@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,8 +140,8 @@ class Parameter:
 class Plugin:
     """Name of a plugin, its parameters in the order of the manual, and those that describe one thing in several ways.
 
-    Each of `alternatives` is a list of the ways, and each way the names of its parameters; ``(sensor)`` stands for any
-    object of this kind.
+    Each of `alternatives` is a list of the ways, and each way the names of its parameters; ``a nested sensor`` stands
+    for an object of this kind.
     """
 
     name: str
@@ -167,6 +167,17 @@ class Plugin:
             for name in way
             if name not in given and name not in chosen
         }
+
+    def check_ways(self, given: Mapping[str, Any]) -> None:
+        """Raise `UserError` if given values describe one thing in several ways."""
+        for ways in self.alternatives:
+            chosen = [next((name for name in way if name in given), "") for way in ways]
+            told = [
+                f"{name} = {given[name]!r}" if isinstance(given[name], (str, int, float)) else name
+                for name in filter(None, chosen)
+            ]
+            if len(told) > 1:
+                raise UserError(f"{self.name}: {' and '.join(told)} describe the same: give one of them")
 
     def reader(self, get: Callable[[str, Any], Any]) -> Read:
         """Return the reader of values that a function (name, default) -> value gives."""

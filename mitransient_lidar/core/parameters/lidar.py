@@ -129,8 +129,9 @@ MULTIPIXEL_RECEIVER = plugin(
     alternatives=(
         _PLACE,
         _BLURS,
-        (("layout",), ("pixel_map",), ("(sensor)",)),
-        (("field_of_view_mrad",), ("focal_length_mm", "pixel_pitch_um"), ("(sensor)",)),
+        (("layout", "fill_factor", "field_of_view_shape", "imager"), ("pixel_map",), ("a nested sensor",)),
+        (("field_of_view_mrad",), ("focal_length_mm", "pixel_pitch_um"), ("a nested sensor",)),
+        (("pixel_map",), ("focal_length_mm", "pixel_pitch_um")),
     ),
 )
 

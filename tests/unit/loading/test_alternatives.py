@@ -60,9 +60,15 @@ def test_each_definition_of_the_divergence_replaces_the_default(name, width):
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"jerlov": "1C", "scattering": 0.1}, "jerlov = '1C' describes the same as scattering: give one of them"),
-        ({"jerlov": "1C", "kd": 0.1}, "jerlov = '1C' describes the same as kd: give one of them"),
-        ({"divergence_mrad": 5, "divergence_1e2_mrad": 9}, "divergence_mrad = 5 and divergence_1e2_mrad = 9 describe"),
+        (
+            {"jerlov": "1C", "scattering": 0.1},
+            "scattering = '0.1' and jerlov = '1C' describe the same: give one of them",
+        ),
+        ({"jerlov": "1C", "kd": 0.1}, "jerlov = '1C' and kd = '0.1' describe the same: give one of them"),
+        (
+            {"divergence_mrad": 5, "divergence_1e2_mrad": 9},
+            "divergence_mrad = '5' and divergence_1e2_mrad = '9' describe",
+        ),
     ],
 )
 def test_two_ways_at_once_are_refused(params, message):
