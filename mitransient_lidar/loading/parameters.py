@@ -174,8 +174,9 @@ def _with_declared(document: SceneDocument, names: Sequence[str]) -> SceneDocume
     for name, former in values.items():
         default = root.ownerDocument.createElement("default")
         default.setAttribute("name", name)
-        default.setAttribute("value", next(filter(None, former), ""))
-        others = root.getElementsByTagName("default")
+        default.setAttribute("value", value := next(filter(None, former), ""))
+        # Before its use, and behind what its value refers to.
+        others = root.getElementsByTagName("default") if "$" in value else []
         root.insertBefore(default, others[-1].nextSibling if others else root.firstChild)
     return replace(document, parameters={**parameters_of(root), **document.parameters})
 

@@ -261,7 +261,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
     import mitsuba as mi
 
     from mitransient_lidar.plugins.bases import exposed
-    from mitransient_lidar.transport.plugin_types import Automatic, Recorded
+    from mitransient_lidar.transport.plugin_types import Recorded
 
     if not isinstance(part, Recorded):
         values, objects = exposed(part)
@@ -275,7 +275,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known = ["type", *(each.name for each in PLUGINS[str(own["type"])] if each.name.isidentifier())]
-    values = part.used_values if isinstance(part, Automatic) else next((two for one, two in used if one is part), {})
+    values = getattr(part, "used_values", None) or next((two for one, two in used if one is part), {})
     chosen = {"used": dict(values)} if values else {}
     return {**dict.fromkeys(known), **plain, **chosen, **_named(objects, origin, used)}
 

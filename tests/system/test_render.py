@@ -271,7 +271,7 @@ def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
     text = catalogue.scene_text("table1")
     for wrong, right, message in (
         ("lidar_transmiter", "lidar_transmitter", "lidar_transmiter"),
-        ('name="pulse_enrgy_mj"  ', 'name="pulse_energy_mj" ', "pulse_enrgy_mj"),
+        ('name="wind_spede"', 'name="wind_speed"', "wind_spede"),
     ):
         assert right in text
         (tmp_path / "wrong.xml").write_text(
