@@ -291,22 +291,7 @@ def _load_xml(
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
-    if unused := [name for name in document.parameters if name not in document.used]:
-        _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, values_of(document), record)
-
-
-def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
-    """Raise `UserError` if the scene lacks the part that the parameters which nothing uses are for."""
-    present = {
-        "sensor": bool(scene.sensors()),
-        "emitter": bool(scene.emitters()),
-        "medium below a sea surface": any(shape.is_medium_transition() for shape in scene.shapes()),
-    }
-    for part, there in present.items():
-        if not there:
-            listed = ", ".join(unused[:4]) + (", ..." if len(unused) > 4 else "")
-            raise UserError(f"{part}: the scene has none, and its parameters {listed} are used by nothing")
 
 
 def _instantiate(parse: Callable[[Any], Any]) -> Any:
