@@ -42,7 +42,7 @@ class ScenePlugin:
     settings
         Attributes that set parameters, by the names of these.
     ids
-        Ids of the plugin and of the objects around it.
+        Ids of the plugin and of the objects around it, and the name of the plugin.
     is_fixed
         Whether its parameters are those of an instrument, and have no names.
     """
@@ -106,7 +106,7 @@ def plugins_of(document: SceneDocument) -> list[ScenePlugin]:
                 ids.append(node.getAttribute("id"))
                 node = node.parentNode
             own, is_fixed = settings.get(id(one.element), {}), bool(document.instrument) and one.value in _LIDAR
-            found.append(ScenePlugin(one.element, PLUGINS[one.value], own, tuple(filter(None, ids)), is_fixed))
+            found.append(ScenePlugin(one.element, PLUGINS[one.value], own, (*filter(None, ids), one.value), is_fixed))
     return found
 
 
@@ -128,7 +128,8 @@ def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocu
     """Return a scene with given values of parameters in place of its own.
 
     These are the scene's own parameters, and those of its plugins: ``wind_speed`` of all plugins that have one, or
-    ``sea.wind_speed`` (in formulas ``sea_wind_speed``) of the one with this id, and of those inside it.
+    ``sea.wind_speed`` (in formulas ``sea_wind_speed``) of the one with this id, and of those inside it, or
+    ``sediment.model`` of all plugins of this name.
 
     Raises
     ------

@@ -50,7 +50,8 @@ class Parameter:
     is_file
         Whether the value is the name of a file.
     by_id
-        Whether its name alone stands for a parameter of other plugins, so that only a name with an id reaches it.
+        Whether its name alone stands for a parameter of other plugins, so that only one with an id or the name of its
+        plugin reaches it.
     otherwise
         What holds without a value where `default` does not say it.
     """
