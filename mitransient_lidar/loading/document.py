@@ -62,7 +62,7 @@ class SceneDocument:
     folder
         Folder that names of files refer to.
     parameters
-        Values of all parameters, as text.
+        Values of its own parameters (``<default>``), as text.
     given
         Those that the user has given.
     instrument

@@ -71,7 +71,7 @@ class SceneRecord:
     is_xml
         Whether the text is XML.
     parameters
-        Parameters of an XML scene with their values as text.
+        Own parameters of an XML scene with their values as text; of a result those that its plugins declare, too.
     files
         Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     instrument
