@@ -154,7 +154,7 @@ def _moved(session, integrator, base, parameter, step):
 def _scale_ripples(scene, factor):
     """Multiply the slope variances of the ripples, which are no parameter of a scene."""
     sea = next(shape for shape in scene.shapes() if shape.id() == "surface")
-    variances = tuple(factor * variance for variance in sea.ripple_variance)
+    variances = tuple(factor * variance for variance in sea.sea.ripple_variance)
     if sea.sea.slope_series is not None:
         sea.bsdf().set_slopes(variances, sea.sea.slope_series)
         return

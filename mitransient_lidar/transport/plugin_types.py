@@ -103,14 +103,10 @@ class WaterMedium(Protocol):
 
 @runtime_checkable
 class SeaShape(Protocol):
-    """The shape ``ocean_surface``: slope variances, lengths [m]."""
+    """The shape ``ocean_surface``."""
 
     sea: sea_surface.SeaSurface
     has_ripples: bool
-    ripple_variance: tuple[float, float]
-    slope_variance: float
-    cell_size: float
-    beam_wave: float
     footprints: Sequence[Footprint] | None
 
     def fit(self, footprints: Sequence[Footprint]) -> bool:

@@ -93,9 +93,9 @@ def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(p
         },
     )
     scene, parameters = opened.scene, opened.parameters
-    (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
-    assert surface.slope_variance == pytest.approx(0.02)
-    assert surface.ripple_variance[0] == surface.ripple_variance[1]
+    (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "sea"))
+    assert surface.sea.slope_variance == pytest.approx(0.02)
+    assert surface.sea.ripple_variance[0] == surface.sea.ripple_variance[1]
     assert surface.interior_medium().water.column.count == 2
     assert parameters["layer_tops"] == "0, 3"
 

@@ -360,7 +360,7 @@ def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
 
 def test_users_bsdf_wins_and_ripples_take_the_waters_index():
     own = scene(sea={**FLAT, "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
-    (surface,) = (s for s in own.shapes() if hasattr(s, "ripple_variance"))
+    (surface,) = (s for s in own.shapes() if hasattr(s, "sea"))
     assert not surface.has_ripples
     water = {"type": "layered_water", "refractive_index": 1.25}
     loaded = scene(sea={**FLAT, "interior": water})
@@ -371,7 +371,7 @@ def test_users_bsdf_wins_and_ripples_take_the_waters_index():
 
 def test_no_wind_is_a_flat_sea():
     (surface,) = (s for s in scene(sea={"type": "ocean_surface", "wind_speed": 0.0,
-                  "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "ripple_variance"))  # fmt: skip
+                  "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "sea"))  # fmt: skip
     assert surface.bbox().max.z == surface.bbox().min.z == 0
     assert surface.sea.spectrum == "flat"
 
