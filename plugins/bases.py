@@ -33,8 +33,8 @@ _OPTICS = tuple(each.name for each in fields(ReceiverOptics))
 class RecordedProperties(mi.Properties):
     """Copy of a plugin's parameters that keeps each value that is read, the default where none is given.
 
-    Parameters whose value may be an empty text are removed where it is: they count as not given. `read` returns
-    values as the plugin declares them.
+    Parameters whose value may be an empty text are removed where it is: they count as not given. Two ways to describe
+    one thing are refused, where ``false`` is none. `read` returns values as the plugin declares them.
     """
 
     def __init__(self, props: mi.Properties, plugin: Plugin) -> None:
@@ -48,6 +48,12 @@ class RecordedProperties(mi.Properties):
         for parameter in plugin:
             if parameter.may_be_empty and parameter.name in self and super().get(parameter.name) == "":
                 del self[parameter.name]
+        ways = {name for several in plugin.alternatives for way in several for name in way}
+        given = {name: super(RecordedProperties, self).get(name) for name in ways.intersection(self.keys())}
+        nested = {"a nested sensor": one for _, one in self.objects(False) if isinstance(one, mi.Sensor)}  # noqa: B035
+        plugin.check_ways({name: one for name, one in {**given, **nested}.items() if str(one).lower() != "false"})
+        for name in given:
+            self.mark_queried(name, False)
 
     @property
     def read(self) -> Read:
@@ -251,11 +257,8 @@ def read_pose(props: RecordedProperties) -> KernelPose:
     if "to_world" not in props:
         pose = KernelPose.from_angles(*(props.get(each.name, each.default) for each in ANGLES))
         return pose.in_frame(props.frame_origin)
-    name = props.plugin_name()
-    if "altitude" in props or "off_nadir_deg" in props:
-        raise UserError(f"{name}: give either to_world or altitude and off_nadir_deg, not both")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64)
-    return KernelPose.from_matrix(f"{name}: to_world", matrix).in_frame(props.frame_origin)
+    return KernelPose.from_matrix(f"{props.plugin_name()}: to_world", matrix).in_frame(props.frame_origin)
 
 
 def _blur(props: RecordedProperties) -> PointSpread | None:
@@ -265,8 +268,6 @@ def _blur(props: RecordedProperties) -> PointSpread | None:
             raise UserError("blur_file_mrad is the size of blur_file, which is missing")
         width = props.read("blur_mrad")
         return GaussianPointSpread(1e-3 * width) if width > 0 else None
-    if "blur_mrad" in props:
-        raise UserError("blur_mrad and blur_file: give one of them, not both")
     if "blur_file_mrad" not in props:
         raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
     path = str(props["blur_file"])

@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.water import LAYERED_WATER
+from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import number_list
 from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.water_types import WATER_KINDS, water_of
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
@@ -24,9 +24,6 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
 from mitransient_lidar.transport.nested_objects import create_object
-
-#: Attenuation, scattering and backscattering.
-_COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
 #: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
@@ -172,19 +169,14 @@ def _column(props: RecordedProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     """
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
-    ways = [name for name in (*WATER_KINDS, "profile") if _is_given(props, name)]
-    own = [name for name in ("layer_tops", *_COEFFICIENTS) if name in props]
-    if not ways:
-        values = {name: read(name) for name in _COEFFICIENTS}
+    way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
+    if way is None:
+        values = {name: read(name) for name in COEFFICIENTS}
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
             values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
         return WaterColumn.from_text(layer_tops, **values), np.zeros(1), None
-    way = ways[0]
-    excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
-    if excluded:
-        raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
         return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
     tops = number_list("layer_tops", layer_tops)

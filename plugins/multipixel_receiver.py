@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER
 from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, register
-from mitransient_lidar.transport.plugin_types import PixelSensor
+from mitransient_lidar.plugins.pixel_fov import PixelFov
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
@@ -52,17 +52,13 @@ class MultipixelReceiver(ReceiverSensor):
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
 
-#: Parameters of pixels that are not nested.
+#: Parameters of a lens.
 _LENS = ("focal_length_mm", "pixel_pitch_um")
-_OWN = ("layout", "pixel_map", "field_of_view_mrad", "field_of_view_shape", "fill_factor", "imager", *_LENS)
 
 
 def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     """Build the pixels from nested sensors."""
-    for name in _OWN:
-        if name in props:
-            raise UserError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
-    if not all(isinstance(pixel, PixelSensor) for pixel in nested):
+    if not all(isinstance(pixel, PixelFov) for pixel in nested):
         raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
     return ShapedPixels([pixel.field for pixel in nested], names)
@@ -70,22 +66,16 @@ def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
 
 def _own_pixels(props: RecordedProperties) -> PixelArray:
     """Build the pixels from a layout or a map."""
-
-    def only_for(kind: str, *names: str) -> None:
-        for name in names:
-            if name in props:
-                raise UserError(f"{name} = {props[name]!r} is for {kind}: leave it out")
-
     field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
-        only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager", *_LENS)
         return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
     layout, fill_factor, imager = str(props.read("layout")), props.read("fill_factor"), props.read("imager")
     if layout.startswith("hex"):
-        only_for("layouts of rows x columns", "field_of_view_shape", "imager", *_LENS)
+        for name in ("field_of_view_shape", "imager", *_LENS):
+            if name in props:
+                raise UserError(f"{name} = {props[name]!r} is for layouts of rows x columns: leave it out")
         return HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
-        only_for("receivers without a focal length", "field_of_view_mrad")
         shape = props.read("field_of_view_shape", "square")
         return LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
     shape = props.read("field_of_view_shape", "circle")

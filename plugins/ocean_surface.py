@@ -121,7 +121,8 @@ class OceanSurface(mi.Mesh):
             return self._values[name]
 
         read = OCEAN_SURFACE.reader(get)
-        self._use(SeaSurface.read(read, is_placeholder=waits))
+        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
+        self.sea = SeaSurface.read(read, is_placeholder=waits)
         #: Resolution of the mesh; None for a level plane in its place.
         self._resolution = None if waits else Resolution.read(read, ())
         children = [child for _, child in props.objects()]
@@ -160,10 +161,10 @@ class OceanSurface(mi.Mesh):
         if resolution == former:
             return False
         unfitted = self._roughness()
-        self._use(SeaSurface.read(read, footprints))
+        self.sea = SeaSurface.read(read, footprints)
         fill_mesh(self, self.sea.mesh(self._frame_origin))
         if self.sea.slope_series is not None:
-            self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)
+            self.bsdf().set_slopes(self.sea.ripple_variance, self.sea.slope_series)
         elif self.has_ripples:
             buffers = mi.traverse(self)
             for axis, alpha, own in zip("uv", self._roughness(), unfitted, strict=True):
@@ -172,16 +173,6 @@ class OceanSurface(mi.Mesh):
                     buffers[name] = alpha
             buffers.update()
         return True
-
-    def _use(self, sea: SeaSurface) -> None:
-        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
-        self.sea = sea
-        #: Slope variances of the ripples along and across the wind, and in total with those of the waves.
-        self.ripple_variance, self.slope_variance = sea.ripple_variance, sea.slope_variance
-        #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
-        self.cell_size = sea.cell_size
-        #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
-        self.beam_wave = sea.beam_wave
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -209,14 +200,14 @@ class OceanSurface(mi.Mesh):
             alpha = (float(np.sqrt(factor)) * value for value in self._roughness())
             roughness = dict(zip(("alpha_u", "alpha_v"), alpha, strict=True))
             return create_object("roughdielectric", distribution="beckmann", **roughness, **indices)
-        along, across = (factor * variance for variance in self.ripple_variance)
+        along, across = (factor * variance for variance in self.sea.ripple_variance)
         return create_object(
             "gram_charlier_dielectric", variance_u=along, variance_v=across, **dataclasses.asdict(series), **indices
         )
 
     def _roughness(self) -> tuple[float, float]:
         """Return Beckmann's alpha of the ripples along and across the wind."""
-        along, across = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
+        along, across = (float(np.sqrt(2 * variance)) for variance in self.sea.ripple_variance)
         return along, across
 
 

@@ -61,11 +61,6 @@ class Sediment(mi.BSDF):
         super().__init__(props)
         particles = _particles(props)
         if "single_scattering_albedo" in props:
-            if "reflectance" in props:
-                raise UserError(
-                    f"reflectance = {props['reflectance']} and single_scattering_albedo = "
-                    f"{props['single_scattering_albedo']} give the same: give one of them"
-                )
             albedo = props.read("single_scattering_albedo")
             #: Reflection (`physics.water.sediments.HapkeSurface`).
             self.surface = particles.of_albedo("single_scattering_albedo", albedo)

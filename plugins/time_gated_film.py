@@ -132,9 +132,6 @@ def _gate_plan(props: RecordedProperties) -> GatePlan | None:
         raise UserError(f"gate_count = {count} gates need either gate_start_ns or gate_start_depth")
     start, pulses = read(starts[0]), read("pulses")
     if "gate_profile" in props:
-        for name in _GATE_SHAPE:
-            if name in given:
-                raise UserError(f"{name} = {props[name]:g} and gate_profile: give one of them")
         profile = GateShape.from_file(str(props["gate_profile"]))
         step = read("gate_step_ns", profile.width_ns)
         train = GateTrain.measured(profile, 0.0, step, count, pulses)

@@ -36,7 +36,7 @@ CASES = {
         {**LEVEL, "attenuation": 1.5, "scattering": 1.2, "backscattering": 0.03, "bottom_depth": 4},
     ),
     "absorbing": ("table1", {**LEVEL, "attenuation": 1.0, "scattering": 0.2, "bottom_depth": 4}),
-    "hg": ("table1", {**LEVEL, "phase": "hg", "phase_g": 0.9, "backscattering": 0}),
+    "hg": ("table1", {**LEVEL, "phase_function": "hg", "phase_g": 0.9, "backscattering": 0}),
     "waves": ("table1", WAVES, ["attenuation", "scattering", "backscattering", "bottom_reflectance"]),
     "ripples": ("table1", {**WAVES, "ripple_focusing": "false"}, ["divergence_mrad", "ripple_variance"]),
     "skewed": (
@@ -154,7 +154,7 @@ def _moved(session, integrator, base, parameter, step):
 def _scale_ripples(scene, factor):
     """Multiply the slope variances of the ripples, which are no parameter of a scene."""
     sea = next(shape for shape in scene.shapes() if shape.id() == "surface")
-    variances = tuple(factor * variance for variance in sea.ripple_variance)
+    variances = tuple(factor * variance for variance in sea.sea.ripple_variance)
     if sea.sea.slope_series is not None:
         sea.bsdf().set_slopes(variances, sea.sea.slope_series)
         return

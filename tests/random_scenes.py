@@ -71,7 +71,7 @@ def draw(number, narrow=False):
         "attenuation": attenuation,
         "scattering": scattering,
         "backscattering": round(scattering * between(0.01, 0.05), 6),
-        "phase": str(rng.choice(["fournier_forand", "petzold", "hg"])),
+        "phase_function": str(rng.choice(["fournier_forand", "petzold", "hg"])),
         "phase_g": round(rng.uniform(0.5, 0.95), 3),
         "bottom_depth": depth,
         "bottom_reflectance": round(rng.uniform(0.0, 0.5), 2),

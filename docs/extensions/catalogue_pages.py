@@ -15,8 +15,9 @@ from mitransient_lidar.loading.document import read_document
 _SCENES = """\
 # Scenes
 
-Shipped scenes, by name: `mitransient-lidar render NAME`, or `mitransient_lidar.render("NAME")`. Every parameter is set
-by `-D name=value` for one run. `scenes copy NAME` writes a scene as one file to edit.
+Shipped scenes, by name: `mitransient-lidar render NAME`, or `mitransient_lidar.render("NAME")`. Every parameter of
+a scene and of its plugins is set by `-D name=value` for one run; the pages list those of the scene.
+`scenes copy NAME` writes a scene as one file to edit.
 """
 
 _INSTRUMENTS = """\

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -16,9 +14,10 @@ from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.loading.catalogue import scene_path
-from mitransient_lidar.loading.document import read_document
+from mitransient_lidar.loading.document import SceneDocument, read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
+from mitransient_lidar.loading.parameters import check_known, values_of
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import open_scene, read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -137,12 +136,12 @@ class RunRenderer:
             If the scene cannot be loaded, or lacks a parameter that the campaign sets.
         """
         record = record_of(campaign)
-        _check_parameters(campaign, columns, record.parameters)
+        _check_parameters(campaign, columns, record.document())
         return cls(campaign, record, cls(campaign, record)._longest_record(columns))
 
     def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters of a run that are its own: those of the table, and the random sea."""
-        if _SEA in values or _SEA in self.campaign.fixed or _SEA not in self.scene.parameters:
+        if _SEA in values or _SEA in self.campaign.fixed or _SEA not in self.scene.values:
             return dict(values)
         return {**values, _SEA: int(self._random(number).integers(1, _SEAS))}
 
@@ -154,7 +153,7 @@ class RunRenderer:
         UserError
             If the scene refuses the parameters, or the light does not fit the record.
         """
-        campaign, known = self.campaign, self.scene.parameters
+        campaign, known = self.campaign, self.scene.values
         params = {**campaign.fixed, **self.inputs(number, values)}
         random = self._random(number)
         random.integers(1, _SEAS)
@@ -337,16 +336,13 @@ def check_names(campaign: Campaign) -> None:
     document = read_document(scene_path(campaign.scene))
     if campaign.instrument is not None:
         document = mount(campaign.instrument, document)
-    _check_parameters(campaign, campaign.parameters, document.parameters)
+    _check_parameters(campaign, campaign.parameters, document)
 
 
-def _check_parameters(campaign: Campaign, columns: Collection[str], known: Collection[str]) -> None:
+def _check_parameters(campaign: Campaign, columns: Collection[str], document: SceneDocument) -> None:
     """Raise `UserError` for parameters that the scene does not have, or that may not vary."""
-    for name in itertools.chain(campaign.fixed, columns):
-        if name not in known:
-            close = difflib.get_close_matches(str(name), sorted(known), n=3)
-            hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known))}"
-            raise UserError(f"parameter {name!r} is not one of scene {campaign.scene}: {hint}")
+    known = values_of(document)
+    check_known([*campaign.fixed, *columns], known, document)
     for name in ("time_start_ns", "bin_width_ns", "bin_count"):
         if name in columns:
             raise UserError(f"parameter {name!r} must be the same in all runs, which share a record: set it in [fixed]")

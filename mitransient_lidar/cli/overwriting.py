@@ -143,7 +143,7 @@ class _Running:
         elif scene is not None:
             from mitransient_lidar.loading.catalogue import scene_parameters
 
-            known = scene_parameters(scene)
+            known = {name: value for name, value in scene_parameters(scene).items() if value}
         return {**known, **parameters(self._given.get("define"))}
 
     def objection(self, path: Path) -> str | None:

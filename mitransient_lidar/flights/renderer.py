@@ -332,7 +332,7 @@ def scene_of(plan: FlightPlan) -> SceneRecord:
     """
     record = read_record(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
     for name in POSE_PARAMETERS:
-        if name not in record.parameters:
+        if name not in record.values:
             raise UserError(f"scene {plan.scene} has no parameter {name}, which the flight sets")
     return record
 

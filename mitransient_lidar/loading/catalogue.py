@@ -15,6 +15,7 @@ from pathlib import Path
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text, replacing, together
 from mitransient_lidar.loading.document import read_document
+from mitransient_lidar.loading.parameters import values_of
 
 
 def scene_names() -> list[str]:
@@ -58,12 +59,13 @@ def scene_summary(name: str | os.PathLike[str]) -> str:
     return comment.strip().partition("\n")[0].strip() if end else ""
 
 
-def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
-    """Return names and default values of the parameters (``<default>`` tags) of a scene, in the order of `scene_text`.
+def scene_parameters(name: str | os.PathLike[str], *, by_id: bool = False) -> dict[str, str]:
+    """Return names and values of the parameters of a scene: its own (``<default>`` tags), and those of its plugins.
 
-    Name and errors as in `scene_text`.
+    Values are texts, empty for those without one. With `by_id`, those of plugins have their names with ids, too. Name
+    and errors as in `scene_text`.
     """
-    return dict(read_document(scene_path(name)).parameters)
+    return values_of(read_document(scene_path(name)), by_id=by_id)
 
 
 def copy_scene(

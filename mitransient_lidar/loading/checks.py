@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.dom import minidom
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.catalogue import limits
+from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, limits
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, is_number, shown
 from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
@@ -55,11 +54,11 @@ _NUMBERS = {
     "lookat": ("origin", "target", "up"),
     "look_at": ("origin", "target", "up"),
     "matrix": ("value",),
+    "spectrum": ("value",),
+    "rgb": ("value",),
 }
 #: Rule of spectra, which Mitsuba would replace by their luminance.
 _AT_ONE_WAVELENGTH = "must be one number, the value at the laser's wavelength: others would be averaged by colour"
-#: Parameters of BSDFs that are shares of the light.
-_SHARE = re.compile(r"(^|_)(reflectance|transmittance)$")
 
 
 def check(document: SceneDocument) -> None:
@@ -69,8 +68,8 @@ def check(document: SceneDocument) -> None:
     ------
     UserError
         If the root is no scene; a type is not the name of a plugin; a library of plugins lies where `check_libraries`
-        forbids it, in a folder of `document.folders`; a number is not finite or not a number, a share of light is not
-        within 0 to 1, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
+        forbids it, in a folder of `document.folders`; a number is not finite, not a number or out of its declared
+        range, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
     """
     root = document.root
     if root.tagName != "scene" or root.getAttribute("type") not in ("", "scene"):
@@ -95,17 +94,12 @@ def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
     label = _Label(first[0] if first else own, parameters[first[0]] if first else setting.template, setting.template)
     if attribute in _NUMBERS.get(element.tagName, ()):
         _check_numbers(label, element.tagName, attribute, value)
-    elif element.tagName in ("spectrum", "rgb") and attribute == "value":
-        _check_spectrum(label, value)
     elif element.tagName == "spectrum" and attribute == "filename":
         raise label.refusal(_AT_ONE_WAVELENGTH)
-    if attribute == "value" and element.tagName in ("float", "integer", "string"):
+    if attribute == "value" and element.tagName in ("float", "integer", "string", "spectrum", "rgb"):
         parent: Any = element.parentNode
-        for number in _numbers_in(value):
-            _check_range(label.name, owner, parent.getAttribute("type"), number)
-    if attribute == "value" and _is_share(element):
-        for word in re.split(r"[\s,]+", value.strip()):
-            in_range(label.name, word, 0, 1)
+        given = float(value) if element.tagName in ("float", "integer") else value
+        _check_value(label.name, owner, parent.getAttribute("type"), given)
 
 
 def check_type(plugin: object) -> None:
@@ -165,20 +159,18 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                 check_type(value)
             if isinstance(value, Mapping):
                 pending.append((f"{label}.", value, depth + 1))
-                given = value.get("filename", value.get("value", 0.0))
-                if value.get("type") == "spectrum" and not _is_plain(given):
+                given = value.get("filename", value.get("value", ()))
+                numbers = given if isinstance(given, (list, tuple)) else [given]
+                if all(isinstance(one, (int, float)) for one in numbers):
+                    _check_value(label, key, str(part.get("type")), numbers)
+                elif value.get("type") == "spectrum":
                     raise UserError(f"{label} = {shown(given)} {_AT_ONE_WAVELENGTH}")
-                if _SHARE.search(key) and _is_plain(value.get("value")):
-                    _check_shares(label, value["value"])
             elif value is None or isinstance(value, (complex, bytes)):
                 raise UserError(f"{label} = {shown(value)} must be a number, a text, a transform or an object")
-            elif isinstance(value, (int, float, str)) and not isinstance(value, bool):
+            elif isinstance(value, (int, float, str, list, tuple)) and not isinstance(value, bool):
                 if isinstance(value, float):
                     finite(label, value)
-                for number in _numbers_in(str(value)):
-                    _check_range(label, key, str(part.get("type")), number)
-                if _SHARE.search(key):
-                    _check_shares(label, value)
+                _check_value(label, key, str(part.get("type")), value)
             elif is_transform(value):
                 _check_matrix(label, matrix_of(value.matrix))
 
@@ -197,11 +189,16 @@ class _Label:
 
 
 def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
-    """Check the numbers of one attribute."""
+    """Check the numbers of one attribute; a colour may be ``#rrggbb``."""
     words = value.replace(",", " ").split()
     if not words:
         raise label.refusal("is empty: it must be a number")
     for word in words:
+        if tag in ("spectrum", "rgb"):
+            if ":" in word:
+                raise label.refusal(_AT_ONE_WAVELENGTH)
+            if word.startswith("#"):
+                continue
         if not is_number(word):
             if is_number(label.value) and float(label.value) < 0:
                 raise label.refusal(f"must not be negative: the scene uses it as {label.text}")
@@ -222,46 +219,14 @@ def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
         raise label.refusal("must be one number")
 
 
-def _check_spectrum(label: _Label, value: str) -> None:
-    """Check a spectrum, one number, or a colour, three numbers or ``#rrggbb``."""
-    for number in value.replace(",", " ").split() or [""]:
-        if ":" in number:
-            raise label.refusal(_AT_ONE_WAVELENGTH)
-        if not number.startswith("#") and not is_number(number):
-            raise label.refusal("must be a number")
-        if is_number(number) and not np.isfinite(float(number)):
-            raise label.refusal("must be finite")
-
-
-def _is_share(element: minidom.Element) -> bool:
-    """Return whether an element is a reflectance or transmittance of a BSDF, but not a colour as ``#rrggbb``."""
-    parent: Any = element.parentNode
-    numeric = element.tagName in ("float", "spectrum", "rgb") and not element.getAttribute("value").startswith("#")
-    return numeric and parent.tagName == "bsdf" and _SHARE.search(element.getAttribute("name")) is not None
-
-
-def _is_plain(value: object) -> bool:
-    """Return whether a value of a spectrum is a number or a list of numbers."""
-    return isinstance(value, (int, float)) or (
-        isinstance(value, (list, tuple)) and all(isinstance(item, (int, float)) for item in value)
-    )
-
-
-def _numbers_in(text: str) -> list[float]:
-    """Return the numbers of a text that holds nothing else, empty for other texts."""
-    words = text.replace(",", " ").split()
-    return [float(word) for word in words] if all(map(is_number, words)) else []
-
-
-def _check_range(label: str, name: str, plugin: str, number: float) -> None:
-    """Check a number against the range of the parameter `name` of a plugin."""
-    if found := limits(name, plugin):
-        in_range(label, number, *found)
-
-
-def _check_shares(label: str, values: Any) -> None:
-    for value in values if isinstance(values, (list, tuple)) else [values]:
-        in_range(label, value, 0, 1)
+def _check_value(label: str, name: str, plugin: str, value: Any) -> None:
+    """Check a value, the numbers of a list, or those of a text that holds nothing else, as a plugin declares them."""
+    if name in FILE_PARAMETERS and isinstance(value, (int, float)):
+        raise UserError(f"{label} = {value} must be a text, the name of a file")
+    numbers = value if isinstance(value, (list, tuple)) else str(value).replace(",", " ").split()
+    if (found := limits(name, plugin)) and all(is_number(str(one)) for one in numbers):
+        for number in numbers:
+            in_range(label, number, *found)
 
 
 def is_transform(value: object) -> bool:

@@ -62,7 +62,7 @@ class SceneDocument:
     folder
         Folder that names of files refer to.
     parameters
-        Values of all parameters, as text.
+        Values of its own parameters (``<default>``), as text.
     given
         Those that the user has given.
     instrument
@@ -208,26 +208,16 @@ def drop_line(element: minidom.Element) -> None:
 
 
 def _drop_repeated(root: minidom.Element) -> None:
-    """Leave one ``<default>`` of each parameter, with its first value, which Mitsuba uses, and its first comment.
-
-    It is the last one, or where a value refers to another parameter, which must be known before, the first one.
-    """
-    values, kept = parameters_of(root), dict[str, minidom.Element]()
-    defaults = list(root.getElementsByTagName("default"))
-    in_order = any("$" in value for value in values.values())
-    for default in defaults if in_order else reversed(defaults):
-        name = default.getAttribute("name")
-        if (one := kept.setdefault(name, default)) is default:
-            default.setAttribute("value", values[name])
-            continue
-        comment, own = comment_on_line(default), comment_on_line(one)
-        drop_line(default)
-        if comment is not None and own is None:
-            parent: Any = one.parentNode
-            for node in (comment, parent.ownerDocument.createTextNode("  ")):
-                parent.insertBefore(node, one.nextSibling)
-        elif comment is not None and own is not None and not in_order:
-            own.data = comment.data
+    """Leave the first ``<default>`` of each parameter, whose value Mitsuba uses, with the first comment on its line."""
+    kept: dict[str, minidom.Element] = {}
+    for default in list(root.getElementsByTagName("default")):
+        if (first := kept.setdefault(default.getAttribute("name"), default)) is not default:
+            comment = comment_on_line(default)
+            drop_line(default)
+            if comment is not None and comment_on_line(first) is None:
+                parent: Any = first.parentNode
+                for node in (comment, parent.ownerDocument.createTextNode("  ")):
+                    parent.insertBefore(node, first.nextSibling)
 
 
 def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
@@ -265,7 +255,7 @@ def text_of(root: minidom.Element) -> str:
     """Return the text of a scene, with the comments above it, and single blank lines."""
     assert root.parentNode is not None
     head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
-    return re.sub(r"[ \t]*\n(?:[ \t]*\n)+", "\n\n", "\n".join([*head, _written(root), ""]))
+    return re.sub(r"\n{3,}", "\n\n", re.sub(r"[ \t]+\n", "\n", "\n".join([*head, _written(root), ""])))
 
 
 def _written(node: minidom.Node, values: Mapping[int, Mapping[str, str]] | None = None) -> str:

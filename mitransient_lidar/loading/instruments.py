@@ -27,11 +27,11 @@ from mitransient_lidar.loading.document import (
     read_document,
     text_of,
 )
-from mitransient_lidar.loading.parameters import without_alternatives
+from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
 _RECORD = ("time_start_ns", "bin_count")
-_SEA = ("surface_refined_size", "surface_cell_size", "surface_shortest_wave")
+_SEA = ("refined_size", "cell_size", "shortest_wave")
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Instrument:
 
 def instrument_names() -> list[str]:
     """Return the names of the instruments in alphabetical order."""
-    return sorted(path.stem for path in _folder().glob("*.xml"))
+    return sorted(path.stem for path in _folder().glob("[!_]*.xml"))
 
 
 def read_instrument(name: str) -> Instrument:
@@ -117,10 +117,11 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     own, part = _own_part(path), read_document(path).root
     scene = scene.copied()
     root = scene.root
-    shared = parameters_of(part)
-    former = parameters_of(root)
-    values = {record: shared[record] for record in _RECORD}
-    values |= {size: "auto" for size in _SEA if size in former} | parameters_of(own)
+    shared, former = parameters_of(part), values_of(scene)
+    values = {record: shared[record] for record in _RECORD} | parameters_of(own)
+    for plugin in plugins_of(scene):
+        for size in {*_SEA} & plugin.settings.keys() if plugin.declared.name == "ocean_surface" else ():
+            drop_line(plugin.settings[size].element)
     films = [tag for tag in root.getElementsByTagName("film") if tag.getAttribute("type") == "time_gated_film"]
     for child in list(root.childNodes):
         if isinstance(child, minidom.Element) and (
@@ -147,9 +148,15 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     for child in list(part.childNodes):
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
             root.appendChild(child)
+    scene = replace(scene, parameters=parameters_of(root) | values, instrument=name)
+    for plugin in plugins_of(scene):
+        for parameter, names in plugin.names():
+            # Water and bottom are those at the laser's wavelength.
+            if parameter.name in names and parameter.name in values and parameter.name not in plugin.settings:
+                plugin.refer(parameter, parameter.name)
     _drop_unused(root)
-    known = {key: scene.parameters.get(key, value) for key, value in parameters_of(root).items()} | values
-    return replace(scene, parameters=without_alternatives(known, values), instrument=name)
+    known = {key: former.get(key, value) for key, value in parameters_of(root).items()} | values
+    return without_replaced(replace(scene, parameters=known), values)
 
 
 def _own_part(path: Path) -> minidom.Element:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 from xml.dom import minidom
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.catalogue import PLUGINS
-from mitransient_lidar.core.parameters.fields import Parameter
+from mitransient_lidar.core.parameters.catalogue import PLUGINS, declared
+from mitransient_lidar.core.parameters.fields import Parameter, Plugin
 from mitransient_lidar.core.validation import finite, is_number, shown
-from mitransient_lidar.loading.document import SceneDocument, parameters_of
+from mitransient_lidar.loading.document import SceneDocument, Setting, drop_line, parameters_of
 
 #: Plugins of Mitsuba that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
@@ -25,106 +26,182 @@ _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "dif
 _TAGS = ("float", "integer", "boolean", "string")
 
 #: Plugins that an instrument brings.
-_LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov", "time_gated_film")
+_LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
 
-_COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
-#: Parameters of scenes that describe the same thing in several ways.
-_ALTERNATIVES: tuple[tuple[tuple[str, ...], ...], ...] = (
-    (("divergence_mrad",), ("divergence_fwhm_mrad",), ("divergence_1e2_mrad",)),
-    (_COEFFICIENTS, ("jerlov",), ("chlorophyll",), ("kd",), ("secchi",), ("petzold",), ("pure",), ("profile",)),
-    (("layer_tops",), ("profile",)),
-)
+@dataclass(frozen=True)
+class ScenePlugin:
+    """A plugin of this package in a scene.
+
+    Attributes
+    ----------
+    element
+        Element of the plugin.
+    declared
+        Declaration of its parameters.
+    settings
+        Attributes that set parameters, by the names of these.
+    ids
+        Ids of the plugin and of the objects around it, and the name of the plugin.
+    is_fixed
+        Whether its parameters are those of an instrument, and have no names.
+    """
+
+    element: minidom.Element
+    declared: Plugin
+    settings: Mapping[str, Setting]
+    ids: tuple[str, ...]
+    is_fixed: bool
+
+    def names(self) -> Iterator[tuple[Parameter, list[str]]]:
+        """Yield the parameters with their names: their own, unless it stands for others, and behind an id."""
+        prefixes = [f"{one}{end}" for one in self.ids for end in "._"]
+        for one in () if self.is_fixed else self.declared:
+            if one.kind in _TAGS:
+                yield one, [f"{prefix}{one.name}" for prefix in (prefixes if one.by_id else ["", *prefixes])]
+
+    def value(self, parameter: Parameter) -> str:
+        """Return the value of a parameter as text, with parameters of the scene in place; empty without one."""
+        setting = self.settings.get(parameter.name)
+        if setting is not None and setting.value != "":
+            return setting.value
+        return "" if parameter.name in self._replaced else parameter.text
+
+    @cached_property
+    def _replaced(self) -> set[str]:
+        """Names of parameters that others describe, which are given: values, or objects by their names and kinds."""
+        children = [one for one in self.element.childNodes if isinstance(one, minidom.Element)]
+        objects = [one for one in children if one.tagName not in _TAGS]
+        given = [name for name, one in self.settings.items() if one.value != ""]
+        return self.declared.replaced(
+            [*given, *(one.getAttribute("name") for one in objects), *(f"a nested {one.tagName}" for one in objects)]
+        )
+
+    def refer(self, parameter: Parameter, name: str) -> str:
+        """Take a parameter from that of the scene with a name; return the text of the value that it had."""
+        setting, document = self.settings.get(parameter.name), self.element.ownerDocument
+        assert document is not None
+        element = document.createElement(parameter.tag)
+        element.setAttribute("name", parameter.name)
+        element.setAttribute("value", f"${name}")
+        if setting is None:
+            self.element.appendChild(element)
+            return parameter.text
+        self.element.replaceChild(element, setting.element)
+        return setting.template
+
+
+def plugins_of(document: SceneDocument) -> list[ScenePlugin]:
+    """Return the plugins of this package in a scene."""
+    settings: dict[int, dict[str, Setting]] = {}
+    for one in document.settings:
+        if one.attribute == "value" and one.element.tagName in _TAGS:
+            settings.setdefault(id(one.element.parentNode), {})[one.owner] = one
+    found = []
+    for one in document.settings:
+        if one.attribute == "type" and one.value in PLUGINS:
+            ids: list[str] = []
+            node: Any = one.element
+            while isinstance(node, minidom.Element):
+                ids.append(node.getAttribute("id"))
+                node = node.parentNode
+            own, is_fixed = settings.get(id(one.element), {}), bool(document.instrument) and one.value in _LIDAR
+            found.append(ScenePlugin(one.element, PLUGINS[one.value], own, (*filter(None, ids), one.value), is_fixed))
+    return found
+
+
+def values_of(document: SceneDocument, *, by_id: bool = True) -> dict[str, str]:
+    """Return the values of all parameters of a scene as text: its own, and those that its plugins declare.
+
+    They are empty for those without a value, and have names with ids, too, unless `by_id` is false.
+    """
+    found: dict[str, str] = {}
+    for plugin in plugins_of(document):
+        for parameter, names in plugin.names():
+            value = plugin.value(parameter)
+            for name in names if by_id else {parameter.name}.intersection(names):
+                found[name] = found.get(name) or value
+    return {**document.parameters, **{name: found[name] for name in found if name not in document.parameters}}
 
 
 def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocument:
     """Return a scene with given values of parameters in place of its own.
 
     These are the scene's own parameters, and those of its plugins: ``wind_speed`` of all plugins that have one, or
-    ``sea.wind_speed`` of the one with this id.
+    ``sea.wind_speed`` (in formulas ``sea_wind_speed``) of the one with this id, and of those inside it, or
+    ``sediment.model`` of all plugins of this name.
 
     Raises
     ------
     UserError
         If the scene has no such parameter or uses it nowhere, or a value is empty or of another type.
     """
-    scene = f"{document.name} with instrument {document.instrument}" if document.instrument else document.name
-    document = _with_declared(document, [name for name in params or {} if name not in document.parameters])
-    known, given = document.parameters, {}
-    for name, value in (params or {}).items():
-        if name not in known:
-            declared = {one.name for part in _own_plugins(document) for one in PLUGINS[part.getAttribute("type")]}
-            hint = _closest(name, known, declared)
-            raise UserError(f"parameter {name!r} is not one of scene {scene}: {hint}")
-        given[name] = _text(name, value)
-        if not given[name].strip() and known[name].strip():
-            raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {known[name]}")
-    filled = replace(document, parameters={**without_alternatives(known, given), **given}, given=given)
+    if not params:
+        return document
+    known = values_of(document)
+    check_known(params, known, document)
+    given = {name: _text(name, value) for name, value in params.items()}
+    for name, value in given.items():
+        if not value.strip() and known[name].strip():
+            raise UserError(f"{name} = {value!r} is empty: it must have a value, as {known[name]}")
+    document = _with_declared(document, [name for name in given if name not in document.parameters])
+    filled = without_replaced(replace(document, parameters={**document.parameters, **given}, given=given), given)
     if unused := [name for name in given if name not in filled.used]:
         raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {document.name}")
     return filled
 
 
+def check_known(names: Iterable[object], known: Collection[str], document: SceneDocument) -> None:
+    """Raise `UserError` for a name that is not among the known parameters of a scene."""
+    scene = f"{document.name} with instrument {document.instrument}" if document.instrument else document.name
+    for name in names:
+        if name not in known:
+            hint = _closest(name, known, document.parameters)
+            raise UserError(f"parameter {name!r} is not one of scene {scene}: {hint}")
+
+
 def _with_declared(document: SceneDocument, names: Sequence[str]) -> SceneDocument:
     """Return a scene that has parameters of its plugins as its own, with the values that they have."""
-    if not any(_declared(element, name) for element in _own_plugins(document) for name in names):
+    if not names:
         return document
-    found = document.copied()
-    for name in names:
-        chosen = [(element, one) for element in _own_plugins(found) if (one := _declared(element, name)) is not None]
-        values = [_refer(element, one, name) for element, one in chosen]
-        if chosen:
-            root: Any = found.root
-            default = root.ownerDocument.createElement("default")
-            default.setAttribute("name", name)
-            default.setAttribute("value", next((value for value in values if value), ""))
-            others = root.getElementsByTagName("default")
-            root.insertBefore(default, others[-1].nextSibling if others else root.firstChild)
-            found = replace(found, parameters={**document.parameters, **parameters_of(found.root)})
-    return found
+    document = document.copied()
+    root: Any = document.root
+    values: dict[str, list[str]] = {name: [] for name in names}
+    for plugin in plugins_of(document):
+        for parameter, known in plugin.names():
+            # The name with an id is for its plugin alone.
+            if chosen := max(set(known).intersection(names), key=len, default=None):
+                values[chosen].append(plugin.refer(parameter, chosen))
+    for name, former in values.items():
+        default = root.ownerDocument.createElement("default")
+        default.setAttribute("name", name)
+        default.setAttribute("value", value := next(filter(None, former), ""))
+        # Before its use, and behind what its value refers to.
+        others = root.getElementsByTagName("default") if "$" in value else []
+        root.insertBefore(default, others[-1].nextSibling if others else root.firstChild)
+    return replace(document, parameters={**parameters_of(root), **document.parameters})
 
 
-def _own_plugins(document: SceneDocument) -> list[minidom.Element]:
-    """Return the elements of a scene that are plugins of this package; the lidar of an instrument is as it is."""
-    fixed = _LIDAR if document.instrument else ()
-    types = [one for one in document.settings if one.attribute == "type"]
-    return [one.element for one in types if one.value in PLUGINS and one.value not in fixed]
+def without_replaced(document: SceneDocument, given: Mapping[str, str]) -> SceneDocument:
+    """Return a scene without values in place of which given ones describe the same; plugins refuse two of them.
 
-
-def _declared(element: minidom.Element, name: str) -> Parameter | None:
-    """Return the parameter of a plugin that a name, or an id and a name, stands for."""
-    part, _, own = str(name).rpartition(".")
-    if part and part != element.getAttribute("id"):
-        return None
-    plugin = PLUGINS.get(element.getAttribute("type"), ())
-    return next((one for one in plugin if one.name == own and one.kind in _TAGS), None)
-
-
-def _refer(element: minidom.Element, parameter: Parameter, name: str) -> str:
-    """Make a plugin take a parameter from that of the scene with a name; return the value that it had."""
-    settings = [one for one in element.childNodes if isinstance(one, minidom.Element) and one.tagName in _TAGS]
-    setting = next((one for one in settings if one.getAttribute("name") == parameter.name), None)
-    if setting is None:
-        assert element.ownerDocument is not None
-        setting = element.ownerDocument.createElement(parameter.kind)
-        setting.setAttribute("name", parameter.name)
-        setting.setAttribute("value", "" if parameter.default is None else _text(parameter.name, parameter.default))
-        element.appendChild(setting)
-    value = setting.getAttribute("value")
-    setting.setAttribute("value", f"${name}")
-    return value
-
-
-def without_alternatives(parameters: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
-    """Return parameters of a scene with empty values where given ones replace them; plugins refuse two of them."""
-    kept = dict(parameters)
-    names = {name for name, value in given.items() if value != ""}
-    for alternatives in _ALTERNATIVES:
-        for chosen in alternatives:
-            if not names.isdisjoint(chosen):
-                others = {name for one in alternatives for name in one} - names - set(chosen)
-                kept |= {name: "" for name in others if name in kept}
-    return kept
+    Parameters of the scene that set such values are empty.
+    """
+    replaced: list[Setting] = []
+    for plugin in plugins_of(document):
+        set_by = {name: one for name, one in plugin.settings.items() if one.value != ""}
+        chosen = [name for name, one in set_by.items() if not set(given).isdisjoint(one.referred)]
+        replaced += [set_by[name] for name in plugin.declared.replaced(chosen) & set_by.keys()]
+    emptied = {name: "" for one in replaced for name in one.referred}
+    document = replace(document, parameters={**document.parameters, **emptied})
+    literal = [one.element for one in replaced if not one.referred]
+    if literal:
+        former = document.root.getElementsByTagName("*")
+        document = document.copied()
+        for one, copy in zip(former, document.root.getElementsByTagName("*"), strict=True):
+            if any(one is each for each in literal):
+                drop_line(copy)
+    return document
 
 
 def unknown_parameters(message: str) -> str | None:
@@ -188,7 +265,7 @@ def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
     if not words or not all(is_number(word) for word in words):
         raise UserError(f"parameter {name} = {shown(text)} is not a number")
     layers = len(parameters.get("layer_tops", "").replace(",", " ").split())
-    if known in (*_COEFFICIENTS, "water_scattering") and len(words) == 1 and index is not None:
+    if len(words) == 1 and index is not None and any(one.is_list for one in declared(known)):
         words *= max(layers, 1)
     if index is None and len(words) > 1:
         last = f"{name}[{len(words) - 1}]"
@@ -199,10 +276,13 @@ def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
     return words, number
 
 
-def _closest(name: object, known: Mapping[str, str], others: Collection[str] = ()) -> str:
-    """Return what to say of an unknown name: the names that are close to it, or all known ones."""
-    close = difflib.get_close_matches(str(name), [*known, *others], n=3)
-    return f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known)) or 'none'}"
+def _closest(name: object, known: Collection[str], own: Collection[str] = ()) -> str:
+    """Return what to say of an unknown name: known ones that are close to it or longer, or the scene's own, if any."""
+    alike = [one for one in known if ("." in one) == ("." in str(name))]
+    longer = [one for one in alike if one.startswith(f"{name}_")]
+    close = list(dict.fromkeys([*difflib.get_close_matches(str(name), alike, n=3), *longer[:3]]))
+    listed = [*sorted(own), "the parameters of its plugins"] if len(own) < len(known) and own else sorted(known)
+    return f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(listed) or 'none'}"
 
 
 def check_params(params: object) -> None:

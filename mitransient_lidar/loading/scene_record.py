@@ -3,7 +3,8 @@
 A result has these attributes:
 
 ``scene_xml``
-    Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters.
+    Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters,
+    and of those that its plugins declare.
 ``scene_dict``
     Instead, a scene given as a dict, as JSON (`scene_json`).
 ``instrument``
@@ -29,6 +30,7 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +45,7 @@ from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_f
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.mesh_files import GRID_PLUGINS, PLY_PLUGINS, check_grid, check_ply
+from mitransient_lidar.loading.parameters import values_of
 from mitransient_lidar.loading.scene_json import from_json, to_json
 
 if TYPE_CHECKING:
@@ -68,7 +71,7 @@ class SceneRecord:
     is_xml
         Whether the text is XML.
     parameters
-        Parameters of an XML scene with their values as text.
+        Own parameters of an XML scene with their values as text; of a result those that its plugins declare, too.
     files
         Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     instrument
@@ -152,9 +155,16 @@ class SceneRecord:
             )
         return cls(name, attributes[kind], kinds[0] == "xml", parameters, files, instrument, sensor)
 
+    @cached_property
+    def values(self) -> dict[str, str]:
+        """Values of all parameters of an XML scene as text: its own and those that its plugins declare."""
+        return values_of(self.document()) if self.is_xml else {}
+
     def attributes(self) -> dict[str, str]:
         """Return the attributes of a result from which `from_attributes` returns this record."""
-        described = {f"scene.{name}": value for name, value in self.parameters.items()}
+        values = values_of(self.document(), by_id=False) if self.is_xml else {}
+        given = {**{name: value for name, value in values.items() if value}, **self.parameters}
+        described = {f"scene.{name}": value for name, value in given.items()}
         described["scene_xml" if self.is_xml else "scene_dict"] = self.text
         described |= {name: one for name in ("instrument", "sensor") if (one := getattr(self, name))}
         if self.files:
@@ -251,7 +261,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
     import mitsuba as mi
 
     from mitransient_lidar.plugins.bases import exposed
-    from mitransient_lidar.transport.plugin_types import Automatic, Recorded
+    from mitransient_lidar.transport.plugin_types import Recorded
 
     if not isinstance(part, Recorded):
         values, objects = exposed(part)
@@ -265,7 +275,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known = ["type", *(each.name for each in PLUGINS[str(own["type"])] if each.name.isidentifier())]
-    values = part.used_values if isinstance(part, Automatic) else next((two for one, two in used if one is part), {})
+    values = getattr(part, "used_values", None) or next((two for one, two in used if one is part), {})
     chosen = {"used": dict(values)} if values else {}
     return {**dict.fromkeys(known), **plain, **chosen, **_named(objects, origin, used)}
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
-from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_path
@@ -22,7 +21,7 @@ from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_docum
 from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
-from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters
+from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters, values_of
 from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
@@ -39,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A loaded scene, its name, the parameters of an XML scene with their values as text, and what loads it again.
+    """A loaded scene, its name, all parameters of an XML scene with their values as text, and what loads it again.
 
     The record is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
     """
@@ -105,7 +104,8 @@ def open_scene(
         Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
         scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
     params
-        Values for the ``<default>`` parameters of an XML scene, and of the instrument.
+        Values for the parameters of an XML scene, its own (``<default>``) and those of its plugins, as of
+        `loading.parameters.fill`, and of the instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
     variant
@@ -291,22 +291,7 @@ def _load_xml(
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
-    if unused := [name for name in document.parameters if name not in document.used]:
-        _tell_missing_part(loaded, unused)
-    return LoadedScene(loaded, document.name, dict(document.parameters), record)
-
-
-def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
-    """Raise `UserError` if the scene lacks the part that the parameters which nothing uses are for."""
-    present = {
-        "sensor": bool(scene.sensors()),
-        "emitter": bool(scene.emitters()),
-        "medium below a sea surface": any(shape.is_medium_transition() for shape in scene.shapes()),
-    }
-    for part, there in present.items():
-        if not there:
-            listed = ", ".join(unused[:4]) + (", ..." if len(unused) > 4 else "")
-            raise UserError(f"{part}: the scene has none, and its parameters {listed} are used by nothing")
+    return LoadedScene(loaded, document.name, values_of(document), record)
 
 
 def _instantiate(parse: Callable[[Any], Any]) -> Any:
@@ -323,8 +308,6 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
         props = node.props
         for name in list(props.keys()):
             value = props[name]
-            if name in FILE_PARAMETERS and isinstance(value, (bool, int, float)):
-                raise UserError(f"{name} = {value} must be a text, the name of a file")
             if isinstance(value, str) and DOLLAR in value:
                 props[name] = value.replace(DOLLAR, "$")
         if props.plugin_name() == "ocean_surface":
@@ -401,4 +384,4 @@ def _no_parameters(params: Mapping[str, Any] | None, instrument: str | None, wha
     if instrument is not None:
         raise UserError(f"instrument = {shown(instrument)} needs an XML scene, not {what}")
     if params:
-        raise UserError(f"params = {sorted(params)} need an XML scene; {what} has no <default> parameters to fill")
+        raise UserError(f"params = {sorted(params)} need an XML scene; {what} has its values in it")

@@ -12,14 +12,11 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
+from mitransient_lidar.core.parameters.water import COEFFICIENTS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.parameters import parameter_of, value_of
 from mitransient_lidar.transport.perturbations import Perturbation
-from mitransient_lidar.transport.water_changes import (
-    COEFFICIENTS,
-    coefficient_derivative,
-    mean_cosine_derivative,
-)
+from mitransient_lidar.transport.water_changes import coefficient_derivative, mean_cosine_derivative
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -164,7 +161,7 @@ def _is_gaussian(transmitter: Transmitter) -> bool:
 
 def _rippled(scene: LidarScene) -> list[SeaShape]:
     """Return the sea surfaces of a scene whose ripples have a variance."""
-    return [sea for sea in scene.seas if sea.has_ripples and sum(sea.ripple_variance) > 0]
+    return [sea for sea in scene.seas if sea.has_ripples and sum(sea.sea.ripple_variance) > 0]
 
 
 def _ripples(scene: LidarScene) -> Parameter:
@@ -172,7 +169,7 @@ def _ripples(scene: LidarScene) -> Parameter:
     seas = _rippled(scene)
     if len(seas) > 1:
         raise UserError(f"derivatives: {RIPPLES} must be of one sea; the scene has {len(seas)}")
-    value = float(sum(seas[0].ripple_variance))
+    value = float(sum(seas[0].sea.ripple_variance))
     below, above = (seas[0].scaled_ripples(scene.refractive_index, 1 + sign * _RIPPLE_STEP) for sign in (-1, 1))
     return Parameter(RIPPLES, value, "1", Perturbation(ripples=(below, above, 2 * _RIPPLE_STEP * value)))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.catalogue import unit_of
+from mitransient_lidar.core.parameters.catalogue import is_quantity, unit_of
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
@@ -32,10 +32,6 @@ _VIEW_STEP, _RELATIVE_STEP, _STEP_FROM_ZERO = 0.1, 0.01, 0.01
 
 #: Longest step of angles, and step of the mean slope of the sea, by which surface echoes change fast [degree].
 _ANGLE_STEP_DEG, _SEA_STEP_DEG = 0.5, 0.2
-
-#: Parameters that choose bins, gates and random numbers instead of what is measured.
-_NO_QUANTITIES = ("time_start_ns", "bin_width_ns", "bin_count", "pulses")
-_NO_QUANTITY_STARTS, _NO_QUANTITY_ENDS = ("gate_",), ("_seed", "_count")
 
 
 class _Side:
@@ -183,7 +179,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
         return float(shift)
     if "depth" in known or known == "layer_tops":
         return float(shift / scene.group_index) * (_LAYER_FACTOR if known == "layer_tops" else 1.0)
-    if known.startswith("surface_slope_"):
+    if known.removeprefix("surface_") in ("slope_x_deg", "slope_y_deg"):
         return _SEA_STEP_DEG
     fixed = {"m": _LENGTH_STEP, "degree": _ANGLE_STEP_DEG}.get(unit or "")
     relative = _VIEW_STEP if unit == "mrad" else _RELATIVE_STEP
@@ -193,7 +189,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
 def _checked_value(parameters: Mapping[str, str], name: str) -> float:
     """Return the value of a parameter of what is measured."""
     value, known = value_of(parameters, name), parameter_of(name)
-    if known in _NO_QUANTITIES or known.startswith(_NO_QUANTITY_STARTS) or known.endswith(_NO_QUANTITY_ENDS):
+    if not is_quantity(known):
         raise UserError(
             f"parameter {name} = {value:g} belongs to the record, its gates or its random numbers: there are "
             "derivatives by quantities of lidar, sea, water, bottom and targets"

@@ -49,7 +49,7 @@ MOST_FRAMES = 10_000
 #: Memory of a pixel in the passes of a frame, and of one of an image that is kept, and labelled at the end [bytes].
 _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
 
-_TIME_PARAMETER = "surface_time"  # time of the sea of an XML scene [s]
+_TIMES = ("surface_time", "time")  # names of the time of the sea of an XML scene [s]
 
 
 @alone
@@ -213,18 +213,19 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
             raise UserError("frames need an ocean_surface in the scene: nothing else changes with time")
         return moved, params
     if isinstance(scene, SceneRecord):
-        defaults = dict(scene.parameters)
+        defaults = scene.values
     elif isinstance(scene, (str, os.PathLike)):
-        defaults = catalogue.scene_parameters(catalogue.scene_path(scene))
+        defaults = catalogue.scene_parameters(scene, by_id=True)
     else:
         raise UserError("frames need a scene by its name, path or dict: the time of a loaded one cannot be changed")
-    if _TIME_PARAMETER not in defaults:
-        raise UserError(f"frames need the parameter {_TIME_PARAMETER} of the scene, the time of its ocean_surface")
-    given = {_TIME_PARAMETER: defaults[_TIME_PARAMETER], **(params or {})}
+    name = next((one for known in (params or {}, defaults) for one in _TIMES if one in known), None)
+    if name is None:
+        raise UserError(f"frames need the parameter {_TIMES[0]} of the scene, the time of its ocean_surface")
+    start = {**defaults, **(params or {})}[name]
     try:
-        return scene, {**given, _TIME_PARAMETER: float(given[_TIME_PARAMETER]) + later}
+        return scene, {**(params or {}), name: float(start) + later}
     except ValueError:
-        raise UserError(f"{_TIME_PARAMETER} = {given[_TIME_PARAMETER]!r} must be a number") from None
+        raise UserError(f"{name} = {start!r} must be a number") from None
 
 
 def _etendue(renderer: DaylightRenderer) -> FloatArray:

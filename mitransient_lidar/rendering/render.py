@@ -61,7 +61,7 @@ def render(
         record of a scene, or a session; or a result (a dataset, or its EXR or NetCDF file), which is rendered again
         with its own options unless others are given. See `render_again`.
     params
-        Values for the ``<default>`` parameters of an XML scene; they have priority over those of an instrument.
+        Values for the parameters of an XML scene and of its plugins; they have priority over those of an instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene, as `loading.instruments` lists
         them.

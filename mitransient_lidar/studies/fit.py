@@ -213,7 +213,7 @@ class _RenderedModel:
         self.between_bins = between_bins
         self.scene, self.params, self.instrument = scene, dict(params or {}), instrument
         self.names, self.passes, self.seed, self.progress = list(names), passes, seed, progress
-        own = scene.parameters if isinstance(scene, SceneRecord) else scene_parameters(scene)
+        own = scene.values if isinstance(scene, SceneRecord) else scene_parameters(scene, by_id=True)
         self.name = scene.name if isinstance(scene, SceneRecord) else Path(scene).stem
         self.texts = {**own, **{name: str(value) for name, value in self.params.items()}}
         self.done, self.began = 0, time.perf_counter()

@@ -17,8 +17,10 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
-from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.catalogue import scene_path
+from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.parameters import plugins_of
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
@@ -180,8 +182,16 @@ def describe_fov_sweep(found: xr.Dataset) -> list[str]:
 
 def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) -> Mapping[str, Any] | None:
     """Return the parameters with the widest field of view, if it is a parameter of the scene."""
-    known = catalogue.scene_parameters(catalogue.scene_path(scene)) if isinstance(scene, (str, os.PathLike)) else {}
-    return {**(params or {}), "field_of_view_mrad": widest} if "field_of_view_mrad" in known else params
+    if not isinstance(scene, (str, os.PathLike)):
+        return params
+    document, name = read_document(scene_path(scene)), "field_of_view_mrad"
+    # Pixels within a receiver have views of their own, in place of the receiver's.
+    own = [
+        one
+        for one in plugins_of(document)
+        if one.element.tagName == "sensor" and one.element.parentNode is document.root
+    ]
+    return {**(params or {}), name: widest} if any(one.value(one.declared[name]) for one in own) else params
 
 
 def _geometry(lidar: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:

@@ -56,7 +56,7 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
         If a solid coincides with the surface of the water, or if it is not defined which one of two solids is seen.
     """
     # Waves coincide with nothing.
-    waves = [sea for sea in scene.seas if np.isfinite(sea.cell_size)]
+    waves = [sea for sea in scene.seas if np.isfinite(sea.sea.cell_size)]
     shapes = [shape for shape in scene.mitsuba_scene.shapes() if not any(shape is sea for sea in waves)]
     pending = _neighbours(shapes, scene.surfaces)
     moved: dict[int, mi.Shape] = {}

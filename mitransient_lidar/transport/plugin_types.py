@@ -17,7 +17,6 @@ from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
@@ -26,15 +25,6 @@ class Recorded(Protocol):
     """Any plugin of this package, with its name as ``type`` and the values of its parameters."""
 
     parameters: dict[str, Any]
-
-
-@runtime_checkable
-class Automatic(Protocol):
-    """Plugins with parameters that may be automatic, with the values used for these."""
-
-    @property
-    def used_values(self) -> dict[str, float]:
-        """Values by name."""
 
 
 @runtime_checkable
@@ -105,14 +95,6 @@ class LidarSensor(Protocol):
 
 
 @runtime_checkable
-class PixelSensor(Protocol):
-    """The sensor ``pixel_fov``."""
-
-    field: FovShape
-    pixel_name: str
-
-
-@runtime_checkable
 class WaterMedium(Protocol):
     """The medium ``layered_water``."""
 
@@ -121,14 +103,10 @@ class WaterMedium(Protocol):
 
 @runtime_checkable
 class SeaShape(Protocol):
-    """The shape ``ocean_surface``: slope variances, lengths [m]."""
+    """The shape ``ocean_surface``."""
 
     sea: sea_surface.SeaSurface
     has_ripples: bool
-    ripple_variance: tuple[float, float]
-    slope_variance: float
-    cell_size: float
-    beam_wave: float
     footprints: Sequence[Footprint] | None
 
     def fit(self, footprints: Sequence[Footprint]) -> bool:

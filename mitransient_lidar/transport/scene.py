@@ -191,7 +191,7 @@ class WaterScene:
         cells that are finer than their waves, do not count.
         """
         sizes = [
-            max(surface.cell_size, _FACET_PER_WAVE * surface.beam_wave)
+            max(surface.sea.cell_size, _FACET_PER_WAVE * surface.sea.beam_wave)
             if isinstance(surface, SeaShape)
             else float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces

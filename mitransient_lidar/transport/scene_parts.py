@@ -273,7 +273,7 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
     for water in waters:
         _check_index(surfaces, water)
         _check_layers(scene, surfaces, water)
-    variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
+    variances = [sea.sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
 
@@ -334,9 +334,9 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
     """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
     footprint = 2 * transmitter.angular_spread * transmitter.pose.ground_range
     for surface in surfaces:
-        if isinstance(surface, SeaShape) and footprint < surface.cell_size < np.inf:
+        if isinstance(surface, SeaShape) and footprint < surface.sea.cell_size < np.inf:
             raise UserError(
-                f"cell_size = {surface.cell_size:.3g} m is coarser than the beam's footprint on the sea, "
+                f"cell_size = {surface.sea.cell_size:.3g} m is coarser than the beam's footprint on the sea, "
                 f"{footprint:.3g} m: it must be finer, or 'auto'"
             )
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.water import COEFFICIENTS
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
@@ -14,9 +15,6 @@ from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
-
-#: Coefficients by which light is differentiated, each with the other two held fixed [1/m].
-COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
 #: Relative step of the numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
 _STEP = 1e-4

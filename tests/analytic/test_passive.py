@@ -115,7 +115,7 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers):
     )
     expected = 1.0
     if "wind_speed" in sea:
-        (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
+        (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "sea"))
         above, below, seen = (crossing(surface.bsdf(), *side) for side in ((1, None), (-1, None), (1, 20.0)))
         assert 1 - sum(seen) < 1e-4 < 4e-3 < 1 - sum(above) < 6e-3 < 9e-3 < 1 - sum(below) < 13e-3
         # Light in the water comes back until it leaves it; radiance below is larger by n^2.

@@ -17,7 +17,7 @@ PATCH = {"refined_size": 32.0, "size": 32.0, "cell_size": 32.0 / CELLS}
 def surface(**parameters):
     sea = {"type": "ocean_surface", **parameters, "interior": {"type": "layered_water"}}
     scene = mi.load_dict({"type": "scene", "sea": sea})
-    return scene, next(shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
+    return scene, next(shape for shape in scene.shapes() if hasattr(shape, "sea"))
 
 
 def buffers(shape):
@@ -114,10 +114,10 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind():
 )
 def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, total):
     _, shape = surface(wind_speed=6.0, slope_variance=asked, **PATCH)
-    assert shape.slope_variance == pytest.approx(total, rel=1e-9)
-    assert min(shape.ripple_variance) > 1e-4
+    assert shape.sea.slope_variance == pytest.approx(total, rel=1e-9)
+    assert min(shape.sea.ripple_variance) > 1e-4
     parameters = mi.traverse(shape)
-    for axis, variance in zip("uv", shape.ripple_variance, strict=True):
+    for axis, variance in zip("uv", shape.sea.ripple_variance, strict=True):
         # Beckmann's alpha is sqrt(2) standard deviations of Gaussian slopes.
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
 
@@ -125,9 +125,9 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
 def test_a_mesh_rougher_than_asked_says_so():
     """All slopes are resolved at 1e-4: the ripples stop at their smallest, and the total is reported."""
     _, shape = surface(wind_speed=6.0, slope_variance="1e-4", **PATCH)
-    assert shape.ripple_variance == (1e-5, 1e-5)
-    assert shape.slope_variance == pytest.approx(sum(shape.sea.resolved_variance) + 2e-5)
-    assert shape.slope_variance > 0.005
+    assert shape.sea.ripple_variance == (1e-5, 1e-5)
+    assert shape.sea.slope_variance == pytest.approx(sum(shape.sea.resolved_variance) + 2e-5)
+    assert shape.sea.slope_variance > 0.005
 
 
 def test_seeds_are_different_seas():
@@ -213,7 +213,7 @@ def test_height_maps_become_surfaces(tmp_path):
         spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", size=60.0
     )
     assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
-    assert shape.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
+    assert shape.sea.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
     x = np.random.default_rng(1).uniform(-28, 28, 1000)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
     np.testing.assert_allclose(np.array(si.p.z), 0.1 * np.clip(x, -10, 10), atol=0.03)
@@ -262,7 +262,7 @@ def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     own = lidar_scene(sea=sea, integrator={"paths_per_pass": 2**14})
     shape = next(shape for shape in own.shapes() if hasattr(shape, "sea"))
     shape.write_ply(str(tmp_path / "sea.ply"))
-    alpha = np.sqrt(2 * np.array(shape.ripple_variance))
+    alpha = np.sqrt(2 * np.array(shape.sea.ripple_variance))
     ripples = {"type": "roughdielectric", "distribution": "beckmann", "int_ior": 1.34, "ext_ior": 1.0}
     read = {
         "type": "ply",
@@ -316,7 +316,7 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         names = ("vertex_positions", "vertex_texcoords", "faces", "bsdf.alpha_u.value", "bsdf.alpha_v.value")
         rays = mi.Ray3f(mi.Point3f(mi.Float(np.linspace(-3, 12, 31)), 0.3, 20.0), mi.Vector3f(0, 0, -1))
         parts.append([*(np.array(parameters[name]) for name in names), np.array(loaded.ray_intersect(rays).t)])
-        assert shape.cell_size < 2.5e-3 * 107 / 12 < before
+        assert shape.sea.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):
         np.testing.assert_array_equal(first, second)
 

@@ -91,7 +91,7 @@ def surface(**parameters):
     scene = mi.load_dict(
         {"type": "scene", "sea": {"type": "ocean_surface", **parameters, "interior": {"type": "layered_water"}}}
     )
-    return scene, next(shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
+    return scene, next(shape for shape in scene.shapes() if hasattr(shape, "sea"))
 
 
 def interaction(scene, direction):
@@ -127,7 +127,7 @@ def test_ripples_sample_their_density_and_keep_the_energy(wi):
 def test_ripples_are_rougher_along_the_wind(direction, along_x):
     """Wind 10 m/s: slope variance 0.0316 up- and 0.0222 crosswind, on the axes that the wind direction says."""
     scene, shape = surface(spectrum="flat", wind_speed=10.0, wind_direction_deg=direction)
-    assert shape.ripple_variance == pytest.approx((0.0316, 0.0222))
+    assert shape.sea.ripple_variance == pytest.approx((0.0316, 0.0222))
     si = interaction(scene, [0, 0, 1])
     tilt = 0.3
     values = []

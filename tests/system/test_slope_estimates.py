@@ -12,7 +12,6 @@ from significance import FALSE_ALARM, largest_z
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve
-from mitransient_lidar.loading import catalogue
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -31,12 +30,6 @@ def planes(tmp_path_factory):
     After 6 passes a slope varies by 0.002 along and 0.004 across from seed to seed; after 2 some fits end elsewhere.
     """
     folder = tmp_path_factory.mktemp("planes")
-    text = catalogue.scene_text("fig09_2x2")
-    surface = '<string name="spectrum" value="$spectrum"/>'
-    assert surface in text
-    text = text.replace(surface, f'{surface}<string name="filename" value="$map"/>')
-    text = text.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default name="map" value=""/>')
-    (folder / "plane.xml").write_text(text, "utf-8")
     params = {"spectrum": "height_map", "slope_variance": 0.1, "bottom_depth": 10, "bottom_reflectance": 0.3}
     params |= {"attenuation": 0.45, "scattering": 0.05, "backscattering": 0.0015, "divergence_mrad": 4}
     # One record for all slopes.
@@ -46,9 +39,7 @@ def planes(tmp_path_factory):
     for along, across in TILTS:
         name = str(folder / f"{along}.npz")
         np.savez(name, heights=along * lines + across * lines[:, np.newaxis], x=lines, y=lines)
-        shots.append(
-            mitransient_lidar.render(str(folder / "plane.xml"), params={**params, "map": name}, passes=6, seed=2)
-        )
+        shots.append(mitransient_lidar.render("fig09_2x2", params={**params, "filename": name}, passes=6, seed=2))
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 
 

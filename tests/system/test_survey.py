@@ -19,9 +19,8 @@ PLACE, HEIGHT = (500_040.0, 6_500_040.0), 75.0
 START = 302_400.0
 
 SCENE = """<scene version="3.0.0">
-    <default name="wind_speed" value="3"/>
     <include filename="{shared}/_lidar.xml"/>
-    <include filename="{shared}/_sea.xml"/>
+    <shape type="ocean_surface" id="surface"><medium type="layered_water" name="interior"/></shape>
     <shape type="seabed" id="bottom">
         <string name="filename" value="{folder}/step.tif"/>
         <float name="reflectance" value="0.15"/>

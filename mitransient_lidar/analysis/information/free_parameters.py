@@ -48,7 +48,7 @@ class Free:
 
 
 def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[float, float]] | None = None) -> list[Free]:
-    """Return free parameters with their bounds, by default the range of their names, or 0 to 1 for reflectances.
+    """Return free parameters with their bounds, by default the range of their names.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[floa
     found = []
     for name, start in starts.items():
         base = re.sub(r"\[\d+\]$", "", name)
-        usual = (0.0, 1.0) if base.endswith("_reflectance") else limits(base) or (-math.inf, math.inf)
+        usual = limits(base) or (-math.inf, math.inf)
         low, high = given.pop(name, (0.0, math.inf) if name == SCALE else usual)
         if not low < high:
             raise UserError(f"bounds of {name} = {low:g}, {high:g} must increase")

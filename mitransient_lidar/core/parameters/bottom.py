@@ -60,8 +60,8 @@ SEDIMENT = plugin(
     "sediment",
     text("model", "lambertian", "Law of reflection", ("lambertian", "hapke")),
     text("reflectance", None,
-        "Share of the light that is reflected, at vertical incidence: 0 to 1, or ``coral_sand``, ``green_algae``, "
-        "``brown_algae`` or ``red_algae``", unit="1", otherwise="``0.1``"),
+        "Share of the light that is reflected, at vertical incidence, or ``coral_sand``, ``green_algae``, "
+        "``brown_algae`` or ``red_algae``", unit="1", low=0, high=1, otherwise="``0.1``"),
     number("wavelength_nm", 532.0, "nm", 400, 700, "Wavelength of a reflectance by name"),
     number("single_scattering_albedo", None, "1", 0, 1, "hapke: albedo of the particles, instead of ``reflectance``"),
     number("lobe_asymmetry", 0.0, "1", 0, 0.9,
@@ -70,6 +70,7 @@ SEDIMENT = plugin(
         "hapke: share *s* of the lobe towards the source; (1 + c)/2 with Hapke's c"),
     number("opposition_amplitude", 1.0, "1", 0, 3, "hapke: opposition effect :math:`B_0`"),
     number("opposition_width", 0.06, "rad", 1e-3, 1, "hapke: its half width *h*"),
+    alternatives=((("reflectance",), ("single_scattering_albedo",)),),
 )
 
 RETROREFLECTOR = plugin(
@@ -79,6 +80,12 @@ RETROREFLECTOR = plugin(
     number("width_deg", 2.0, "degree", 0.01, 180,
         "Full angle between the directions where the lobe has fallen to e^-1/2 of its peak"),
     number("diffuse_share", 0.0, "1", 0, 1, "Lambertian share of the reflected light"),
+)
+
+#: Shares of light that BSDFs of Mitsuba reflect or transmit.
+OF_MITSUBA = tuple(
+    number(f"{part}{share}", None, "1", 0, 1, "Share of the light")
+    for part in ("", "diffuse_", "specular_") for share in ("reflectance", "transmittance")
 )
 
 _INFINITE = float("-inf"), float("inf")

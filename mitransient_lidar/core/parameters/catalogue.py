@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from mitransient_lidar.core.parameters import bottom, integrators, lidar, sea, water
 from mitransient_lidar.core.parameters.fields import Parameter, Plugin
@@ -18,12 +19,29 @@ PLUGINS: dict[str, Plugin] = {
 #: Names of parameters whose value is the name of a file.
 FILE_PARAMETERS = tuple(dict.fromkeys(each.name for plugin in PLUGINS.values() for each in plugin if each.is_file))
 
-#: Units of parameters of shipped scenes, which have names of their own, by the ends of these.
+#: Units of parameters of scenes that no plugin declares, such as the places of shapes, by the ends of their names.
 _UNIT_OF_END = {
-    **{"_deg": "degree", "_reflectance": "1", "_seed": "1", "_count": "1", "_time": "s"},
-    **{f"_{end}": "m" for end in ("x", "y", "depth", "height", "size", "length", "width", "left", "middle", "right")},
-    "_wave": "m",
+    **{"_deg": "degree", "_seed": "1", "_count": "1"},
+    **{f"_{end}": "m" for end in ("x", "y", "height", "length", "width", "left", "middle", "right")},
 }
+
+#: Plugins whose parameters are no quantities that are measured: of the record, and of estimators.
+_OF_RECORDS = (lidar.TIME_GATED_FILM, *filter(lambda each: isinstance(each, Plugin), vars(integrators).values()))
+
+
+def declared(name: str, plugin: str | None = None) -> list[Parameter]:
+    """Return the parameters of a name, of a plugin or of all of this package.
+
+    Where no parameter of all has it, those of the name behind an id: ``surface_time`` is ``time``.
+    """
+    if plugin is not None:
+        return [each for each in PLUGINS.get(plugin, bottom.OF_MITSUBA) if each.name == name]
+    known = [each for one in PLUGINS.values() for each in one]
+    while name:
+        if found := [each for each in known if each.name == name]:
+            return found
+        name = re.split("[._]", name, maxsplit=1)[1] if re.search("[._]", name) else ""
+    return []
 
 
 def limits(name: str, plugin: str | None = None) -> tuple[float, float] | None:
@@ -31,18 +49,20 @@ def limits(name: str, plugin: str | None = None) -> tuple[float, float] | None:
 
     None where there is no such parameter of a limited range, or it is an integer.
     """
-    ranges = [(each.low, each.high) for each in _declared(name, plugin) if each.unit and each.kind != "integer"]
+    ranges = [(each.low, each.high) for each in declared(name, plugin) if each.unit and each.kind != "integer"]
     low, high = min((one for one, _ in ranges), default=-math.inf), max((one for _, one in ranges), default=math.inf)
     return None if -low == high == math.inf else (low, high)
 
 
 def unit_of(name: str) -> str | None:
     """Return the unit of a parameter of a plugin or a shipped scene; None for texts and other names."""
-    unit = next((each.unit for each in _declared(name) if each.unit), None)
+    unit = next((each.unit for each in declared(name) if each.unit), None)
     return unit or next((unit for end, unit in _UNIT_OF_END.items() if name.endswith(end)), None)
 
 
-def _declared(name: str, plugin: str | None = None) -> list[Parameter]:
-    """Return the parameters of a name."""
-    plugins = PLUGINS.values() if plugin is None else filter(None, [PLUGINS.get(plugin)])
-    return [each for one in plugins for each in one if each.name == name]
+def is_quantity(name: str) -> bool:
+    """Return whether a parameter may be one of what is measured: not of bins, gates, estimators or random numbers."""
+    found = declared(name)
+    return not found or any(
+        each.kind != "integer" and not any(each in one.parameters for one in _OF_RECORDS) for each in found
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,9 @@ class Parameter:
         Whether ``auto`` leaves the choice to the scene, and whether an empty text counts as not given.
     is_file
         Whether the value is the name of a file.
+    by_id
+        Whether its name alone stands for a parameter of other plugins, so that only one with an id or the name of its
+        plugin reaches it.
     otherwise
         What holds without a value where `default` does not say it.
     """
@@ -66,6 +69,7 @@ class Parameter:
     may_be_auto: bool = False
     may_be_empty: bool = False
     is_file: bool = False
+    by_id: bool = False
     otherwise: str = ""
 
     def checked(self, value: Any) -> Any:
@@ -107,6 +111,18 @@ class Parameter:
         return np.broadcast_to(values, layers)
 
     @property
+    def text(self) -> str:
+        """The default as in XML; empty without one."""
+        if self.default is None:
+            return ""
+        return f"{self.default:.15g}" if isinstance(self.default, float) else str(self.default).lower()
+
+    @property
+    def tag(self) -> str:
+        """Element of XML that sets the value: a text where it may be one that is no number."""
+        return "string" if self.may_be_auto or self.may_be_empty or self.kind == "boolean" else self.kind
+
+    @property
     def allowed(self) -> str:
         """What is allowed, for the manual."""
         if self.choices:
@@ -123,10 +139,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Plugin:
-    """Name of a plugin and its parameters, in the order of the manual."""
+    """Name of a plugin, its parameters in the order of the manual, and those that describe one thing in several ways.
+
+    Each of `alternatives` is a list of the ways, and each way the names of its parameters; ``a nested sensor`` stands
+    for an object of this kind.
+    """
 
     name: str
     parameters: tuple[Parameter, ...]
+    alternatives: tuple[tuple[tuple[str, ...], ...], ...] = ()
 
     def __getitem__(self, name: str) -> Parameter:
         """Return a parameter by name."""
@@ -135,6 +156,29 @@ class Plugin:
     def __iter__(self) -> Iterator[Parameter]:
         """Yield the parameters."""
         return iter(self.parameters)
+
+    def replaced(self, given: Collection[str]) -> set[str]:
+        """Return the names of the parameters in place of which given ones describe the same."""
+        return {
+            name
+            for ways in self.alternatives
+            for chosen in ways
+            if not set(chosen).isdisjoint(given)
+            for way in ways
+            for name in way
+            if name not in given and name not in chosen
+        }
+
+    def check_ways(self, given: Mapping[str, Any]) -> None:
+        """Raise `UserError` if given values describe one thing in several ways."""
+        for ways in self.alternatives:
+            chosen = [next((name for name in way if name in given), "") for way in ways]
+            told = [
+                f"{name} = {given[name]!r}" if isinstance(given[name], (str, int, float)) else name
+                for name in filter(None, chosen)
+            ]
+            if len(told) > 1:
+                raise UserError(f"{self.name}: {' and '.join(told)} describe the same: give one of them")
 
     def reader(self, get: Callable[[str, Any], Any]) -> Read:
         """Return the reader of values that a function (name, default) -> value gives."""
@@ -153,9 +197,9 @@ class Plugin:
         return "\n".join(lines)
 
 
-def plugin(name: str, *parameters: Parameter) -> Plugin:
+def plugin(name: str, *parameters: Parameter, alternatives: tuple[tuple[tuple[str, ...], ...], ...] = ()) -> Plugin:
     """Return the declaration of a plugin."""
-    return Plugin(name, parameters)
+    return Plugin(name, parameters, alternatives)
 
 
 @dataclass(frozen=True)

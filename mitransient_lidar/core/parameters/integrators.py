@@ -31,7 +31,7 @@ LIDAR_MERGING = plugin(
     number("cell_size", 0.0, "m", 0, 1e4,
         "Horizontal width of the cells on the beam's axis at the surface, within 2e-6 to 2 standard deviations of the "
         "beam there; 0: from footprint, facets of the sea, field of view and attenuation. Smaller cells have less bias "
-        "and more noise"),
+        "and more noise", by_id=True),
     number("point_spacing", 0.0, "m", 0, 1e4,
         "Distance between points along a path; 0: a fourteenth of the distance to the bottom or to the depth that the "
         "record allows, a tenth from 4096 pixels on"),

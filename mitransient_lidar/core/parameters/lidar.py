@@ -32,21 +32,27 @@ POSE = (
 )
 
 
-def divergences(default: float | None) -> tuple[Parameter, Parameter, Parameter]:
+def divergences(default: float | None, **more: bool) -> tuple[Parameter, Parameter, Parameter]:
     """Return the three ways to give the width of a beam; the default is that of the first."""
+    more["may_be_empty"] = True
     return (
         number("divergence_mrad", default, "mrad", 1e-3, 2000,
             "Full angle between the points where the irradiance of a Gaussian beam has fallen to e^-1/2 of its peak "
-            "(its sigma is half of it); the full angle of a top-hat beam", may_be_empty=True),
+            "(its sigma is half of it); the full angle of a top-hat beam", **more),
         number("divergence_fwhm_mrad", None, "mrad", 1e-3, 2000,
             "The same beam by its full width at half maximum; give one of the three. Each is the full angle of a "
             "top-hat beam, whose irradiance falls from its peak to 0 at the edge. An empty text counts as not given",
-            may_be_empty=True),
+            **more),
         number("divergence_1e2_mrad", None, "mrad", 1e-3, 2000,
             "The same beam by its full width at e^-2 of the peak. An empty text counts as not given",
-            may_be_empty=True),
+            **more),
     )
 
+
+#: Ways to give a width of a beam, a place and direction, and a point-spread function.
+DIVERGENCES = tuple((each.name,) for each in divergences(None))
+_PLACE = tuple(each.name for each in ANGLES), ("to_world",)
+_BLURS = ("blur_mrad",), ("blur_file", "blur_file_mrad")
 
 LIDAR_TRANSMITTER = plugin(
     "lidar_transmitter",
@@ -70,6 +76,7 @@ LIDAR_TRANSMITTER = plugin(
     file("pulse_file",
         "Instead: text file with two columns, time [ns] and power (any unit), or in any order and unit of time below a "
         "heading such as ``t [ps], V``"),
+    alternatives=(DIVERGENCES, _PLACE, (("pulse_fwhm_ns",), ("pulse_file",))),
 )
 
 OPTICS = (
@@ -119,6 +126,13 @@ MULTIPIXEL_RECEIVER = plugin(
     *OPTICS,
     *POSE,
     nested("(nested)", "film", "``time_gated_film``"),
+    alternatives=(
+        _PLACE,
+        _BLURS,
+        (("layout", "fill_factor", "field_of_view_shape", "imager"), ("pixel_map",), ("a nested sensor",)),
+        (("field_of_view_mrad",), ("focal_length_mm", "pixel_pitch_um"), ("a nested sensor",)),
+        (("pixel_map",), ("focal_length_mm", "pixel_pitch_um")),
+    ),
 )
 
 PIXEL_FOV = plugin(
@@ -143,6 +157,7 @@ PIXEL_FOV = plugin(
     text("pixel_name", "", "Name in the result", otherwise="``pixel`` (numbered by ``multipixel_receiver``)"),
     *OPTICS,
     *POSE,
+    alternatives=(_PLACE, _BLURS),
 )
 
 TIME_GATED_FILM = plugin(
@@ -163,4 +178,8 @@ TIME_GATED_FILM = plugin(
         "Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in other units below a "
         "heading that names them"),
     count("pulses", 1, 1, 10**9, "Number of pulses that each gate accumulates"),
+    alternatives=(
+        (("gate_start_ns",), ("gate_start_depth",)),
+        (("gate_width_ns", "gate_rise_ns", "gate_fall_ns"), ("gate_profile",)),
+    ),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mitransient_lidar.core.parameters.fields import AUTO, Parameter, count, file, nested, number, plugin, switch, text
-from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE, divergences
+from mitransient_lidar.core.parameters.lidar import DIVERGENCES, LARGEST_COORDINATE, divergences
 
 # A parameter a row, which the formatter would spread over five.
 # fmt: off
@@ -72,10 +72,12 @@ OCEAN_SURFACE = plugin(
     _length("map_size", "Side of a height map that carries no positions"),
     file("filename", "File of a ``height_map``"),
     number("altitude", None, "m", 0.1, 1e6,
-        "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene"),
-    number("off_nadir_deg", None, "degree", 0, 89.9, "The same"),
-    number("field_of_view_mrad", None, "mrad", 1e-3, 3000, "The same"),
-    *divergences(None),
+        "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene",
+        by_id=True),
+    number("off_nadir_deg", None, "degree", 0, 89.9, "The same", by_id=True),
+    number("field_of_view_mrad", None, "mrad", 1e-3, 3000, "The same", by_id=True),
+    *divergences(None, by_id=True),
     nested("(nested)", "bsdf", "Any BSDF instead of the ripples"),
     nested("interior", "medium", "The water: ``layered_water``"),
+    alternatives=(DIVERGENCES, (("fetch",), ("inverse_wave_age",))),
 )

@@ -17,6 +17,10 @@ def _water(name: str, meaning: str, unit: str = "") -> Parameter:
     return text(name, None, meaning, may_be_empty=True, unit=unit)
 
 
+#: Coefficients of layers, and waters by name in their place.
+COEFFICIENTS = ("attenuation", "scattering", "backscattering")
+WATER_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
+
 LAYERED_WATER = plugin(
     "layered_water",
     numbers("layer_tops", "0", "m", 0, 1e5, "Depth of each layer's upper edge, first 0, increasing: ``0, 3``"),
@@ -77,6 +81,10 @@ LAYERED_WATER = plugin(
     number("bubble_backscatter", 233.0, "m-1 sr-1", 100, 1445,
         "Volume scattering at 180 degrees over void fraction: 233 of clean bubbles, 1445 of a thick coating (Churnside "
         "2010, doi:10.1364/OE.18.008294)"),
+    alternatives=(
+        (COEFFICIENTS, *((each,) for each in WATER_KINDS), ("profile",)),
+        (("layer_tops",), ("profile",)),
+    ),
 )
 
 FOURNIER_FORAND = plugin(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import Read
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian beam.
@@ -30,7 +29,7 @@ def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     Raises
     ------
     UserError
-        If several are given, or the value is out of range.
+        If the value is out of range.
 
     Notes
     -----
@@ -39,7 +38,4 @@ def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     beyond: all three are its full angle.
     """
     given = read.given(*WIDTHS)
-    if len(given) > 1:
-        values = " and ".join(f"{name} = {read.get(name, '')}" for name in given)
-        raise UserError(f"{values} describe one width: give one of {', '.join(WIDTHS)}")
     return 1e-3 * read(given[0]) / (1.0 if is_top_hat else WIDTHS[given[0]]) if given else None

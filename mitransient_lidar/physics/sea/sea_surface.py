@@ -258,8 +258,6 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
     fetch, age, peak_enhancement = map(read, ("fetch", "inverse_wave_age", "peak_enhancement"))
     swell_height, swell_wavelength = read("swell_height"), read("swell_wavelength")
     swell_direction = math.radians(read("swell_direction_deg"))
-    if fetch is not None and age is not None:
-        raise UserError(f"fetch = {fetch:g} and inverse_wave_age = {age:g} are alternatives: give one of them")
     components: list[WaveSpectrum] = []
     if spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
         if wind_speed == 0:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.water import WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
 from mitransient_lidar.physics.water.data_tables import read_columns
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
@@ -36,9 +37,6 @@ _NODES = 32768
 
 #: b, bb and the scattering by molecules bw [1/m].
 Scattered = tuple[float, float, float]
-
-WATER_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
-"""Quantities that give a water; see `water_of`."""
 
 #: bb/b of particles in the open ocean (Westberry et al. 2010).
 _OCEANIC_BACKSCATTER_RATIO = 0.010

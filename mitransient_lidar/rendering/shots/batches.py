@@ -249,8 +249,8 @@ class ShotBatches:
         self._aim = np.array(aim) - self._frame_origin
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
-        waves = [sea for sea in lidar.seas if np.isfinite(sea.cell_size)]
-        level = [sea for sea in lidar.seas if np.isinf(sea.cell_size)]
+        waves = [sea for sea in lidar.seas if np.isfinite(sea.sea.cell_size)]
+        level = [sea for sea in lidar.seas if np.isinf(sea.sea.cell_size)]
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
         self._seas = [SeaPatches(shape) for shape in waves]

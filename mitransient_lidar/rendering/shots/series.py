@@ -177,7 +177,8 @@ def render_shots(
     series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
-    own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
+    before = (session or series.session).parameters
+    own = {name: before[name] for name in replaced if name in before}
     truth = truth_coordinates(sea_of(series.session.scene), series.lidar, ShotPoses(places))
     if missed := np.count_nonzero(np.isnan(truth["true_bottom_depth"][1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))

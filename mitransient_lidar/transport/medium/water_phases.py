@@ -19,9 +19,6 @@ from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
 from mitransient_lidar.transport.nested_objects import create_object
 
-#: Phase functions that ``layered_water`` creates.
-PHASE_FUNCTIONS = ("fournier_forand", "petzold", "hg")
-
 
 @runtime_checkable
 class HasTable(Protocol):
@@ -86,7 +83,7 @@ class LayerPhases:
     nested
         Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     kind
-        One of `PHASE_FUNCTIONS`, used where none is nested.
+        Choice of the parameter ``phase_function``, used where none is nested.
     phase_g
         Mean cosine for ``hg``.
     water_scattering

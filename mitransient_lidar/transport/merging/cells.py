@@ -83,7 +83,7 @@ class RefractedProfile:
         # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
-        ripples = 0.5 * max((sum(sea.ripple_variance) for sea in scene.seas), default=0.0)
+        ripples = 0.5 * max((sum(sea.sea.ripple_variance) for sea in scene.seas), default=0.0)
         self._own = [(spread, shift * math.sqrt(ripples)) for spread, shift in zip(spreads, shifts, strict=True)]
         self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
         self._growths = [opaque(growth) for _, growth in self._own]

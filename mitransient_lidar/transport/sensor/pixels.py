@@ -35,8 +35,6 @@ _OVERLAP_POINTS = 4096
 #: Cells of the table along a side for each pixel along a side, and at most.
 _CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
 
-FIELD_SHAPES = ("circle", "square")
-
 
 class PixelArray(ABC):
     """The pixels of a receiver in tangent-plane angles [rad].
@@ -117,8 +115,6 @@ class LayoutPixels(PixelArray):
         fill_factor: float = 1.0,
     ) -> None:
         rows, columns = parse_layout(layout)
-        if shape not in FIELD_SHAPES:
-            raise UserError(f"field_of_view_shape = {shape!r} must be one of {', '.join(FIELD_SHAPES)}")
         self.sides = field_of_view if isinstance(field_of_view, tuple) else (field_of_view, field_of_view)
         height, width = (0.5 * side for side in self.sides)
         if height != width:

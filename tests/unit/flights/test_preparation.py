@@ -81,7 +81,7 @@ def test_maps_are_in_the_system_of_the_flight(tmp_path, of_map, beside):
 OWN_SCENE = """<scene version="3.0.0">
     <default name="map_file" value="nowhere.tif"/>
     <include filename="{shared}/_lidar.xml"/>
-    <include filename="{shared}/_sea.xml"/>
+    <shape type="ocean_surface" id="surface"><medium type="layered_water" name="interior"/></shape>
     <shape type="seabed"><string name="filename" value="$map_file"/>{own}</shape>
 </scene>
 """

@@ -57,12 +57,26 @@ def test_each_definition_of_the_divergence_replaces_the_default(name, width):
     assert [key for key in parameters if key.startswith("divergence") and parameters[key]] == [f"divergence_{name}"]
 
 
+def test_a_given_start_of_the_gates_replaces_that_of_the_scene():
+    """The film refuses both."""
+    opened = open_scene("gated_mine", {**FLAT, "layout": "2x2", "gate_start_ns": 1500})
+    assert opened.scene.sensors()[0].film().gates.start_ns == 1500
+    assert opened.parameters["gate_start_depth"] == ""
+    assert open_scene(opened.record).parameters == opened.parameters
+
+
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"jerlov": "1C", "scattering": 0.1}, "jerlov = '1C' describes the same as scattering: give one of them"),
-        ({"jerlov": "1C", "kd": 0.1}, "jerlov = '1C' describes the same as kd: give one of them"),
-        ({"divergence_mrad": 5, "divergence_1e2_mrad": 9}, "divergence_mrad = 5 and divergence_1e2_mrad = 9 describe"),
+        (
+            {"jerlov": "1C", "scattering": 0.1},
+            "scattering = '0.1' and jerlov = '1C' describe the same: give one of them",
+        ),
+        ({"jerlov": "1C", "kd": 0.1}, "jerlov = '1C' and kd = '0.1' describe the same: give one of them"),
+        (
+            {"divergence_mrad": 5, "divergence_1e2_mrad": 9},
+            "divergence_mrad = '5' and divergence_1e2_mrad = '9' describe",
+        ),
     ],
 )
 def test_two_ways_at_once_are_refused(params, message):

@@ -64,14 +64,15 @@ FLAT = """<!-- A level sea -->
   Over a bottom.
 -->
 <scene version="3.0.0">
+
+    <default name="radius" value="2"/>  <!-- m -->
     <!-- Chosen here -->
+    <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
 
     <!-- All parameters -->
 
     <!-- Ball -->
-    <default name="radius" value="2"/>  <!-- m -->
     <default name="depth" value="3"/>
-    <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
 
     <default name="power" value="7"/>
 

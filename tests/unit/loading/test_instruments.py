@@ -140,6 +140,16 @@ def test_a_scene_without_a_lidar_gets_one(tmp_path):
     assert loaded.integrator().plugin == "lidar_merging"
 
 
+def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
+    path = tmp_path / "sea.xml"
+    path.write_text(SEA.format(lidar='<emitter type="lidar_transmitter"><float name="aim_x" value="3"/></emitter>'))
+    loaded = scenes.open_scene(path, None, "leica_chiroptera4x")
+    assert loaded.parameters["aim_x"] == "3"
+    assert parts(loaded.scene)[1].pose.nearby_point()[0] == pytest.approx(3, abs=0.01)
+    (surface,) = loaded.scene.shapes()
+    assert surface.interior_medium().parameters["wavelength_nm"] == 515
+
+
 def test_a_camera_of_the_scene_is_replaced(tmp_path):
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<sensor type="perspective"><film type="hdrfilm"/></sensor>'))

@@ -88,7 +88,8 @@ def test_scenes_without_parameters_say_so():
 
 OWN = """<scene version="3.0.0"><default name="deep" value="6"/>
 <emitter type="lidar_transmitter"/><sensor type="multipixel_receiver"><film type="time_gated_film"/></sensor>
-<shape type="ocean_surface" id="sea"><float name="wind_speed" value="2"/></shape>
+<shape type="ocean_surface" id="sea"><float name="wind_speed" value="2"/><medium type="layered_water" name="interior"/>
+</shape>
 <shape type="seabed" id="bottom"><float name="depth" value="$deep"/></shape>
 <shape type="seabed" id="lower"/></scene>"""
 
@@ -97,11 +98,26 @@ def test_parameters_of_plugins_are_those_of_the_scene(tmp_path):
     """Without a ``<default>`` in the scene: of all plugins that have one of the name, or of one with an id."""
     path = tmp_path / "own.xml"
     path.write_text(OWN)
-    given = {"altitude": 150, "wind_speed": 4.5, "lower.depth": 9, "deep": 5}
+    given = {"altitude": 150, "wind_speed": 4.5, "lower.depth": 9, "depth": 7, "sea_kd": 0.1}
     values = json.loads(open_scene(path, given).attributes()["plugin_parameters"])
     assert values["lidar_transmitter"]["altitude"] == values["multipixel_receiver"]["altitude"] == 150
-    assert values["sea"]["wind_speed"] == 4.5
-    assert (values["bottom"]["depth"], values["lower"]["depth"]) == (5, 9)
+    assert (values["sea"]["wind_speed"], values["sea"]["interior"]["kd"]) == (4.5, "0.1")
+    # The height for which the sea chooses its cells follows the lidar, unless it is given by the id of the sea.
+    assert values["sea"]["altitude"] is None
+    assert (values["bottom"]["depth"], values["lower"]["depth"]) == (7, 9)
+
+
+def test_results_state_the_parameters_of_plugins(tmp_path):
+    path = tmp_path / "own.xml"
+    path.write_text(OWN)
+    loaded = open_scene(path, {"sea.altitude": 90, "jerlov": "1C"})
+    found = {name.partition(".")[2]: value for name, value in loaded.attributes().items() if name.startswith("scene.")}
+    given = {"deep": "6", "wind_speed": "2", "jerlov": "1C", "altitude": "200", "sea.altitude": "90"}
+    assert {name: found[name] for name in given} == given
+    assert not {"attenuation", "kd", "sea_wind_speed", "seabed_depth"} & found.keys()
+    assert value_of(loaded.parameters, "seabed.depth") == 6
+    assert value_of(loaded.parameters, "bottom_depth") == value_of(loaded.parameters, "depth") == 6
+    assert open_scene(loaded.record).parameters == loaded.parameters
 
 
 def test_values_that_plugins_have_are_the_defaults():
@@ -109,7 +125,7 @@ def test_values_that_plugins_have_are_the_defaults():
     filled = fill(document, {"bottom.depth": 7, "wind_speed": 4, "wavelength_nm": 515})
     assert (filled.parameters["wind_speed"], filled.parameters["deep"]) == ("4", "6")
     assert 'name="bottom.depth" value="$deep"' in filled.text
-    assert 'name="wavelength_nm" value="532.0"' in filled.text
+    assert 'name="wavelength_nm" value="532"' in filled.text
     assert fill(document, {"deep": 7}).text == OWN
 
 
@@ -117,9 +133,11 @@ def test_values_that_plugins_have_are_the_defaults():
     ("params", "message"),
     [
         ({"sea.depth": 3}, "parameter 'sea.depth' is not one of scene own"),
-        ({"hight": 3}, "parameter 'hight' is not one of scene own: it has deep"),
+        ({"hight": 3}, "parameter 'hight' is not one of scene own: it has deep, the parameters of its plugins"),
         ({"altitud": 3}, "parameter 'altitud' is not one of scene own: did you mean altitude"),
         ({"film": 3}, "parameter 'film' is not one of scene own"),
+        ({"phase": "hg"}, "parameter 'phase' is not one of scene own: did you mean phase_g or .*phase_function"),
+        ({"sea_wind_speed": 3, "wind_speed": 2}, "parameter wind_speed = 2 is used by nothing in scene own"),
     ],
 )
 def test_other_names_are_refused(params, message):

@@ -20,8 +20,8 @@ def test_no_plugin_calls_the_loader(monkeypatch, phase):
 
     load_file = mi.load_file
     monkeypatch.setattr(mi, "load_dict", refuse)
-    assert open_scene("table1", {"phase": phase, "spectrum": "flat"}).scene.shapes()
-    assert load_file(str(catalogue.scene_path("ship_wake")), spectrum="flat").shapes()
+    assert open_scene("table1", {"phase_function": phase, "spectrum": "flat"}).scene.shapes()
+    assert load_file(str(catalogue.scene_path("ship_wake")), ship_x="0").shapes()
 
 
 def test_seabed_and_bubbles_are_made_without_the_loader(monkeypatch):

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
@@ -113,11 +112,6 @@ def test_own_values_of_the_sea_win():
     explicit = {"cell_size": 0.3, "refined_size": 20.0, "centre_x": 3.0, "centre_y": -2.0, "size": 400.0}
     assert choose(lidar(), shortest_wave=0.5, **explicit) == Resolution((3.0, -2.0), 0.3, 20.0, 400.0, 0.5, 0.5)
     assert choose([]) == Resolution((0.0, 0.0), 0.125, 32.0, 1000.0, 1.0, 1.0)
-
-
-def test_one_definition_of_the_divergence_may_be_given():
-    with pytest.raises(UserError, match="divergence_mrad = 5 and divergence_fwhm_mrad = 6 describe one width"):
-        choose(lidar(), divergence_mrad=5, divergence_fwhm_mrad=6)
 
 
 def test_waves_that_no_cell_resolves_become_ripples():
