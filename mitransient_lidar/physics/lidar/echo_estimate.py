@@ -2,8 +2,9 @@
 
 Light is the lidar equation's, on the lines of sight of a level sea. Scattering moves and delays it: paths scatter
 forwards a random number of times at random depths, and each event shifts all that follows by the tangent of its angle
-times the remaining distance. One scattering by a large angle, or the bottom, turns the path. Shifts on the way down move
-the point that is lit, and with it the time; those on the way up move only the direction from which its light is seen.
+times the remaining distance. One scattering by a large angle, or the bottom, turns the path. Shifts on the way down
+move the point that is lit, and with it the time; those on the way up move only the direction from which its light is
+seen.
 
 Directions that forward scattering has spread matter to the water and not to the bottom: per depth, light along a slant
 meets more water, by 1/cos, and it returns by other angles than 180 degrees. The energy that a level Lambertian bottom
@@ -29,7 +30,6 @@ from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_t
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-
 
 #: Nodes of phase functions at the angles by which paths turn, in sin^2(theta/2).
 _BACKWARD = np.linspace(0.05, 1, 192)
@@ -109,7 +109,7 @@ class EchoEstimate:
 
         backscatter = self._backscatter(depths, *spread.tilts(depths / self.system.cos_water))
         water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
-        bottoms = thickness * (np.arange(steps) + 0.5) if every_depth else np.array([self.bottom_depth])
+        bottoms = np.asarray(thickness * (np.arange(steps) + 0.5) if every_depth else [self.bottom_depth])
         return water, arrivals(bottoms, self.reflectance / np.pi * cosine)
 
     def _backscatter(self, depths: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
