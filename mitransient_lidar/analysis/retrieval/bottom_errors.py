@@ -39,7 +39,10 @@ _UNTESTED = 0.05  # relative error of the optical depth where a column is too sh
 _DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
 _CERTAIN = 0.1  # relative error of a sum by noise above which a fit counts
 _WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
-_FOCUSING = 0.45  # relative deviation of the light at the bottom by waves over the deviation of the sea's slopes
+# Relative deviation of the light at a bottom by waves that focus it, over the deviation of the sea's slopes, times the
+# width of the beam [m]; and width that is added to it. At 5 m/s and 8 m eight seas each had 21 % with a beam of 0.2 m
+# and 5 % with one of 0.6 m; three had 2 % with one of 2.1 m.
+_FOCUSING, _NARROWEST = 0.24, 0.1
 _GRID, _REACH = 128, 4.0  # points along each side of a beam, and half of its side in standard deviations
 
 
@@ -188,9 +191,16 @@ def slope_variance(attributes: Mapping[str, Any]) -> float:
     return TYPICAL_SLOPE_VARIANCE if known is None else known
 
 
-def focusing(attributes: Mapping[str, Any]) -> float:
-    """Return the relative standard deviation of the light at a bottom by waves that focus it [1]."""
-    return _FOCUSING * math.sqrt(slope_variance(attributes))
+def focusing(attributes: Mapping[str, Any], slant_range: float) -> float:
+    """Return the relative standard deviation of the light at a bottom by waves that focus it [1], 0 without waves.
+
+    The light of a beam is a mean over facets, of a number that grows with the area of the beam.
+    """
+    if not np.any(attributes.get("surface_heights_m", 1.0)):
+        return 0.0
+    known = (optional_number(attributes, name) for name in ("divergence_mrad", "field_of_view_mrad"))
+    width = 1e-3 * slant_range * min((one for one in known if one is not None), default=0.0)
+    return _FOCUSING * math.sqrt(slope_variance(attributes)) / math.hypot(width, _NARROWEST)
 
 
 def sea_variances(

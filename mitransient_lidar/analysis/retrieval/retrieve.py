@@ -295,7 +295,7 @@ def bottom(
 
     loss = bottom_errors.loss_error(waveforms, echoes, depth[0], surfaces[0][1], mean_attenuation, scattered)
     common = of_echo**2 + loss**2 + hidden**2 + _mean(of_decay**2) / _count(of_decay)
-    wavy = bottom_errors.focusing(dataset.attrs) ** 2
+    wavy = bottom_errors.focusing(dataset.attrs, lidar.slant_range) ** 2
     without, corrected = by_sea["reflectance"]
     of_sea = [wavy + without, wavy + np.where(slope_corrected, corrected, without)]
     # The ratio to the column takes out what the sea does to a shot, but not to the mean of all.
