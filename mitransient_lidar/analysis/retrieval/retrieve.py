@@ -243,7 +243,7 @@ def bottom(
     flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
     share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
     waveforms = Waveforms.from_dataset(summed, None, None, None, None)
-    scattered = scattered_light.of_columns(waveforms, echoes, system, share, dataset.attrs)
+    scattered = scattered_light.of_columns(waveforms, echoes, system, share, dataset)
     whole, by_noise = bottom_errors.whole_energy(waveforms, echoes, scattered)
     missing = np.isnan(time)
     energy, energy_error = np.where(missing, np.nan, whole), np.where(missing, np.nan, by_noise)
@@ -384,7 +384,7 @@ def water(
     column, system = echoes.sel(echo="column"), lidar_system(dataset.attrs, efficiency)
     share = np.where((seen := share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
     waveforms = Waveforms.from_dataset(shallow, None, None, None, None)
-    light = scattered_light.of_columns(waveforms, echoes, system, share, dataset.attrs, factor)
+    light = scattered_light.of_columns(waveforms, echoes, system, share, dataset, factor)
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
     backscatter = scattered_light.backscatter_of(echoes, system, share)
     excess, gain = (np.nan, np.nan) if light is None else (light.excess, light.level)

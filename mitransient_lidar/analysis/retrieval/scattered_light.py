@@ -9,15 +9,14 @@ the level and the decay of a measured one.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import ncx2
 
+from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIO
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
@@ -37,7 +36,7 @@ _BIN, _BEHIND = 0.25, 6.0  # of the column along the path, and its end behind th
 _BELOW = 3.0  # echo widths of water below a column without a bottom
 _LEAST_ABSORPTION = 0.02  # over the attenuation of the column
 _MOST_BACKSCATTERING = 0.2  # [1/m]
-_SHIFTS = 256  # nodes of the share of a beam in view
+_SHIFTS, _TURNS = 256, 32  # nodes of the share of a beam in view, and directions of shifts
 _MODE = 6  # iterations of the time of an echo
 _ALONG, _ACROSS = 2.0, 1.6  # longest path of light turned twice over its depth, and over the radius of the view
 
@@ -48,16 +47,34 @@ class View:
 
     system: LidarSystem  #: The lidar, its energy and aperture without effect.
     radius: float  #: Half angle of the field of view [rad].
+    centre: float  #: Angle of its middle from the beam's axis [rad].
     beam: float  #: Standard deviation of the beam [rad].
     slope_variance: float  #: Total variance of the sea's slopes [1].
     echo_width: float  #: Full width at half maximum of an echo, as a path in the water [m].
 
+    @classmethod
+    def of(cls, dataset: xr.Dataset, system: LidarSystem, echo_width: float) -> View:
+        """Return the view of all pixels of a result as a circle, with the beam of its attributes."""
+        radius, beam = (
+            0.5e-3 * required_number(dataset.attrs, name) for name in ("field_of_view_mrad", "divergence_mrad")
+        )
+        known = optional_number(dataset.attrs, "surface_slope_variance")
+        variance, centre = TYPICAL_SLOPE_VARIANCE if known is None else known, 0.0
+        if lines := [line for pixel in surface_inputs.outlines(dataset) for line in pixel]:
+            corners = np.concatenate(lines)
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            radius, centre = float(np.mean(0.5 * (high - low))), float(np.hypot(*(0.5 * (high + low))))
+        return cls(system, radius, centre, beam, variance, echo_width)
+
     def share(self, shift: FloatArray) -> FloatArray:
-        """Return the share of a beam in the field of view about shifted axes [rad], over that without a shift."""
+        """Return the share of a beam in the field of view, shifted in any direction [rad], over that without one."""
         beam = max(self.beam, 1e-3 * self.radius)
-        nodes = np.linspace(0, self.radius + 6 * beam, _SHIFTS)
-        inside = ncx2.cdf((self.radius / beam) ** 2, 2, (nodes / beam) ** 2)
-        return np.asarray(np.interp(shift, nodes, inside / inside[0]))
+        reach = self.radius + self.centre + 6 * beam
+        apart = np.linspace(0, self.centre + reach, 2 * _SHIFTS)
+        inside = ncx2.cdf((self.radius / beam) ** 2, 2, (apart / beam) ** 2)
+        nodes, turn = np.linspace(0, reach, _SHIFTS), np.exp(2j * np.pi * np.arange(_TURNS) / _TURNS)
+        mean = np.interp(np.abs(self.centre + nodes[:, np.newaxis] * turn), apart, inside).mean(axis=1)
+        return np.asarray(np.interp(shift, nodes, mean / mean[0]))
 
 
 @dataclass(frozen=True)
@@ -120,7 +137,7 @@ def of_columns(
     echoes: xr.Dataset,
     system: LidarSystem,
     share: FloatArray,
-    attributes: Mapping[str, Any],
+    dataset: xr.Dataset,
     phase_factor: float | None = None,
 ) -> ScatteredLight | None:
     """Return the light of the water that the mean column of waveforms shows; None where no column is known.
@@ -131,8 +148,9 @@ def of_columns(
         Waveforms of one pixel, and their table of `echo_table.extract` without the dimension pixel.
     system, share
         The lidar, and the share of the beam in view, shape () or (shots,).
-    attributes
-        Those of the result: ``field_of_view_mrad``, ``divergence_mrad`` and, if it is known, the variance of slopes.
+    dataset
+        Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the variance of
+        slopes and the outlines of pixels.
     phase_factor
         As for `retrieve.water`.
     """
@@ -145,14 +163,7 @@ def of_columns(
     path = waveforms.geometry.path_of_time(records.time_ns[inside])
     gain = waveforms.gain(slice(0, waveforms.count)).mean(axis=0)[inside]
     noise = np.broadcast_to(records.noise, records.power.shape).mean(axis=0)[inside]
-    slope_variance = optional_number(attributes, "surface_slope_variance")
-    view = View(
-        system,
-        0.5e-3 * required_number(attributes, "field_of_view_mrad"),
-        0.5e-3 * required_number(attributes, "divergence_mrad"),
-        TYPICAL_SLOPE_VARIANCE if slope_variance is None else slope_variance,
-        width * waveforms.geometry.metres_per_ns,
-    )
+    view = View.of(dataset, system, width * waveforms.geometry.metres_per_ns)
     bottom = _mean(echoes["time_ns"].sel(echo="bottom").values)
     # Without a bottom, the water goes on below the last bin.
     deepest = float(waveforms.geometry.path_of_time(end + _BELOW * width if math.isnan(bottom) else bottom))

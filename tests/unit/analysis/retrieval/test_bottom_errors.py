@@ -146,7 +146,7 @@ def test_energy_of_a_bottom_is_the_sum_only_where_its_light_is_alone(target_dept
 
     def whole_energy(dataset):
         waveforms = Waveforms.from_dataset(dataset, None, None, None, None)
-        light = scattered_light.of_columns(waveforms, echoes, lidar_system(shot.attrs), np.ones(()), shot.attrs)
+        light = scattered_light.of_columns(waveforms, echoes, lidar_system(shot.attrs), np.ones(()), shot)
         return bottom_errors.whole_energy(waveforms, echoes, light)
 
     energy, error = whole_energy(shot)

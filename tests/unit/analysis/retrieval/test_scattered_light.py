@@ -11,7 +11,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 
 SYSTEM = LidarSystem(200, math.radians(20), 1.34, 1.364, energy=1.0, aperture_area=1.0)
 # 30 mrad around a beam of 10 mrad, ripples of 3 m/s, and echoes of 8.3 ns.
-VIEW = View(SYSTEM, radius=15e-3, beam=5e-3, slope_variance=0.0183, echo_width=0.92)
+VIEW = View(SYSTEM, radius=15e-3, centre=0.0, beam=5e-3, slope_variance=0.0183, echo_width=0.92)
 
 # Renders of `table1` over a level sea with components, 8 passes, seed 1: absorption and backscattering of Jerlov's type
 # [1/m]; the window of the column's fit and the path of the bottom's echo [m], decay [1/m] and level [1/(m sr)] of the
@@ -43,9 +43,15 @@ def test_light_of_rendered_columns(name, monkeypatch):
 
 
 def test_a_narrow_beam_is_all_in_view_and_a_wide_one_moves_out():
-    narrow, wide = (View(SYSTEM, 15e-3, beam, 0.0, 1.0) for beam in (1e-6, 5e-3))
+    narrow, wide = (View(SYSTEM, 15e-3, 0.0, beam, 0.0, 1.0) for beam in (1e-6, 5e-3))
     np.testing.assert_allclose(narrow.share(np.array([0.0, 0.0149, 0.0151])), [1, 1, 0], atol=0.02)
     rng = np.random.default_rng(1)
     x, y = 5e-3 * rng.standard_normal((2, 200_000))
     inside = [np.mean(np.hypot(x + shift, y) < 15e-3) for shift in (0.0, 8e-3, 15e-3)]
     np.testing.assert_allclose(wide.share(np.array([0.0, 8e-3, 15e-3])), np.divide(inside, inside[0]), atol=0.005)
+    # About a view whose middle is 6 mrad away, a shift in any direction.
+    away, turn = View(SYSTEM, 8e-3, 6e-3, 5e-3, 0.0, 1.0), 2 * np.pi * rng.random(x.size)
+    inside = [
+        np.mean(np.hypot(x + shift * np.cos(turn) - 6e-3, y + shift * np.sin(turn)) < 8e-3) for shift in (0, 8e-3)
+    ]
+    assert float(away.share(np.array(8e-3))) == pytest.approx(inside[1] / inside[0], rel=0.02)
