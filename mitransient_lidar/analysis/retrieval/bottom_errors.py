@@ -31,11 +31,12 @@ LARGEST_ERROR = 0.5
 LEAST_SHARE = 0.05
 
 _FEWEST_SHOTS = 8  # whose scatter of reflectance is known
-_OF_ECHO = 0.02  # relative error of the energy of the bottom echo with its tail
+_OF_ECHO = 0.01  # relative error of the energy of the bottom echo with its tail
 _AROUND = (2.0, 4.0)  # echo widths before and behind a bottom echo whose light counts
 _APART = 4.0  # echo widths between a bottom echo and others that leave this light its own
 _OF_GAIN = 0.07  # error of the column's gain on the bottom by scattering, relative to it: bb/b is not known
-_UNTESTED = 0.05  # relative error of the optical depth where a column is too short to be tested for layers
+_OF_SHAPE = 0.012  # error of the optical depth for a bottom as far below the surface as the column's fit is long
+_UNTESTED = 0.04  # relative error of the optical depth where a column is too short to be tested for layers
 _DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
 _CERTAIN = 0.1  # relative error of a sum by noise above which a fit counts
 _WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
@@ -98,7 +99,8 @@ def loss_error(
         return np.inf
     split = _loss_of_layers(echoes, depth, path, depths, light)
     ahead = _excess_before_bottom(waveforms, echoes, light)
-    parts = [_OF_GAIN * float(np.nanmean(light.gain_of_column(path)))]
+    far = float(np.nanmean(path)) / (light.fitted[-1] - light.fitted[0])
+    parts = [_OF_GAIN * float(np.nanmean(light.gain_of_column(path))), _OF_SHAPE * far]
     parts += [] if np.isfinite(split).any() else [_UNTESTED * float(np.nanmean(depths))]
     parts += [float(np.mean(part[np.isfinite(part)])) for part in (split, ahead) if np.isfinite(part).any()]
     return float(np.linalg.norm(parts))
