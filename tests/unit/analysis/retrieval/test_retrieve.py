@@ -296,7 +296,7 @@ def test_command(tmp_path):
     written = tmp_path / "out" / "found.nc"
     done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
     assert done.exit_code == 0, done.output
-    for text in ("slope along: ", "bottom depth: 8.0", "bright 9", "water (1/m): a 0.1", "attenuation (1/m): c "):
+    for text in ("slope along: ", "bottom depth: 8.0", "bright 100", "water (1/m): a 0.1", "attenuation (1/m): c "):
         assert text in done.output
     for line in done.stdout.splitlines()[1:-1]:
         assert " +- " in line or " %" in line or " to " in line, line
