@@ -140,18 +140,15 @@ WATERS = {
 @pytest.mark.long
 @pytest.mark.parametrize("name", WATERS)
 def test_waters(name):
-    """Kd and bb within 25 %: ten waters came within 13 and 10 % with many passes. Of c no more than bounds.
-
-    Not an independent check: the constants of the retrieval, 6.4 and 10.6 m and the factor 1.13, were fitted to columns
-    of this renderer. An error of the renderer that is the same in all waters would pass. The next test is independent.
-    """
+    """a, Kd and bb within 10 %; of c no more than bounds. The retrieval's estimate of the column shares no code."""
     absorption, scattering, backscattering = WATERS[name]
     params = {"attenuation": absorption + scattering, "scattering": scattering, "backscattering": backscattering}
     params |= {"bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
     found = retrieve.water(mitransient_lidar.render("fig09_1x1", params=params, passes=4, seed=4))
     kd = InherentProperties(absorption, scattering, backscattering).kd
-    assert float(found["kd"]) == pytest.approx(kd, rel=0.25)
-    assert float(found["backscattering"]) == pytest.approx(backscattering, rel=0.25)
+    assert float(found["absorption"]) == pytest.approx(absorption, rel=0.1)
+    assert float(found["kd"]) == pytest.approx(kd, rel=0.1)
+    assert float(found["backscattering"]) == pytest.approx(backscattering, rel=0.1)
     assert found["attenuation_low"] < absorption + scattering < found["attenuation_high"]
 
 
@@ -161,10 +158,10 @@ def test_waters_in_closed_form(name):
     """Columns of the lidar equation, and Kd of an independent Monte Carlo study; nothing is rendered.
 
     In quasi-single scattering (Gordon 1982, doi:10.1364/AO.21.002996) the column in a wide view has the level of single
-    scattering by bb and decays with a + bb. The retrieval must return a, and bb divided by its factor 1.13 for the
-    multiple scattering that this signal lacks. For the sun at the zenith, Kirk (1984), Limnol. Oceanogr. 29, 350,
-    doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold: 7 to 12 % above the
-    relation of Lee, Du and Arnone (2005) that the retrieval uses.
+    scattering by bb and decays with a + bb. Light that is scattered more often adds to the column with depth: the
+    retrieval must return a between a and a + bb, and less than bb. For the sun at the zenith, Kirk (1984), Limnol.
+    Oceanogr. 29, 350, doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold: 7
+    to 12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses.
     """
     absorption, scattering, backscattering = WATERS[name]
     angle, index, group = math.radians(20), 1.34, 1.364
@@ -186,6 +183,6 @@ def test_waters_in_closed_form(name):
     options = {"time": time, "pixel_names": ["all"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": attributes}
     found = retrieve.water(results.build(*arrays, **options), efficiency=0.81 * 0.9)
     assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=0.01)
-    assert float(found["absorption"]) == pytest.approx(absorption, rel=0.02)
-    assert 1.13 * float(found["backscattering"]) == pytest.approx(backscattering, rel=0.03)
+    assert absorption < float(found["absorption"]) < absorption + backscattering
+    assert 0.7 * backscattering < float(found["backscattering"]) < backscattering
     assert float(found["kd"]) == pytest.approx(math.sqrt(absorption**2 + 0.235 * absorption * scattering), rel=0.15)
