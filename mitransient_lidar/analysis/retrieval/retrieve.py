@@ -221,7 +221,7 @@ def bottom(
     Column and bottom decay by what `scattered_light` finds for homogeneous water with typical particles. The light is
     that of the beam in the pixels (coordinate ``beam_share``) through the open part of the aperture. The errors of
     reflectances include noise, 1 % of the energy of the echo, the unknown bb/b of particles, layers (differences from
-    homogeneous water, or 4 % of the optical depth of both ways in columns too short to be tested), waves that focus
+    homogeneous water, or 3 % of the optical depth of both ways in columns too short to be tested), waves that focus
     light, slope and height of the sea, and the share of the beam that targets of a scene hide. A relative error above
     0.5 leaves no value. Errors of efficiencies and of the pulse's energy are not included.
 
