@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d
-from scipy.stats import ncx2
 
 from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIO
@@ -68,10 +66,12 @@ class View:
 
     def share(self, shift: FloatArray) -> FloatArray:
         """Return the share of a beam in the field of view, shifted in any direction [rad], over that without one."""
+        from scipy.special import chndtr
+
         beam = max(self.beam, 1e-3 * self.radius)
         reach = self.radius + self.centre + 6 * beam
         apart = np.linspace(0, self.centre + reach, 2 * _SHIFTS)
-        inside = ncx2.cdf((self.radius / beam) ** 2, 2, (apart / beam) ** 2)
+        inside = chndtr((self.radius / beam) ** 2, 2, (apart / beam) ** 2)
         nodes, turn = np.linspace(0, reach, _SHIFTS), np.exp(2j * np.pi * np.arange(_TURNS) / _TURNS)
         mean = np.interp(np.abs(self.centre + nodes[:, np.newaxis] * turn), apart, inside).mean(axis=1)
         return np.asarray(np.interp(shift, nodes, mean / mean[0]))
@@ -230,6 +230,8 @@ def _curves(
     view: View, a: float, bb: float, b: float, phase: PowerLawTable, depth: float, paths: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return path and signal of the column, and path and logarithm of bottoms, of `ScatteredLight`."""
+    from scipy.ndimage import gaussian_filter1d
+
     column = WaterColumn(*(np.array([one]) for one in (0.0, a + b, b, bb)))
     model = EchoEstimate(view.system, column, [phase], np.eye(2) * 0.5 * view.slope_variance, depth, np.pi)
     rng = np.random.default_rng(0)
