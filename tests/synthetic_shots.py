@@ -34,6 +34,7 @@ ATTRIBUTES = {
     "field_of_view_mrad": 60.0,
     "divergence_mrad": 0.1,
     "surface_time_ns": SURFACE,
+    "surface_heights_m": [0.0, 0.0],
     "scene.optical_efficiency": "0.9",
     "scene.two_way_atmospheric_transmittance": "0.9",
 }
@@ -58,7 +59,7 @@ def waveform(delay=0.0, share=0.25, glint=2e-13, factor=1.0, k=A + BB, depth=DEP
     path = depth / COS_WATER
     surface, bottom = SURFACE + delay, SURFACE + delay + 2 * N * path / C0
     through = factor * share * ENERGY * normal_transmittance() ** 2
-    # 1.13 is the multiple scattering that `column_retrieval` assumes.
+    # 1.13 is the multiple scattering of the fixture `scattered_once`.
     level = through * solid_angle(0.0) * 1.13 * BB / (2 * np.pi) * C0 * 1e9 / (2 * N)
     echo = through * solid_angle(path) * RHO / np.pi * COS_WATER * math.exp(-2 * k * path)
 

@@ -96,12 +96,12 @@ def estimate(
     has layers of one refractive index; the bottom is level and Lambertian. Targets, bubbles and slopes of the bottom
     are left out. Light that large angles turn more than once is missing.
 
-    Compared with renders of ``table1`` over a level sea, with views of 10 to 100 mrad, bottoms at 4 to 15 m and
-    Jerlov's types II, 1C and 5C, and with a beam of 0.5 mrad in 5 mrad, the surface agrees within 0.1 %, the bottom
-    within 2 % of its energy, 4 % of its peak and 0.3 ns of its mean time. The water has 1 to 8 % too little energy,
-    15 % in 5C, mostly late. Over waves of 3 and 6 m/s, means of six seas, the column has 7 and 2 % too much at 0.5 to
-    1.5 m, and less with depth, down to 5 % too little at 6 to 8 m; the bottom has 2 and 3 % too much. In the turbid
-    layers of ``fig15_2x2``, c of 0.9 and 0.5, the bottom has 3 to 13 % too little.
+    Compared with renders of ``table1`` over a level sea, in Jerlov's types 1C and 3C and with bottoms at 4 to 12 m, the
+    surface agrees within 0.1 % and the water has 2 to 3 % too little energy, in 5C 4 to 6 %, and 8 % in views of 60 and
+    200 mrad. The bottom agrees within 3 % of its energy up to 8 attenuation lengths; beyond, where its light is late,
+    it has too little: 10 % at 12 and 27 % at 18 attenuation lengths (5C at 8 and 12 m). Over waves of 3 and 6 m/s the
+    result is the mean over seas. In the turbid layers of ``fig15_2x2``, c of 0.9 and 0.5, the bottom had 3 to 13 % too
+    little.
     """
     paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)

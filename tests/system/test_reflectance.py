@@ -9,6 +9,7 @@ import xarray as xr
 import mitransient_lidar
 from mitransient_lidar.analysis.retrieval import retrieve
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
+from mitransient_lidar.physics.water.water_types import water_of
 
 RHO = 0.15
 LEVEL = xr.Dataset({"slope_along": 0.0, "slope_across": 0.0, "surface_range": 200 / math.cos(math.radians(20))})
@@ -31,7 +32,7 @@ def shot(lidar_scene):
             integrator={"type": "lidar_merging", "paths_per_pass": 2**15},
             tx=tx,
             rx=rx,
-            water={"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006, **(water or {})},
+            water=water or {"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006},
             sea={"slope_variance": "cox_munk", "wind_speed": 3.0},
             film={"time_start_ns": "auto", "bin_count": "auto"},
             rho=RHO,
@@ -71,6 +72,20 @@ def test_reflectance_within_its_error(tx, rx, shot):
     value, error = float(found["reflectance"]), float(found["reflectance_stderr"])
     assert error < 0.25 * RHO
     assert abs(value - RHO) < error, (value, error)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jerlov", [pytest.param("1C", marks=pytest.mark.long), "5C"])
+def test_forward_scattering_leaves_no_bias(jerlov, shot):
+    """If the light of the bottom decayed as that of the column does, 5C would have 0.11 +- 0.03."""
+    seen = shot(water={"jerlov": jerlov})
+    found, water = retrieve.bottom(seen, LEVEL), retrieve.water(seen)
+    np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.12)
+    assert (np.abs(found["reflectance"] - RHO) < 2 * found["reflectance_stderr"]).all()
+    assert (found["reflectance_stderr"] < 0.2 * found["reflectance"]).all()
+    true = water_of("jerlov", jerlov)
+    for name in ("absorption", "backscattering"):
+        assert float(water[name]) == pytest.approx(getattr(true, name), rel=0.08)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarS
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
@@ -131,19 +131,17 @@ WATERS = {
 @pytest.mark.long
 @pytest.mark.parametrize("name", WATERS)
 def test_waters(name):
-    """Kd and bb within 25 %: ten waters came within 13 and 10 % with many passes. Of c no more than bounds.
+    """a and Kd within 10 %, bb within 17 %; of c no more than bounds. The estimate of the column shares no code.
 
-    Not an independent check: the constants of the retrieval, 6.4 and 10.6 m and the factor 1.13, were fitted to columns
-    of this renderer. An error of the renderer that is the same in all waters would pass. The next test is independent.
+    Petzold's phase functions hold the molecules that the retrieval adds: bb of the second is 15 % low.
     """
-    absorption, scattering, backscattering = WATERS[name]
-    params = {"attenuation": absorption + scattering, "scattering": scattering, "backscattering": backscattering}
-    params |= {"bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
+    kind, kept = name.split()
+    params = {kind: kept, "bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
     found = retrieve.water(mitransient_lidar.render("fig09_1x1", params=params, passes=4, seed=4))
-    kd = InherentProperties(absorption, scattering, backscattering).kd
-    assert float(found["kd"]) == pytest.approx(kd, rel=0.25)
-    assert float(found["backscattering"]) == pytest.approx(backscattering, rel=0.25)
-    assert found["attenuation_low"] < absorption + scattering < found["attenuation_high"]
+    true = water_of(kind, kept)
+    for quantity, limit in (("absorption", 0.1), ("kd", 0.1), ("backscattering", 0.17)):
+        assert float(found[quantity]) == pytest.approx(getattr(true, quantity), rel=limit)
+    assert found["attenuation_low"] < true.attenuation < found["attenuation_high"]
 
 
 @pytest.mark.slow
@@ -152,10 +150,10 @@ def test_waters_in_closed_form(name):
     """Columns of the lidar equation, and Kd of an independent Monte Carlo study; nothing is rendered.
 
     In quasi-single scattering (Gordon 1982, doi:10.1364/AO.21.002996) the column in a wide view has the level of single
-    scattering by bb and decays with a + bb. The retrieval must return a, and bb divided by its factor 1.13 for the
-    multiple scattering that this signal lacks. For the sun at the zenith, Kirk (1984), Limnol. Oceanogr. 29, 350,
-    doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold: 7 to 12 % above the
-    relation of Lee, Du and Arnone (2005) that the retrieval uses.
+    scattering by bb and decays with a + bb. Light that is scattered more often adds to the column with depth: the
+    retrieval must return a between a and a + bb, and less than bb. For the sun at the zenith, Kirk (1984), Limnol.
+    Oceanogr. 29, 350, doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold:
+    7 to 12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses.
     """
     absorption, scattering, backscattering = WATERS[name]
     angle, index, group = math.radians(20), 1.34, 1.364
@@ -177,6 +175,6 @@ def test_waters_in_closed_form(name):
     options = {"time": time, "pixel_names": ["all"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": attributes}
     found = retrieve.water(results.build(*arrays, **options), efficiency=0.81 * 0.9)
     assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=0.01)
-    assert float(found["absorption"]) == pytest.approx(absorption, rel=0.02)
-    assert 1.13 * float(found["backscattering"]) == pytest.approx(backscattering, rel=0.03)
+    assert absorption < float(found["absorption"]) < absorption + backscattering
+    assert 0.7 * backscattering < float(found["backscattering"]) < backscattering
     assert float(found["kd"]) == pytest.approx(math.sqrt(absorption**2 + 0.235 * absorption * scattering), rel=0.15)

@@ -13,9 +13,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import surface_inputs
+from mitransient_lidar.analysis.retrieval.scattered_light import ScatteredLight
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.analysis.retrieval.surface_echoes import inside_outline
 from mitransient_lidar.analysis.waveforms.column_onset import Focusing
+from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE
 from mitransient_lidar.analysis.waveforms.echo_detection import error_of_sums
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
@@ -28,19 +30,20 @@ LARGEST_ERROR = 0.5
 #: Smallest share of the beam's energy in the pixels at which scattered light does not dominate their echoes.
 LEAST_SHARE = 0.05
 
-_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
-_OF_ECHO = 0.03  # relative error of the energy of the bottom echo with its tail
-#: Optical depth of both ways by which light of the bottom loses more than the column's decay says, and its error: light
-#: that the water scatters twice by large angles joins the column within its first metres, and its decay is slower.
-COLUMN_GAIN, _OF_COLUMN_GAIN = 0.035, 0.04
+_FEWEST_SHOTS = 8  # whose scatter of reflectance is known
+_OF_ECHO = 0.01  # relative error of the energy of the bottom echo with its tail
 _AROUND = (2.0, 4.0)  # echo widths before and behind a bottom echo whose light counts
 _APART = 4.0  # echo widths between a bottom echo and others that leave this light its own
-_OF_LOSS = 0.05  # relative error of the optical depth of both ways: the bottom's light decays unlike the column's
-_UNTESTED = 0.15  # the same for a column that is too short to be tested for layers
+_OF_GAIN = 0.07  # error of the column's gain on the bottom by scattering, relative to it: bb/b is not known
+_OF_SHAPE = 0.01  # error of the optical depth for a bottom as far below the surface as the column's fit is long
+_UNTESTED = 0.03  # relative error of the optical depth where a column is too short to be tested for layers
 _DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
 _CERTAIN = 0.1  # relative error of a sum by noise above which a fit counts
 _WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
-_FOCUSING = 0.45  # relative deviation of the light at the bottom by waves over the deviation of the sea's slopes
+# Relative deviation of the light at a bottom by waves that focus it, over the deviation of the sea's slopes, times the
+# width of the beam [m]; and width that is added to it. At 5 m/s and 8 m eight seas each had 21 % with a beam of 0.2 m
+# and 5 % with one of 0.6 m; three had 2 % with one of 2.1 m.
+_FOCUSING, _NARROWEST = 0.24, 0.1
 _GRID, _REACH = 128, 4.0  # points along each side of a beam, and half of its side in standard deviations
 
 
@@ -65,35 +68,47 @@ REASONS = {
 
 
 def loss_error(
-    summed: xr.Dataset, echoes: xr.Dataset, depth: FloatArray, path: FloatArray, attenuation: float
+    waveforms: Waveforms,
+    echoes: xr.Dataset,
+    depth: FloatArray,
+    path: FloatArray,
+    attenuation: float,
+    light: ScatteredLight | None,
 ) -> float:
     """Return the error of the optical depth of both ways to the bottom by the method [1], infinite if unknown.
 
-    The loss is that of one exponential through the column. Two signs that the water differs below count in full: the
-    loss by two exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over
-    the exponential. Both are means over the shots, of the same water.
+    The loss is that of homogeneous water. Two signs that the water differs below count in full: the loss by two
+    exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over the
+    column's, each less that of homogeneous water. Both are means over the shots, of the same water.
 
     Parameters
     ----------
-    summed
-        Waveforms over (pixel, time) or (shot, pixel, time), of one pixel.
+    waveforms
+        Waveforms of one pixel.
     echoes
         Table of `echo_table.extract` of these waveforms with `layers`, without the dimension pixel.
     depth, path
         Depths of the bottom and one-way paths to it in the water [m], of the shots.
     attenuation
         Mean attenuation of the columns along the path [1/m].
+    light
+        Scattered light of homogeneous water.
     """
     depths = 2 * attenuation * path
-    if not np.isfinite(depths).any():
+    if light is None or not np.isfinite(depths).any():
         return np.inf
-    split, ahead = _loss_of_layers(echoes, depth, path, depths), _excess_before_bottom(summed, echoes)
-    parts = [(_OF_LOSS if np.isfinite(split).any() else _UNTESTED) * float(np.nanmean(depths))]
+    split = _loss_of_layers(echoes, depth, path, depths, light)
+    ahead = _excess_before_bottom(waveforms, echoes, light)
+    far = float(np.nanmean(path)) / (light.fitted[-1] - light.fitted[0])
+    parts = [_OF_GAIN * float(np.nanmean(light.gain_of_column(path))), _OF_SHAPE * far]
+    parts += [] if np.isfinite(split).any() else [_UNTESTED * float(np.nanmean(depths))]
     parts += [float(np.mean(part[np.isfinite(part)])) for part in (split, ahead) if np.isfinite(part).any()]
     return float(np.linalg.norm(parts))
 
 
-def _loss_of_layers(echoes: xr.Dataset, depth: FloatArray, path: FloatArray, loss: FloatArray) -> FloatArray:
+def _loss_of_layers(
+    echoes: xr.Dataset, depth: FloatArray, path: FloatArray, loss: FloatArray, light: ScatteredLight
+) -> FloatArray:
     """Return the optical depth of both ways by two exponentials less that by one, NaN for too short a column."""
     names = ("layer_depth_m", "layer_attenuation_above", "layer_attenuation_below")
     at, above, below = (np.moveaxis(echoes[name].transpose(..., "layer").values, -1, 0) for name in names)
@@ -102,18 +117,21 @@ def _loss_of_layers(echoes: xr.Dataset, depth: FloatArray, path: FloatArray, los
     usable = (share > 0) & (share < _DEEPEST_CHANGE)
     first = np.argmax(usable, axis=0)[np.newaxis]
     part, upper, lower = (np.take_along_axis(one, first, axis=0)[0] for one in (share, above, below))
-    difference = 2 * path * (upper * part + np.maximum(lower, 0) * (1 - part)) - loss
+    difference: FloatArray = 2 * path * (upper * part + np.maximum(lower, 0) * (1 - part)) - loss
+    if usable.any():
+        # The column of homogeneous water is no exponential.
+        more, less = light.slopes(float(np.nanmean(np.where(usable.any(axis=0), part * path, np.nan))))
+        difference = difference - 2 * path * (more * part + less * (1 - part))
     return np.asarray(np.where(usable.any(axis=0), difference, np.where(np.isfinite(share[0]), 0.0, np.nan)))
 
 
-def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
+def _excess_before_bottom(waveforms: Waveforms, echoes: xr.Dataset, light: ScatteredLight) -> FloatArray:
     """Return the logarithm of the signal before bottom echoes over the columns', NaN without both; of the shots."""
-    waveforms = Waveforms.from_dataset(summed, None, None, None, None)
     rows = slice(0, waveforms.count)
     time, width = waveforms.records(rows).time_ns, waveforms.echo_fwhm_ns
     start, middle = (echoes["time_ns"].sel(echo=name).values.reshape(-1, 1) for name in ("surface", "bottom"))
     inside = (time > np.maximum(middle - _WINDOW[0] * width, start + width)) & (time < middle - _WINDOW[1] * width)
-    column = _column_of(waveforms, time, echoes)
+    column = _column_of(waveforms, time, echoes, light)
     power = waveforms.records(rows).power
     measured, fitted = (np.sum(np.where(inside & np.isfinite(column), one, 0), axis=1) for one in (power, column))
     known = (measured > 0) & (fitted > 0)
@@ -121,23 +139,25 @@ def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
     return np.where(known, np.log(ratio), np.nan).reshape(echoes["attenuation"].shape)
 
 
-def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, FloatArray]:
+def whole_energy(
+    waveforms: Waveforms, echoes: xr.Dataset, light: ScatteredLight | None
+) -> tuple[FloatArray, FloatArray]:
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
     Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy are
-    not in the Gaussian that is fitted to the echo. The sum of the signal about the echo, less the column before it, is
-    all of it. The Gaussian counts where noise makes the sum less certain than 10 %, there is no column, the sum would
-    reach beyond the record, or another echo is less than four echo widths before the bottom's.
+    not in the Gaussian that is fitted to the echo. The sum of the signal about the echo, less the column before it and
+    the column's late light behind it, is all of it. The Gaussian counts where noise makes the sum less certain than
+    10 %, there is no column, the sum would reach beyond the record, or another echo is less than four echo widths
+    before the bottom's.
 
     Parameters are those of `loss_error`.
     """
-    waveforms = Waveforms.from_dataset(summed, None, None, None, None)
     rows = slice(0, waveforms.count)
     records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
     middle, energy, error = (echoes[name].sel(echo="bottom").values for name in ("time_ns", "energy", "energy_stderr"))
     from_echo = records.time_ns - middle.reshape(-1, 1)
     inside = (from_echo > -_AROUND[0] * width) & (from_echo < _AROUND[1] * width)
-    column = np.where(from_echo < 0, _column_of(waveforms, records.time_ns, echoes), 0)
+    column = np.zeros(1) if light is None else _column_of(waveforms, records.time_ns, echoes, light)
     seconds = 1e-9 * records.bin_ns
     total = seconds * np.sum(np.where(inside, records.power - column, 0), axis=1).reshape(energy.shape)
     of_total = seconds * error_of_sums(np.where(inside, records.noise, 0), None, records.shared).reshape(energy.shape)
@@ -146,18 +166,19 @@ def whole_energy(summed: xr.Dataset, echoes: xr.Dataset) -> tuple[FloatArray, Fl
     others = echoes["time_ns"].drop_sel(echo=["column", "bottom"]).transpose("echo", ...).values
     # Comparisons with the times of echoes that are not there are false.
     alone = ~(others > middle - _APART * width).any(axis=0)
-    better = np.isfinite(total) & (of_total < _CERTAIN * total) & whole & alone
+    better = (light is not None) & np.isfinite(total) & (of_total < _CERTAIN * total) & whole & alone
     return np.where(better, total, energy), np.where(better, of_total, error)
 
 
-def _column_of(waveforms: Waveforms, time: FloatArray, echoes: xr.Dataset) -> FloatArray:
-    """Return the columns that were fitted to waveforms, extrapolated to all times, shape (waveforms, time)."""
+def _column_of(waveforms: Waveforms, time: FloatArray, echoes: xr.Dataset, light: ScatteredLight) -> FloatArray:
+    """Return the columns of fits to waveforms above a bottom, at all times, shape (waveforms, time)."""
     start, level = (
         echoes[name].sel(echo=echo).values.reshape(-1, 1)
         for name, echo in (("time_ns", "surface"), ("amplitude", "column"))
     )
     decay = echoes["attenuation"].values.reshape(-1, 1) * 2 * waveforms.geometry.metres_per_ns
-    return np.asarray(level * waveforms.gain(slice(0, waveforms.count)) * np.exp(-decay * (time - start)))
+    exponential = level * waveforms.gain(slice(0, waveforms.count)) * np.exp(-decay * (time - start))
+    return np.asarray(exponential * light.column_ratio(waveforms.geometry.path_of_time(time)))
 
 
 def focusing_at(dataset: xr.Dataset, depth: FloatArray) -> FloatArray:
@@ -169,12 +190,19 @@ def focusing_at(dataset: xr.Dataset, depth: FloatArray) -> FloatArray:
 def slope_variance(attributes: Mapping[str, Any]) -> float:
     """Return the total variance of the sea's slopes [1], a typical one if it is unknown."""
     known = optional_number(attributes, "surface_slope_variance")
-    return _TYPICAL_SLOPE_VARIANCE if known is None else known
+    return TYPICAL_SLOPE_VARIANCE if known is None else known
 
 
-def focusing(attributes: Mapping[str, Any]) -> float:
-    """Return the relative standard deviation of the light at a bottom by waves that focus it [1]."""
-    return _FOCUSING * math.sqrt(slope_variance(attributes))
+def focusing(attributes: Mapping[str, Any], slant_range: float) -> float:
+    """Return the relative standard deviation of the light at a bottom by waves that focus it [1], 0 without waves.
+
+    The light of a beam is a mean over facets, of a number that grows with the area of the beam.
+    """
+    if not np.any(attributes.get("surface_heights_m", 1.0)):
+        return 0.0
+    known = (optional_number(attributes, name) for name in ("divergence_mrad", "field_of_view_mrad"))
+    width = 1e-3 * slant_range * min((one for one in known if one is not None), default=0.0)
+    return _FOCUSING * math.sqrt(slope_variance(attributes)) / math.hypot(width, _NARROWEST)
 
 
 def sea_variances(
@@ -221,7 +249,19 @@ def sea_variances(
 
 def echo_error(energy: FloatArray, stderr: FloatArray) -> FloatArray:
     """Return the relative error of the energies of bottom echoes by noise and by the method."""
-    return np.hypot(math.hypot(_OF_ECHO, _OF_COLUMN_GAIN), np.nan_to_num(stderr / energy))
+    return np.hypot(_OF_ECHO, np.nan_to_num(stderr / energy))
+
+
+def scatter(reflectance: FloatArray) -> float:
+    """Return the relative standard deviation of reflectances over shots, infinite for few shots."""
+    known = reflectance[np.isfinite(reflectance) & (reflectance > 0)]
+    return float(np.std(np.log(known))) if known.size >= _FEWEST_SHOTS else math.inf
+
+
+def steadier(corrected: FloatArray, uncorrected: FloatArray) -> bool:
+    """Return whether reflectances scatter less over shots, or have too few shots for that."""
+    found = scatter(corrected)
+    return math.isinf(found) or found < scatter(uncorrected)
 
 
 def target_flags(

@@ -13,18 +13,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.physics.water.seawater import water_scattering
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 
-#: Diameters [m] of the field of view on the sea at which a column decays with Kd, and from which on with a + bb.
-SPOT_OF_KD, SPOT_OF_A_PLUS_BB = 6.4, 10.6
-
-#: Smallest diameter [m]: below it, the loss of light from the field of view is not distinct from attenuation.
+#: Smallest diameter of the field of view on the sea [m]: below it, the loss of light from the view is not distinct from
+#: attenuation.
 SMALLEST_SPOT = 6.0
-
-#: Level of a column by multiple scattering over that by bb alone.
-MULTIPLE_SCATTERING = 1.13
 
 #: Relative error of bb and Kd by the method.
 METHOD_ERROR = 0.1
@@ -60,14 +55,7 @@ class WaterEstimate:
         return {"absorption": np.hypot(kd, per_bb * backscattering), "backscattering": backscattering, "kd": kd}
 
 
-def water_of_column(
-    decay: npt.ArrayLike,
-    backscatter: npt.ArrayLike,
-    spot_diameter: float,
-    *,
-    first_path: float = 0.0,
-    phase_factor: float = 1.0,
-) -> WaterEstimate:
+def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
     """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide field of view.
 
     Parameters
@@ -76,52 +64,26 @@ def water_of_column(
         Attenuation K along the path of the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi)
         including multiple scattering [1/(m sr)]: the power at the surface, extrapolated with K, over
         `LidarSystem.column_gain` and the fraction of the beam in view.
-    spot_diameter : float
-        Diameter of the receiver's field of view on the sea surface [m], at least 6.
-    first_path : float
-        Path at which the fit of the column begins [m]: above it, the signal decays with a + bb.
-    phase_factor : float
-        2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for those of Fournier and Forand.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range.
+    excess, level : float
+        K less the absorption [1/m], and backscatter over bb/(2 pi), of `scattered_light.ScatteredLight`.
 
     Notes
     -----
-    bb = 2 pi backscatter exp(-2 (K - a - bb) s_1)/(1.13 phase_factor). K is a + bb where all forward-scattered light is
-    received (quasi-single scattering, Gordon 1982, doi:10.1364/AO.21.002996), from a diameter of 10.6 m on, and Kd at
-    6.4 m; between them it is linear in the diameter. Kd is that of Lee, Du and Arnone (2005),
-    doi:10.1029/2004JC002275. The diameters and the factor 1.13 are an empirical fit to columns rendered by this
-    package, for one geometry: seven waters (c 0.18 to 1.4), a beam of 10 mrad, 200 m high, 2 to 5 m deep; their levels
-    scattered by 8 %. The beam must be narrower than the field of view, and the column homogeneous.
-
-    c is ill-posed: the signal hardly depends on forward scattering. The estimate is a + bw + (bb - bw/2)/r, with the
-    scattering bw of sea water at 532 nm, for particles of r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The
-    waters of `water_types` have 0.0033 (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
+    Kd is that of Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on
+    forward scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw of sea water at 532 nm, for
+    particles of r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters of `water_types` have 0.0033
+    (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
     """
-    diameter = in_range("spot_diameter", spot_diameter, SMALLEST_SPOT, np.inf)
-    factor = positive("phase_factor", phase_factor)
-    fall, level = np.broadcast_arrays(np.asarray(decay, dtype=np.float64), np.asarray(backscatter, dtype=np.float64))
-    share = np.clip((SPOT_OF_A_PLUS_BB - diameter) / (SPOT_OF_A_PLUS_BB - SPOT_OF_KD), 0, 1)
-    known = np.isfinite(fall) & np.isfinite(level) & (fall > 0) & (level > 0)
-    k = np.where(known, fall, 1.0)
-    apparent = 2 * np.pi * np.where(known, level, 0.0) / (MULTIPLE_SCATTERING * factor)
-    # The iteration converges fast, since Kd - a - bb is much smaller than K.
-    a, bb = k.copy(), apparent
-    for _ in range(60):
-        excess = share * (_kd(np.maximum(a, 0), bb) - np.maximum(a, 0) - bb)
-        bb = apparent * np.exp(-2 * excess * first_path)
-        a = 0.5 * (a + k - bb - excess)
-    known &= a > 0
-    kd = _kd(np.maximum(a, 0), bb)
+    fall, seen = np.broadcast_arrays(np.asarray(decay, dtype=np.float64), np.asarray(backscatter, dtype=np.float64))
+    a, bb = fall - excess, 2 * np.pi * seen / level
+    known = np.isfinite(a) & np.isfinite(bb) & (a > 0) & (bb > 0)
+    a, bb = (np.where(known, one, 1.0) for one in (a, bb))
     molecules = float(water_scattering(532.0))
     particles = np.maximum(bb - molecules / 2, 0)
     usual, low, high = (
         a + molecules + particles / ratio for ratio in (BACKSCATTER_RATIO, *reversed(BACKSCATTER_RATIOS))
     )
-    return WaterEstimate(*(np.where(known, value, np.nan) for value in (a, bb, kd, usual, low, high)))
+    return WaterEstimate(*(np.where(known, value, np.nan) for value in (a, bb, _kd(a, bb), usual, low, high)))
 
 
 def _kd(absorption: FloatArray, backscattering: FloatArray) -> FloatArray:

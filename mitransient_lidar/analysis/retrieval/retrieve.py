@@ -14,14 +14,21 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.retrieval import bottom_errors, column_retrieval, surface_inputs, surface_slope
-from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
+from mitransient_lidar.analysis.retrieval import (
+    bottom_errors,
+    column_retrieval,
+    scattered_light,
+    surface_inputs,
+    surface_slope,
+)
+from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag, scatter, steadier
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
@@ -34,9 +41,7 @@ from mitransient_lidar.results.geometry import (
 )
 
 _LOG = logging.getLogger(__name__)
-_FEWEST_SHOTS = 8  # whose scatter of reflectance is known
 _STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
-_COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
 
 
 def surface_slopes(
@@ -213,12 +218,12 @@ def bottom(
     Reflectances ``level`` and ``slope`` use the mean attenuation of all shots. The ratio needs a column of at least 8
     bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
-    The light is that of the beam in the pixels (coordinate ``beam_share``) through the open part of the aperture. The
-    errors of reflectances include noise, 5 % of the energy of the echo, 5 % of the optical depth of both ways (15 %
-    where the column is too short to be tested for layers), the difference between one and two exponentials through the
-    column, waves that focus light, slope and height of the sea, and the share of the beam that targets of a scene hide.
-    A relative error above 0.5 leaves no value. Errors of efficiencies and of
-    the pulse's energy are not included.
+    Column and bottom decay by what `scattered_light` finds for homogeneous water with typical particles. The light is
+    that of the beam in the pixels (coordinate ``beam_share``) through the open part of the aperture. The errors of
+    reflectances include noise, 1 % of the energy of the echo, the unknown bb/b of particles, layers (differences from
+    homogeneous water, or 3 % of the optical depth of both ways in columns too short to be tested), waves that focus
+    light, slope and height of the sea, and the share of the beam that targets of a scene hide. A relative error above
+    0.5 leaves no value. Errors of efficiencies and of the pulse's energy are not included.
 
     A correction that is not expected to lower the variance is not applied: that for the slope where
     `slope_corrections.variances` gives no lower one with it, that by the column where its noise exceeds the scatter of
@@ -234,7 +239,12 @@ def bottom(
     seabed, column = (echoes.sel(echo=name) for name in ("bottom", "column"))
     seabed = seabed.where(xr.DataArray(flags & ReflectanceFlag.TARGET == 0, dims=seabed["time_ns"].dims))
     time = seabed["time_ns"].values
-    whole, by_noise = bottom_errors.whole_energy(summed, echoes)
+    system, share = lidar_system(dataset.attrs, efficiency), share_in_view(dataset)
+    flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
+    share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
+    waveforms = Waveforms.from_dataset(summed, None, None, None, None)
+    scattered = scattered_light.of_columns(waveforms, echoes, system, share, dataset)
+    whole, by_noise = bottom_errors.whole_energy(waveforms, echoes, scattered)
     missing = np.isnan(time)
     energy, energy_error = np.where(missing, np.nan, whole), np.where(missing, np.nan, by_noise)
     along, across = (np.nan_to_num(slopes[f"slope_{name}"].values) for name in ("along", "across"))
@@ -248,14 +258,10 @@ def bottom(
     ]
     depth = [bottom_depth(distance, path, lidar.height, lidar.off_nadir, one) for distance, path, one in surfaces]
 
-    system = lidar_system(dataset.attrs, efficiency)
     power, attenuation = column["amplitude"].values, echoes["attenuation"].values
     mean_attenuation = _mean(attenuation)
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
-    share = share_in_view(dataset)
-    flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
-    share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
     helpful, by_sea = bottom_errors.sea_variances(lidar, time, mean_attenuation, slopes)
     by_waves, by_estimate = by_sea["depth"]
     depth_corrected = helpful["depth"] & np.isfinite(depth[1])
@@ -266,14 +272,15 @@ def bottom(
     depth_error = [level_error, np.where(depth_corrected, np.sqrt(others + by_estimate), level_error)]
     received = system.energy * system.aperture_area * share
     reflectance = []
+    more = 0.0 if scattered is None else scattered.bottom_loss(np.asarray(surfaces[0][1]))
     # Waves focus the light of the bottom as they do that of the column.
-    light = energy * math.exp(bottom_errors.COLUMN_GAIN) / bottom_errors.focusing_at(dataset, depth[0])
+    light = energy * np.exp(more) / bottom_errors.focusing_at(dataset, depth[0])
     for distance, path, one in surfaces:
         gain = bottom_gain(distance, np.nan_to_num(path), lidar.refractive_index, one)
         reflectance.append(np.pi * light * np.exp(2 * mean_attenuation * path) / (received * gain))
-    slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
+    slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
-    backscatter = _mean(power / share) / system.column_gain
+    backscatter = _mean(scattered_light.backscatter_of(echoes, system, share))
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
@@ -283,12 +290,12 @@ def bottom(
     of_decay = 2 * delay * lidar.metres_per_ns * echoes["attenuation_stderr"].values
     parts = (energy_error / energy, column["amplitude_stderr"].values / power, of_decay)
     relative = np.sqrt(sum(np.nan_to_num(part) ** 2 for part in parts))
-    column_corrected = np.isfinite(ratio) & (relative < _scatter(reflectance[1])) & _steadier(ratio, reflectance[1])
+    column_corrected = np.isfinite(ratio) & (relative < scatter(reflectance[1])) & steadier(ratio, reflectance[1])
     reflectance.append(np.where(column_corrected, ratio, np.where(np.isfinite(ratio), reflectance[1], np.nan)))
 
-    loss = bottom_errors.loss_error(summed, echoes, depth[0], surfaces[0][1], mean_attenuation)
+    loss = bottom_errors.loss_error(waveforms, echoes, depth[0], surfaces[0][1], mean_attenuation, scattered)
     common = of_echo**2 + loss**2 + hidden**2 + _mean(of_decay**2) / _count(of_decay)
-    wavy = bottom_errors.focusing(dataset.attrs) ** 2
+    wavy = bottom_errors.focusing(dataset.attrs, lidar.slant_range) ** 2
     without, corrected = by_sea["reflectance"]
     of_sea = [wavy + without, wavy + np.where(slope_corrected, corrected, without)]
     # The ratio to the column takes out what the sea does to a shot, but not to the mean of all.
@@ -296,9 +303,10 @@ def bottom(
     of_sea.append(np.where(column_corrected, of_ratio, of_sea[1]))
     deviation = np.sqrt(common[..., np.newaxis] + np.stack(np.broadcast_arrays(*of_sea), axis=-1))
     flags |= np.where(np.isfinite(time) & np.isnan(attenuation), int(ReflectanceFlag.NO_COLUMN), 0)
-    flags |= np.where(deviation[..., 2] > bottom_errors.LARGEST_ERROR, int(ReflectanceFlag.UNCERTAIN), 0)
-    unclear = (deviation > bottom_errors.LARGEST_ERROR) | (flags != 0)[..., np.newaxis]
-    known = np.where(unclear, np.nan, np.stack(reflectance, axis=-1))
+    unsure = (deviation[..., 2] > bottom_errors.LARGEST_ERROR) & np.isfinite(share)
+    flags |= np.where(unsure, int(ReflectanceFlag.UNCERTAIN), 0)
+    unsure = (deviation > bottom_errors.LARGEST_ERROR) | (flags != 0)[..., np.newaxis]
+    known = np.where(unsure, np.nan, np.stack(reflectance, axis=-1))
     errors = np.abs(known) * deviation
     names, probability = column_retrieval.bottom_class(known[..., 2], errors[..., 2], classes)
     found = _labelled(
@@ -332,20 +340,12 @@ def bottom(
     return found.assign_coords(correction=["level", "slope", "column"], bottom_class=names)
 
 
-def _scatter(reflectance: FloatArray) -> float:
-    """Return the relative standard deviation of reflectances over shots, infinite for few shots."""
-    known = reflectance[np.isfinite(reflectance) & (reflectance > 0)]
-    return float(np.std(np.log(known))) if known.size >= _FEWEST_SHOTS else math.inf
-
-
-def _steadier(corrected: FloatArray, uncorrected: FloatArray) -> bool:
-    """Return whether reflectances scatter less over shots, or have too few shots for that."""
-    scatter = _scatter(corrected)
-    return math.isinf(scatter) or scatter < _scatter(uncorrected)
-
-
 def water(
-    dataset: xr.Dataset, *, efficiency: float | None = None, phase_factor: float = 1.0, deepest_path: float = 8.0
+    dataset: xr.Dataset,
+    *,
+    efficiency: float | None = None,
+    phase_factor: float | None = None,
+    deepest_path: float = 8.0,
 ) -> xr.Dataset:
     """Estimate absorption, backscattering, Kd and bounds of c from the column.
 
@@ -355,11 +355,11 @@ def water(
         Waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the beam.
     efficiency : float, optional
         As for `bottom`.
-    phase_factor : float
-        As for `column_retrieval.water_of_column`.
+    phase_factor : float, optional
+        2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for those of Fournier and Forand. By default,
+        that of sea water with typical particles.
     deepest_path : float
-        Largest path in the water at which the column is used [m], above 0. The attenuation of a column depends on the
-        path; the constants of the retrieval are for 8 m.
+        Largest path in the water at which the column is used [m], above 0.
 
     Returns
     -------
@@ -377,18 +377,18 @@ def water(
     lidar = lidar_geometry(dataset.attrs)
     summed = _summed(dataset)
     end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
-    echoes = echo_table.extract(summed.isel(time=summed["time"].values < end)).isel(pixel=0)
-    column = echoes.sel(echo="column")
-    level = column["amplitude"].values
-    start = _COLUMN_START * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
-    gain = lidar_system(dataset.attrs, efficiency).column_gain
-    share = share_in_view(dataset)
-    share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
-    backscatter = level / share / gain
+    factor = None if phase_factor is None else positive("phase_factor", phase_factor)
+    in_range("spot_diameter", spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
+    shallow = summed.isel(time=summed["time"].values < end)
+    echoes = echo_table.extract(shallow).isel(pixel=0)
+    column, system = echoes.sel(echo="column"), lidar_system(dataset.attrs, efficiency)
+    share = np.where((seen := share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
+    waveforms = Waveforms.from_dataset(shallow, None, None, None, None)
+    light = scattered_light.of_columns(waveforms, echoes, system, share, dataset, factor)
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
-    found = column_retrieval.water_of_column(
-        decay, backscatter, spot_diameter(dataset.attrs), first_path=start, phase_factor=phase_factor
-    )
+    backscatter = scattered_light.backscatter_of(echoes, system, share)
+    excess, gain = (np.nan, np.nan) if light is None else (light.excess, light.level)
+    found = column_retrieval.water_of_column(decay, backscatter, excess, gain)
     table = {
         "column_attenuation": (decay, "1/m", "attenuation of the column's signal along the path"),
         "column_attenuation_stderr": (decay_error, "1/m", "standard error of the attenuation by noise"),
@@ -399,7 +399,7 @@ def water(
         "attenuation_low": (found.attenuation_low, "1/m", "smallest beam attenuation coefficient"),
         "attenuation_high": (found.attenuation_high, "1/m", "largest beam attenuation coefficient"),
     }
-    level_error = column["amplitude_stderr"].values / level
+    level_error = (column["amplitude_stderr"] / column["amplitude"]).values
     for name, error in found.errors(decay_error, level_error).items():
         table[f"{name}_stderr"] = (error, "1/m", f"error of {table[name][2]} by noise and method")
     return _labelled(dataset, table, np.shape(decay))

@@ -30,7 +30,7 @@ _OF_PULSE, _OF_LOST_PULSE = 0.03, 0.15  # of the time of a surface, distinct and
 _LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to the brightest pixel
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
-_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
+TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 # Slope of waves averaged over a beam of 2 m, relative to the standard deviation of all slopes; its power of the width.
 _MEAN_SLOPE, _OF_WIDTH, _WIDTH = 0.4, -0.25, 2.0
 _HEIGHTS = 8.0  # standard deviations from the lowest to the highest point of a sea
@@ -227,7 +227,7 @@ def mean_slope(attributes: Attributes, width: float) -> float:
 def _slope_variance(attributes: Attributes) -> float:
     """Return the variance of all slopes of the sea [1]."""
     variance = optional_number(attributes, "surface_slope_variance")
-    return _TYPICAL_SLOPE_VARIANCE if variance is None else variance
+    return TYPICAL_SLOPE_VARIANCE if variance is None else variance
 
 
 def _column_gain(attributes: Attributes) -> float:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms import deconvolution, echo_estimators, echo_fits
 from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_echoes, column_fit
-from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
+from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE, DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_detection import (
     BEHIND_EDGE,
     DetectedEchoes,
@@ -35,7 +35,6 @@ from mitransient_lidar.results.geometry import optional_number
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
-_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
 _TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
 _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
@@ -54,6 +53,8 @@ _PER_WAVEFORM = {
     "attenuation": ("1/m", "effective attenuation of the column along the path"),
     "attenuation_stderr": ("1/m", "standard error of the effective attenuation"),
     "attenuation_chi2": ("1", "squared residuals of the column's fit over its degrees of freedom"),
+    "column_start_ns": ("ns", "time from which on samples count for the column"),
+    "column_end_ns": ("ns", "time up to which samples count for the column"),
     "layer_depth_m": ("m", "depth of a change in the column"),
     "layer_p_value": ("1", "probability that noise causes as strong a change"),
     "layer_step": ("1", "logarithm of the signal below the change over that above it"),
@@ -126,8 +127,9 @@ def extract(
         ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
         `echo_detection.EchoFlag`. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
         ``_stderr`` and ``_method_error``, which ``depth_m_method_error`` includes. Over the dimensions of the waveforms
-        alone: ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over
-        ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
+        alone: ``attenuation`` [1/m] along the path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
+        ``_end_ns``; with `layers`, over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``,
+        ``layer_attenuation_above`` and ``_below``.
 
     Raises
     ------
@@ -261,8 +263,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         targets=settings.targets,
         tail=waveforms.template.share_behind(BEHIND_EDGE * width),
     )
-    time = records.time_ns
-    surface = found.surface
+    time, surface = records.time_ns, found.surface
     # The column begins where the tail of the surface echo has ended.
     tail = max(1.75 * width, waveforms.template.tail_ns(_TAIL) + width - waveforms.template.fwhm_ns)
     start = np.where(surface >= 0, time[surface] + tail, np.nan)
@@ -270,8 +271,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
-    reference = time[surface]
-    gain = waveforms.gain(rows)
+    reference, gain = time[surface], waveforms.gain(rows)
     saturated = waveforms.saturated_samples(rows, records)
     spans = records.bin_ns * saturated_spans(saturated, found.bins, waveforms.echo_fwhm_ns / records.bin_ns)
     found = replace(found, flags=found.flags | np.where(spans > 0, int(EchoFlag.SATURATED), 0))
@@ -302,7 +302,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     table["clipped_ns"] = time[np.stack(longest_run(saturated), axis=1)]
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
     table |= {"attenuation": column.decay * per_metre, "attenuation_stderr": column.decay_stderr * per_metre}
-    table["attenuation_chi2"] = column.chi2
+    table |= {"attenuation_chi2": column.chi2, "column_start_ns": start, "column_end_ns": end}
     if settings.layers:
         changes = change_points(clear, start, end, gain, layers=settings.layers, blur_ns=width)
         table |= {
@@ -343,7 +343,7 @@ def _with_depths(
             error[:, number, 0].reshape(shots, -1),
             errors.of_surface(faint).reshape(shots, -1),
             lines.reshaped((shots, -1)),
-            slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
+            slope_variance=TYPICAL_SLOPE_VARIANCE if variance is None else variance,
             heights_m=(lowest, highest),
             echo_fwhm_ns=waveforms.echo_fwhm_ns,
             trigger_ns=trigger,
@@ -393,8 +393,8 @@ def _label(
 ) -> xr.Dataset:
     """Return the table with its dimensions, units and provenance."""
     dims, shape = waveforms.dims[:-1], waveforms.shape[:-1]
-    per_second = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
-    units = {"time_ns": "ns", "depth_m": "m", "width_ns": "ns", "amplitude": waveforms.unit, "energy": per_second}
+    energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
+    units = {"time_ns": "ns", "depth_m": "m", "width_ns": "ns", "amplitude": waveforms.unit, "energy": energy}
 
     def of_echoes(values: npt.NDArray[Any], described: dict[str, Any]) -> tuple[Any, ...]:
         inner = ("estimator", "echo") if several else ("echo",)

@@ -2,8 +2,14 @@
 
 Light is the lidar equation's, on the lines of sight of a level sea. Scattering moves and delays it: paths scatter
 forwards a random number of times at random depths, and each event shifts all that follows by the tangent of its angle
-times the remaining distance. One scattering by 180 degrees, or the bottom, turns the path. Shifts on the way down move
-the point that is lit, and with it the time; those on the way up move only the direction from which its light is seen.
+times the remaining distance. One scattering by a large angle, or the bottom, turns the path. Shifts on the way down
+move the point that is lit, and with it the time; those on the way up move only the direction from which its light is
+seen.
+
+Directions that forward scattering has spread matter to the water and not to the bottom: per depth, light along a slant
+meets more water, by 1/cos, and it returns by other angles than 180 degrees. The energy that a level Lambertian bottom
+receives and returns through a horizontal plane is the same for all directions. The signal of a column thus decays more
+slowly than the echoes of bottoms.
 Two-way use of the beam spread function in this way follows Katsev et al. (1997), J. Opt. Soc. Am. A 14, 1338,
 doi:10.1364/JOSAA.14.001338, and Walker and McLean (1999), Appl. Opt. 38, 2384, doi:10.1364/AO.38.002384; angles are
 drawn from the phase function here, since its moments describe sea water badly.
@@ -24,6 +30,9 @@ from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_t
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+
+#: Nodes of phase functions at the angles by which paths turn, in sin^2(theta/2).
+_BACKWARD = np.linspace(0.05, 1, 192)
 
 
 class Arrivals(NamedTuple):
@@ -66,10 +75,13 @@ class EchoEstimate:
         energy = self.system.energy * reflectance * density * geometry / len(beam)
         return Arrivals(beam[:, 0], beam[:, 1], surface_time_ns(self.system.height, theta), energy)
 
-    def water_and_bottom(self, beam: FloatArray, steps: int, rng: np.random.Generator) -> tuple[Arrivals, Arrivals]:
+    def water_and_bottom(
+        self, beam: FloatArray, steps: int, rng: np.random.Generator, *, every_depth: bool = False
+    ) -> tuple[Arrivals, Arrivals]:
         """Return the light of the water, in `steps` of equal depth, and of the bottom, of points of the beam.
 
-        The points are those of `surface`. Arrays are of shape (n, steps) and (n, 1).
+        The points are those of `surface`. Arrays are of shape (n, steps) and (n, 1), or with `every_depth`, of bottoms
+        in the middle of each step, (n, steps).
         """
         spread = self._scattered(len(beam), steps, rng)
         thickness = self.bottom_depth / steps
@@ -77,8 +89,6 @@ class EchoEstimate:
         depths = np.asarray(thickness * (np.arange(steps) + rng.random()), dtype=np.float64)
         theta, _ = self._rays(*beam.T)
         cosine = np.cos(snell(theta, self.system.refractive_index))[:, None]
-        phases = np.array([float(phase.eval_s(1.0)) for phase in self.phases])
-        backscatter = (self.column.scattering * phases)[self.column.layer_at(depths)]
         ripples = [self._ripples(len(beam), rng)[:, None] for _ in range(2)]
 
         def arrivals(depth: FloatArray, returned: FloatArray) -> Arrivals:
@@ -97,8 +107,25 @@ class EchoEstimate:
                 kept = kept * self.enhancement(depth, np.abs(shifts[0] + shifts[1]))
             return Arrivals(seen.real, seen.imag, time, gain * returned * lost * kept / len(beam))
 
+        backscatter = self._backscatter(depths, *spread.tilts(depths / self.system.cos_water))
         water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
-        return water, arrivals(np.array([self.bottom_depth]), self.reflectance / np.pi * cosine)
+        bottoms = np.asarray(thickness * (np.arange(steps) + 0.5) if every_depth else [self.bottom_depth])
+        return water, arrivals(bottoms, self.reflectance / np.pi * cosine)
+
+    def _backscatter(self, depths: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+        """Return the backscatter per depth of light that arrives and returns in directions [1/(m sr)].
+
+        Directions are tangents of their angles from the ray that is not scattered, as complex numbers.
+        """
+        lengths = [np.minimum(np.sqrt(1 + np.abs(one) ** 2), 1 / np.cos(LARGEST_ANGLE)) for one in (down, up)]
+        both = lengths[0] * lengths[1]
+        s = np.clip(0.5 + 0.5 * (1 - (down * up.conj()).real) / both, _BACKWARD[0], 1)
+        found = np.empty(s.shape)
+        layers = self.column.layer_at(depths)
+        for one in np.unique(layers):
+            values = self.column.scattering[one] * self.phases[one].eval_s(_BACKWARD)
+            found[:, layers == one] = np.interp(s[:, layers == one], _BACKWARD, values)
+        return np.asarray(found * both)
 
     def _rays(self, angle_x: FloatArray, angle_y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return angle from the vertical and azimuth [rad] of points in the tangent plane."""
@@ -179,10 +206,7 @@ class _Spread:
         Shifts are complex numbers, away from nadir and to the left. Sums are linear between the nodes of the grid, as
         if events within a cell were spread along it.
         """
-        last = self._grid.size - 1
-        place = np.clip(distance / self._grid[-1] * last, 0, last)
-        low = np.minimum(place.astype(np.intp), last - 1)
-        part = place - low
+        low, part = self._place(distance)
 
         def beyond(sums: tuple[FloatArray, FloatArray]) -> FloatArray:
             nodes = [self._grid[node] * sums[0][:, node] - sums[1][:, node] for node in (low, low + 1)]
@@ -191,3 +215,16 @@ class _Spread:
         down_x, down_y, up_x, up_y, delay, absorbed = map(beyond, self._sums)
         kept = np.where(self._end[:, None] > distance, np.exp(-absorbed), 0.0)
         return down_x + 1j * down_y, up_x + 1j * up_y, delay, kept
+
+    def tilts(self, distance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the tangents of the angles on the way down and up at distances [m], as complex numbers."""
+        low, part = self._place(distance)
+        x, y, up_x, up_y = ((1 - part) * sums[:, low] + part * sums[:, low + 1] for sums, _ in self._sums[:4])
+        return x + 1j * y, up_x + 1j * up_y
+
+    def _place(self, distance: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return the node before distances and the part of the cell behind it."""
+        last = self._grid.size - 1
+        place = np.clip(distance / self._grid[-1] * last, 0, last)
+        low = np.minimum(place.astype(np.intp), last - 1)
+        return low, place - low

@@ -22,10 +22,14 @@ from synthetic_shots import (
     waveform,
 )
 
-from mitransient_lidar.analysis.retrieval import bottom_errors, retrieve, surface_inputs
+from mitransient_lidar.analysis.retrieval import bottom_errors, retrieve, scattered_light, surface_inputs
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
 from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.results.geometry import lidar_system
 from mitransient_lidar.results.sum_errors import with_correlation
+
+pytestmark = pytest.mark.usefixtures("scattered_once")
 
 
 def with_shares(shot, shares):
@@ -41,7 +45,7 @@ def test_reflectance_is_of_the_light_that_enters_the_open_aperture():
     whole, half = (with_shares(on_axis(), [share] * 4) for share in (0.25, 0.125))
     plain = retrieve.bottom(whole, LEVEL)["reflectance"].values
     # These waters scatter once, so that their columns decay as the light of the bottom does.
-    np.testing.assert_allclose(plain, RHO * math.exp(bottom_errors.COLUMN_GAIN), rtol=0.02)
+    np.testing.assert_allclose(plain, RHO, rtol=0.02)
     np.testing.assert_allclose(retrieve.bottom(half, LEVEL)["reflectance"], 2 * plain, rtol=1e-9)
     obscured = whole.assign_attrs(obscuration=0.3)
     np.testing.assert_allclose(retrieve.bottom(obscured, LEVEL)["reflectance"], plain / 0.7, rtol=1e-9)
@@ -139,11 +143,17 @@ def test_energy_of_a_bottom_is_the_sum_only_where_its_light_is_alone(target_dept
     shot = result(values[np.newaxis])[["waveform", "waveform_stderr"]].isel(time=slice(last))
     echoes = echo_table.extract(shot, depth_from="mean", layers=2).isel(pixel=0)
     own = echoes.sel(echo="bottom")
-    energy, error = bottom_errors.whole_energy(shot, echoes)
+
+    def whole_energy(dataset):
+        waveforms = Waveforms.from_dataset(dataset, None, None, None, None)
+        light = scattered_light.of_columns(waveforms, echoes, lidar_system(shot.attrs), np.ones(()), shot)
+        return bottom_errors.whole_energy(waveforms, echoes, light)
+
+    energy, error = whole_energy(shot)
     assert (energy != own["energy"].values) == (error != own["energy_stderr"].values) == summed
     # Errors that all bins share add up.
     whole = with_correlation(shot, shot["time"].values, np.ones(2 * (shot.sizes["time"],)))
-    together = bottom_errors.whole_energy(whole, echoes)[1]
+    together = whole_energy(whole)[1]
     count = np.sum((np.abs(shot["time"] - own["time_ns"] - 4.0) < 12.0).values)
     assert not summed or together > 0.5 * np.sqrt(count) * error
     known = with_correlation(on_axis(), TIME, np.eye(TIME.size))

@@ -28,11 +28,8 @@ def test_level_of_the_lidar_equation():
     assert power / SYSTEM.column_gain == pytest.approx(0.15 * 1.7e-3, rel=1e-12)
 
 
-@pytest.mark.parametrize(("spot", "decay"), [(11.0, A + BB), (6.4, KD), (8.5, 0.5 * (A + BB + KD))])
-def test_water_of_its_own_model(spot, decay):
-    """K between a + bb and Kd by the spot; the level is 1.13 bb/(2 pi), steeper from 1.5 m on."""
-    level = 1.13 * BB / (2 * np.pi) * np.exp(2 * (decay - A - BB) * 1.5)
-    found = water_of_column(decay, level, spot, first_path=1.5)
+def test_water_of_its_own_level_and_decay():
+    found = water_of_column(A + 0.02, 1.13 * BB / (2 * np.pi), excess=0.02, level=1.13)
     np.testing.assert_allclose(found.absorption, A, rtol=1e-6)
     np.testing.assert_allclose(found.backscattering, BB, rtol=1e-6)
     np.testing.assert_allclose(found.kd, KD, rtol=1e-6)
@@ -44,20 +41,13 @@ def test_water_of_its_own_model(spot, decay):
 @pytest.mark.parametrize("name", ["jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid"])
 def test_bounds_of_attenuation_include_waters_by_name(name):
     water = water_of(*name.split())
-    level = 1.13 * water.backscattering / (2 * np.pi)
-    found = water_of_column(water.absorption + water.backscattering, level, 11.0)
+    found = water_of_column(water.absorption, water.backscattering / (2 * np.pi), 0.0, 1.0)
     assert found.attenuation_low < water.attenuation < found.attenuation_high
 
 
 def test_columns_that_no_water_makes_are_nan():
-    found = water_of_column([0.05, np.nan, -0.1, 0.1], [0.1, 1e-3, 1e-3, np.nan], 11.0)
+    found = water_of_column([0.05, np.nan, -0.1, 0.1, 0.1], [1e-3, 1e-3, 1e-3, np.nan, -1e-3], 0.06, 1.0)
     assert np.isnan(found.kd).all()
-    twice = water_of_column(0.1, 1e-3, 11.0, phase_factor=2.0)
-    assert twice.backscattering == pytest.approx(2 * np.pi * 1e-3 / (1.13 * 2))
-    with pytest.raises(ValueError, match="spot_diameter = 3 must be at least 6"):
-        water_of_column(0.1, 1e-3, 3.0)
-    with pytest.raises(ValueError, match="phase_factor = 0 must be greater"):
-        water_of_column(0.1, 1e-3, 8.0, phase_factor=0)
 
 
 def test_reflectance_is_the_ratio_of_bottom_and_column():

@@ -104,3 +104,19 @@ def test_shifts_on_the_way_up_change_no_time():
     slope = np.polyfit(x[bent], (time - time.min())[bent], 1)[0]
     steepest = 2e9 / C0 * 200.0 * np.sin(np.radians(60)) / np.cos(np.radians(60)) ** 2
     assert 0.3 < slope / steepest < 0.75
+
+
+def test_tilted_light_meets_more_water_and_the_bottom_the_same():
+    """Isotropic backscatter: 1/cos for each way; of a function of the angle, that between both directions.
+
+    Light that returns along its way down has moved in the opposite direction on its way up.
+    """
+    water = WaterColumn(np.zeros(1), np.array([0.3]), np.array([0.2]), np.array([0.1]))
+    even = PowerLawTable.from_function(lambda theta: np.full_like(theta, 1 / (4 * np.pi)))
+    steep = PowerLawTable.from_function(lambda theta: henyey_greenstein(theta, -0.4))
+    down, up = np.array([[0.0, 0.5, 0.5, 0.5j]]), np.array([[0.0, 0.0, -0.5, 0.5]])
+    angles = np.pi - np.array([0.0, np.arctan(0.5), 0.0, np.arccos(1 / 1.25)])
+    for phase, expected in ((even, 1 / (4 * np.pi)), (steep, henyey_greenstein(angles, -0.4))):
+        model = EchoEstimate(SYSTEM, water, [phase], FLAT, 8.0, 0.1)
+        found = model._backscatter(np.array([1.0, 2.0, 3.0, 4.0]), down, up)[0]
+        np.testing.assert_allclose(found, 0.2 * expected * np.array([1, 1.25**0.5, 1.25, 1.25]), rtol=0.01)
