@@ -18,6 +18,8 @@ FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 
 #: Images are of few pixels here.
 IMAGE = {"layout": "8x8", "surface_cell_size": "0.2"}
+#: Its sand has ripples in 160 m.
+SMALL = {"flight": {"bottom_refined_size": "20"}}
 
 #: As another scene, but for layout, place or water.
 ALIKE = {
@@ -38,7 +40,7 @@ def test_scene(name, tmp_path, caplog):
     bits; a target outside the view or a record that is too short, a warning.
     """
     image = catalogue.scene_parameters(name)["layout"] == "128x128"
-    params = {"pulse_energy_mj": "4", **(IMAGE if image else {})}
+    params = {"pulse_energy_mj": "4", **(IMAGE if image else {}), **SMALL.get(name, {})}
     with caplog.at_level(logging.WARNING):
         first = mitransient_lidar.render(name, params=params, integrator=FEW, passes=2, seed=3)
     assert caplog.messages == []

@@ -230,9 +230,9 @@ def test_description_of_the_sea_can_be_left_out(rendered):
 @pytest.mark.slow
 def test_series_that_does_not_fit_the_memory(rendered):
     with pytest.raises(
-        UserError, match=r"^3000 shots of 4096 pixels x 19\d bins, and 3 components of each, take 6\d\d GB of memory"
+        UserError, match=r"^3 shots of 1048576 pixels x 19\d bins, and 3 components of each, take 1\d\d GB of memory"
     ):
-        shot_series.render_shots("table1", {**FLAT, "layout": "64x64"}, positions=[(0, 0)] * 3000, components=True)
+        shot_series.render_shots("table1", {**FLAT, "layout": "1024x1024"}, positions=PLACES, components=True)
 
 
 @pytest.mark.slow
