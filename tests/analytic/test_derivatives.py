@@ -62,7 +62,7 @@ def one_pass(renderer, seed=0):
 
 
 def by_origin(renderer, name, seed=0):
-    """Return the energies of a pass by origin, and their perturbations by one of the shared parameters, with bins last."""
+    """Return the energies of a pass by origin, and their perturbations by a shared parameter, with bins last."""
     energy, changes = one_pass(renderer.by_origin(), seed)
     return energy.reshape(3, -1), changes.reshape(len(SHARED), 3, -1)[SHARED.index(name)]
 
