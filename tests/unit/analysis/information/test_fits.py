@@ -184,7 +184,7 @@ def test_standard_errors_from_few_passes_widen_the_covariance():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("receiver", [None, "apd"])
+@pytest.mark.parametrize("receiver", [None, pytest.param("apd", marks=pytest.mark.long)])
 def test_errors_of_a_result_without_batches_agree_as_those_of_the_model(receiver):
     """Data of 16 passes whose errors are a common factor for the larger part, which the batches of the model tell.
 
