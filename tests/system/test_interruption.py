@@ -166,7 +166,7 @@ STUDIES = {
         "a map needs all places, and",
     ),
     "depth-bias": (
-        ["published_airborne", "--winds", 3, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
+        ["published_airborne", "--winds", 0, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
         "of 3 renders, and none is kept.",
     ),
 }

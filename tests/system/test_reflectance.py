@@ -28,7 +28,7 @@ def shot(lidar_scene):
 
     def render(tx=None, rx=None, water=None):
         scene = lidar_scene(
-            integrator={"type": "lidar_merging", "paths_per_pass": 2**15},
+            integrator={"type": "lidar_merging", "paths_per_pass": 2**15, "photons_per_pass": 2**14},
             tx=tx,
             rx=rx,
             water={"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006, **(water or {})},
