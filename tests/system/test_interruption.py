@@ -167,7 +167,7 @@ STUDIES = {
     ),
     "depth-bias": (
         ["published_airborne", "--winds", 0, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
-        "of 3 renders, and none is kept.",
+        "of 6 renders, and none is kept.",
     ),
 }
 
