@@ -401,21 +401,6 @@ def test_python_calls(folder, call, sentence):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("params", "sentence"),
-    [
-        ({"altitude": 10, "time_start_ns": 1390}, "time_start_ns = 1390 starts the record after every echo"),
-        ({"altitude": 510, "bin_count": 5}, "end the record at 3555 ns: it must end after the surface echo"),
-        ({"bin_width_ns": 1e-5}, "into 18500000 bins: it must be at least 0.00018"),
-        ({"time_start_ns": 5000}, "time_start_ns = 5000 starts the record after every echo"),
-    ],
-)
-def test_records_without_an_echo(folder, params, sentence):
-    definitions = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
-    assert_refused(run("render", "table1", "-q", "--no-plot", "--passes", 2, *definitions), sentence)
-
-
 @pytest.mark.parametrize(
     "error", [MemoryError(), MemoryError("Unable to allocate 7 TiB"), RuntimeError("jit_malloc(): out of memory! ...")]
 )
