@@ -262,7 +262,7 @@ def both(request):
             change, (start, width, count), gate, _, orders = CASES[name]
             film = {"time_start_ns": start, "bin_width_ns": width, "bin_count": count}
             # Merged light is known better from a tenth of the time.
-            passes = (8, 16) if name == MIXED else (10, 32, 2**14)
+            passes = (8, 16) if name == MIXED else (10, 24, 2**14)
             found[name] = pair(lidar_scene(film=film, **change), PathClasses(orders) if orders else None, gate, *passes)
         return found[name]
 
