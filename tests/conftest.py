@@ -29,9 +29,6 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     significance.shift_seeds(config.getoption("--seed-shift"))
-    if hasattr(config, "workerinput"):
-        # Workers share the processors among them: more threads than these wait for each other, a tenth of the time.
-        dr.set_thread_count(1)
 
 
 def pytest_testnodedown(node):

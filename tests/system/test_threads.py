@@ -8,7 +8,6 @@ import sys
 import threading
 import warnings
 
-import drjit as dr
 import numpy as np
 import OpenEXR
 import pytest
@@ -17,7 +16,6 @@ from same_bits import assert_same_bits
 import mitransient_lidar
 from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.waveforms import plot_waveforms
 from mitransient_lidar.results.dataset import save
@@ -68,15 +66,6 @@ def in_threads(count, function, given):
 def render(case):
     integrator, seed = case
     return mitransient_lidar.render("table1", params=SCENE, integrator=integrator, passes=4, seed=seed)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def all_processors():
-    """Threads of Dr.Jit as users have them: workers of the tests have one."""
-    before = dr.thread_count()
-    dr.set_thread_count(usable_processors())
-    yield
-    dr.set_thread_count(before)
 
 
 @pytest.fixture(scope="module")
