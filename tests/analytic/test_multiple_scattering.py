@@ -105,7 +105,7 @@ def scatter(rng, direction):
 )
 def walks(request):
     """Return attenuation, scattering and index, and the energies of independent walks."""
-    return request.param, np.array([random_walk(*request.param, 20_000, seed) for seed in range(20)])
+    return request.param, np.array([random_walk(*request.param, 6000, seed) for seed in range(20)])
 
 
 @pytest.mark.parametrize(
@@ -135,5 +135,5 @@ def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, wa
     reference = references[:, 1:]
     # Few bright walks make the light of the last gates: its mean is compared where it happens to be known to 10 %.
     early = np.hypot(*(np.divide(*mean_and_error(energies[:, :9])[::-1]) for energies in (rendered, reference)))
-    assert np.all(early < largest_error(min(count, len(reference)), 0.03)), early
+    assert np.all(early < largest_error(min(count, len(reference)), 0.05)), early
     assert_same(rendered, reference, error=0.01)
