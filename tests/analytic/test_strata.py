@@ -87,7 +87,7 @@ def test_layers_below_the_bottom_are_refused(lidar_scene, passes):
         passes(lidar_scene(water={"layer_tops": "0, 9", "attenuation": "0.3, 0.4"}), 1)
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_a_plate_on_a_boundary_is_that_above_it(lidar_scene, integrator):
     """The same random numbers: light would pass through the plate, upwards as well, and 8 % of its echo be missing."""
     energies = []
