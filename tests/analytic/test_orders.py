@@ -42,10 +42,3 @@ def test_single_scattering_is_that_of_paths_with_one_event(lidar_scene, passes):
         limited = passes(lidar_scene(integrator={**VOLPATH, "max_scatterings": most}, rx=one), 2)[:, 0]
         kept = sorted_energy[:, :, : most + 1].sum(axis=(1, 2))
         np.testing.assert_allclose(kept.sum(axis=1), limited.sum(axis=1), rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), [("orders", 0), ("orders", 63), ("passes", 1)])
-def test_options_out_of_range(name, value):
-    with pytest.raises(ValueError, match=f"{name} = {value} must lie between"):
-        scattering_orders("fig09_2x2", **{name: value})
