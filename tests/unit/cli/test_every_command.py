@@ -23,7 +23,7 @@ SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
     "shot-statistics": ["--count", 2],
     "target-signal": ["--passes", 16],
-    "detect": ["--passes", 8, "--shots", 1000, "--renders", 3],
+    "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "estimate": [],
     "bounds": ["--free", "attenuation,bottom_reflectance", "--over", "layout=1x1,2x2", "--renders", 2, "--passes", 2],
     "beam-spread": ["--depths", "2,5", "--passes", 2],
