@@ -56,6 +56,7 @@ def shot(lidar_scene):
             {"divergence_mrad": 16.0, "divergence_across_mrad": 4.0, "ellipse_deg": 30.0},
             {"field_of_view_mrad": 20.0},
             id="ellipse",
+            marks=pytest.mark.long,
         ),
         pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
         pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="top hat in a narrow view"),
