@@ -300,6 +300,8 @@ LONG |= {
     "solids below an inclined sea",
     "mast at 60 degrees",
     "below a boat, at a target",
+    "narrow beam over waves",
+    NOISY,
 }
 
 

@@ -235,7 +235,7 @@ def test_flights_that_cannot_be_rendered(change, message):
         FlightRenderer.of(FlightPlan.of({**FLIGHT, **change}))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
     """The other pulses have their points."""
     path, folder = tmp_path / "short.toml", tmp_path / "failed"

@@ -172,8 +172,9 @@ STUDIES = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("study", STUDIES)
+@pytest.mark.parametrize(
+    "study", [pytest.param(name, marks=pytest.mark.slow if name == "detect" else pytest.mark.long) for name in STUDIES]
+)
 def test_a_study_that_needs_all_of_its_renders_ends_with_the_first_interruption(tmp_path, study):
     """It once went on with the next render, and counted the interrupted one as complete."""
     arguments, text = STUDIES[study]
@@ -199,8 +200,14 @@ app.main()
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
+    ],
+)
 def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
     """Ctrl-C once gave a traceback and exit code 0."""
     process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)

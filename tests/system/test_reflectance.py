@@ -79,7 +79,11 @@ def test_reflectance_within_its_error(tx, rx, shot):
     ("field_of_view", "water"),
     [
         (30.0, {"attenuation": "0.9, 0.5", "scattering": "0.45, 0.25", "backscattering": "0.018, 0.010"}),
-        (10.0, {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"}),
+        pytest.param(
+            10.0,
+            {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_two_layers_leave_no_class_that_looks_sure(field_of_view, water, shot):

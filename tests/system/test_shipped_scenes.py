@@ -12,8 +12,6 @@ from mitransient_lidar import results
 from mitransient_lidar.loading import catalogue, instruments, scenes
 from mitransient_lidar.results import sum_errors
 
-pytestmark = pytest.mark.slow
-
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 
 #: Images are of few pixels here.
@@ -32,7 +30,13 @@ ALIKE = {
 PASSIVE = {"passive_sea"}
 
 
-@pytest.mark.parametrize("name", sorted(set(catalogue.scene_names()) - PASSIVE))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name in ALIKE else pytest.mark.slow)
+        for name in sorted(set(catalogue.scene_names()) - PASSIVE)
+    ],
+)
 def test_scene(name, tmp_path, caplog):
     """One small render, its files, and renders of these.
 
@@ -72,6 +76,7 @@ def test_scene(name, tmp_path, caplog):
     assert parameters["altitude"] == "150"
 
 
+@pytest.mark.slow
 def test_automatic_numbers_of_merging():
     """As many paths as photons, cells of centimetres and points of decimetres, which the result states and repeats."""
     first = mitransient_lidar.render("table1", passes=2)

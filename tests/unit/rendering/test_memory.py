@@ -194,8 +194,8 @@ TASKS = {
 }
 
 
-#: In the long tier, 10 to 30 s each: photons fill arrays as paths do; of the others the quick tier states the sizes.
-LONG = ("photons", "shots", "record", "passive", "frames")
+#: In the long tier, 5 to 30 s each: photons fill arrays as paths do; of the others the quick tier states the sizes.
+LONG = ("bins", "derivatives", "photons", "shots", "record", "passive", "frames")
 
 
 @pytest.mark.parametrize(
