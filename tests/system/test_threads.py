@@ -65,7 +65,7 @@ def in_threads(count, function, given):
 
 def render(case):
     integrator, seed = case
-    return mitransient_lidar.render("table1", params=SCENE, integrator=integrator, passes=4, seed=seed)
+    return mitransient_lidar.render("table1", params=SCENE, integrator=integrator, passes=2, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_a_scene_of_another_thread_has_the_bits_of_one_alone(alone):
         del forgotten
         gc.collect()
         integrator, seed = RENDERS[case]
-        return mitransient_lidar.render(sessions[case], integrator=integrator, passes=4, seed=seed)
+        return mitransient_lidar.render(sessions[case], integrator=integrator, passes=2, seed=seed)
 
     # Each is rendered by a thread that another one has loaded it for, while others are loaded and freed.
     for expected, one in zip(alone, in_threads(4, use, range(4)), strict=True):
