@@ -83,7 +83,10 @@ def connected(lidar_scene, passes, sea, count, emitter=True, **integrator):
 
 @pytest.mark.slow
 def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
-    """Through absorbing water and a rough sea, where both connections find the bottom about as often."""
+    """Through absorbing water and a rough sea, where both connections find the bottom about as often.
+
+    Weights that do not sum to one change it by a tenth: the walk, by far the noisier, has three times the passes.
+    """
     sea, water = {"slope_variance": "0.1"}, {"attenuation": 0.4, "scattering": 0.0, "backscattering": 0.0}
     combined, walk = (
         passes(
@@ -96,12 +99,12 @@ def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
                 ),
                 emitter,
             ),
-            16,
+            count,
             first_seed=100 * number,
         ).sum(axis=(1, 2))
-        for number, emitter in enumerate((True, False))
+        for number, (emitter, count) in enumerate(((True, 16), (False, 64)))
     )
-    assert_same(combined, walk, error=0.04)
+    assert_same(combined, walk, error=0.02)
 
 
 @pytest.mark.long
