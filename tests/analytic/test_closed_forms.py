@@ -269,7 +269,7 @@ def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, int
         tx={**pose, "divergence_mrad": 2e3 * sigma / height},
         rx={**pose, **RECEIVER, "field_of_view_mrad": 2e3 * radius / height, "layout": "1x1"},
         film={"time_start_ns": float(surface_time_ns(height, 0.0)), "bin_width_ns": bin_ns, "bin_count": 10 * bins},
-        integrator={"type": integrator, "paths_per_pass": 2**14},
+        integrator={"type": integrator, "paths_per_pass": 2**14 if integrator == "lidar_merging" else 2**16},
         sea={"slope_variance": str(2 * variance)},
         water={**water, "refractive_index": index, "group_index": GROUP_INDEX},
         bottom=None,
