@@ -47,9 +47,9 @@ def shoot(lidar_scene, passes, start_ns, *, altitude, angle, water, bottom, slop
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
-@pytest.mark.parametrize(("altitude", "depth"), [(400.0, 3.0), (1000.0, 8.0)])
-def test_bottom_arrives_to_a_tenth_of_a_millimetre(lidar_scene, passes, integrator, altitude, depth):
+def test_bottom_arrives_to_a_tenth_of_a_millimetre(lidar_scene, passes, integrator):
     """Rays start beside the surfaces that they leave: distances without these gaps are up to 0.4 mm too short."""
+    altitude, depth = 1000.0, 8.0
     pose = {"altitude": altitude, "off_nadir_deg": 0.0}
     expected = 2 * (altitude + 1.364 * depth) / C0 * 1e9
     bin_ns, bins = 1e-3, 64
@@ -134,6 +134,7 @@ def test_echoes_reach_orbit_when_geometry_says(lidar_scene, passes, angle, integ
     surface = float(surface_time_ns(altitude, np.radians(angle)))
     bottom = float(bottom_time_ns(altitude, 8.0, np.radians(angle), 1.34, 1.364))
     width = 0.02
+    photons = {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
     # A shallow layer of a strong absorber leaves the echo of the surface alone.
     seas = [
         (surface, {"slope_variance": "0.05"}, {"attenuation": 100.0}, None),
@@ -142,7 +143,7 @@ def test_echoes_reach_orbit_when_geometry_says(lidar_scene, passes, angle, integ
     for expected, sea, water, depth in seas:
         start = width * round((expected - 8) / width)
         scene = lidar_scene(
-            integrator={"type": integrator, "paths_per_pass": 2**14},
+            integrator={"type": integrator, "paths_per_pass": 2**14, **photons},
             tx={**pixel, "divergence_mrad": 0.001},
             rx={**pixel, "field_of_view_mrad": 0.006, "layout": "1x1"},
             film={"time_start_ns": start, "bin_width_ns": width, "bin_count": round(16 / width)},

@@ -86,7 +86,7 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
         # Deep down, ripples would carry some per cent of the light over the edge between a dark and a bright cell.
         sea={"slope_variance": "2e-5"},
         bottom=DEPTH,
-        integrator={"paths_per_pass": 2**15},
+        integrator={"paths_per_pass": 2**14},
     )
     energy = passes(scene, 16).sum(axis=-1)
     quadrants = [
@@ -99,7 +99,7 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     expected = np.array([expected_bottom(density, quadrant) for quadrant in quadrants])
     assert expected.max() > 1.3 * expected.min()
     z, relative = z_score(energy, expected)
-    assert np.all(relative < 8e-3), relative
+    assert np.all(relative < 0.012), relative
     # The grid of the closed form resolves rims and the edge of the view to 1e-3, and ripples still carry that much.
     assert np.all(np.abs(energy.mean(axis=0) / expected - 1) < largest_z(16, 4) * relative + 2e-3), (
         z,
@@ -108,9 +108,12 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 @pytest.mark.parametrize(
-    ("variance", "depth", "spread"), [(5e-4, 0.48, 0.7e-3), (1e-5, 0.48, 0.7e-3), (1e-5, 2.0, 3e-3)]
+    ("integrator", "variance", "depth", "spread"),
+    [
+        ("lidar_volpath", 5e-4, 0.48, 0.7e-3),
+        *(("lidar_merging", *case) for case in ((5e-4, 0.48, 0.7e-3), (1e-5, 0.48, 0.7e-3), (1e-5, 2.0, 3e-3))),
+    ],
 )
 def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator, variance, depth, spread):
     """Patches that grew with depth as broad light does, from a millimetre, lost 74, 88 and 58 % of it.
@@ -120,8 +123,9 @@ def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator,
     """
     height, index, radius = 11.0, 1.34, 2 * spread
     pose = {"altitude": height, "off_nadir_deg": 0.0}
+    photons = {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
     scene = lidar_scene(
-        integrator={"type": integrator, "paths_per_pass": 2**15},
+        integrator={"type": integrator, "paths_per_pass": 2**13, **photons},
         tx={**pose, "divergence_mrad": 2e3 * spread / height, "pulse_energy_mj": 4.0},
         rx={**pose, "field_of_view_mrad": 2e3 * radius / height, "layout": "1x1", "obscuration": 0.0},
         film={"time_start_ns": 74.0, "bin_count": 40},
@@ -138,7 +142,7 @@ def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator,
     found = passes(scene, 16)[:, 0]
     # The surface's light is in the first bins.
     begin = int(2 * (height + index * depth) / C0 * 1e9 - 74.0)
-    assert_equal(found[:, begin - 1 : begin + 2].sum(axis=1), expected, error=4e-3, bias=8e-3)
+    assert_equal(found[:, begin - 1 : begin + 2].sum(axis=1), expected, error=0.02, bias=8e-3)
 
 
 @pytest.mark.long

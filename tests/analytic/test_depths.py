@@ -128,7 +128,7 @@ def shoot(lidar_scene, layout, bottom, paths, passes, film=None):
     # Mitsuba would merge shapes of one material.
     step = {"far": plate(0, -DEPTH, size=200.0), "near": plate(-60, -6.5, reflectance=0.21)}
     scene = lidar_scene(
-        integrator={"type": "lidar_merging", "paths_per_pass": paths},
+        integrator={"type": "lidar_merging", "paths_per_pass": paths, "photons_per_pass": 2**13},
         rx={"layout": layout, "field_of_view_mrad": 15.0},
         film={"time_start_ns": 1400.0, "bin_width_ns": 1.0, "bin_count": 150, **(film or {})},
         sea={"slope_variance": "0.02"},

@@ -37,7 +37,8 @@ def by_origin(dataset, origin):
 def test_estimate_agrees_with_renders(params, water):
     """Levels and times of each pixel; the water lacks light that turned twice."""
     params = {**LEVEL, **params}
-    rendered = mitransient_lidar.render("table1", params=params, passes=12, components=True, seed=3)
+    few = {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}
+    rendered = mitransient_lidar.render("table1", params=params, integrator=few, passes=12, components=True, seed=3)
     found = estimate("table1", params, paths=2**15, seed=significance.seed_shift)
     for origin, bias, shift in (("surface", 0.012, 0.05), ("water", water, 1.5), ("bottom", 0.03, 0.2)):
         energy, error, time = by_origin(found, origin)

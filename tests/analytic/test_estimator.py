@@ -30,14 +30,14 @@ def compare(first, second, largest):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layout", ["2x2", "1x4", "8x8"])
-def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout):
+def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
     """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
     energies = []
-    for name in (layout, "1x1"):
-        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**16})
+    for name in ("1x1", "2x2", "1x4"):
+        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**14})
         energies.append(passes(scene, 1).sum(axis=1))
-    np.testing.assert_allclose(energies[0], energies[1], rtol=1e-10)
+    for parts in energies[1:]:
+        np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
 
 
 @pytest.mark.long
@@ -83,7 +83,10 @@ def connected(lidar_scene, passes, sea, count, emitter=True, **integrator):
 
 @pytest.mark.slow
 def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
-    """Through absorbing water and a rough sea, where both connections find the bottom about as often."""
+    """Through absorbing water and a rough sea, where both connections find the bottom about as often.
+
+    Weights that do not sum to one change it by a tenth: the walk, by far the noisier, has three times the passes.
+    """
     sea, water = {"slope_variance": "0.1"}, {"attenuation": 0.4, "scattering": 0.0, "backscattering": 0.0}
     combined, walk = (
         passes(
@@ -96,12 +99,12 @@ def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
                 ),
                 emitter,
             ),
-            16,
+            count,
             first_seed=100 * number,
         ).sum(axis=(1, 2))
-        for number, emitter in enumerate((True, False))
+        for number, (emitter, count) in enumerate(((True, 16), (False, 64)))
     )
-    assert_same(combined, walk, error=0.04)
+    assert_same(combined, walk, error=0.02)
 
 
 @pytest.mark.long
@@ -139,9 +142,10 @@ def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
             rx={"field_of_view_mrad": view, "layout": "1x1"},
             sea=sea,
             film={"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 5},
+            integrator={"paths_per_pass": 2**14},
         )
         signals.append(with_total(passes(scene, 16)[:, 0] / view**2))
-    compare(*signals, 0.016)
+    compare(*signals, 0.035)
 
 
 @pytest.mark.long
@@ -167,10 +171,10 @@ def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
 @pytest.mark.slow
 def test_roulette_changes_no_mean(lidar_scene, passes):
     """Without it, and with much of it: survivors that did not carry the share of the dead would lose most light."""
-    few = {"paths_per_pass": 2**14}
+    few = {"paths_per_pass": 2**13}
     reference = echoes(passes(lidar_scene(sea=ROUGH, integrator=few), 16))
     # The more light survivors carry, the noisier it is.
-    for threshold, count, error in ((0.0, 16, 0.02), (0.05, 32, 0.068)):
+    for threshold, count, error in ((0.0, 16, 0.03), (0.05, 32, 0.1)):
         scene = lidar_scene(sea=ROUGH, integrator={**few, "roulette_threshold": threshold})
         compare(reference, echoes(passes(scene, count, 500)), error)
 
@@ -188,7 +192,7 @@ def test_seeds_repeat_and_differ(lidar_scene, passes):
 def test_orders_of_scattering_add_up(lidar_scene, passes):
     """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
     energies = [
-        passes(lidar_scene(sea=ROUGH, integrator={"paths_per_pass": 2**15, "max_scatterings": limit}), 1)[0]
+        passes(lidar_scene(sea=ROUGH, integrator={"paths_per_pass": 2**13, "max_scatterings": limit}), 1)[0]
         for limit in (0, 1, 2, 4, 1000, -1)
     ]
     for fewer, more in pairwise(energies):
@@ -233,12 +237,12 @@ def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, p
         water = {"attenuation": attenuation, "scattering": 0.0, "backscattering": 0.0}
         # The record ends before light comes that the bottom has reflected twice.
         film = {"time_start_ns": 1450.0, "bin_count": 60}
-        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**15})
+        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**13})
         bottoms.append(passes(scene, 32).sum(axis=(1, 2)))
     path = 8 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
     mean = [b.mean() for b in bottoms]
     relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
-    assert relative < 5e-3
+    assert relative < 1e-2
     # Rays of the beam within 5 mrad cross 0.1 % more or less water.
     assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
@@ -250,6 +254,7 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
         water={"attenuation": 0.5, "scattering": 0.5, "backscattering": 0.02},
         rx={"field_of_view_mrad": 200.0, "layout": "1x1"},
         film={"time_start_ns": 1300.0, "bin_width_ns": 10.0, "bin_count": 300},
+        integrator={"paths_per_pass": 2**14},
         rho=1.0,
     )
     # Most of the passes: a rare one holds a path that is brighter than all others.

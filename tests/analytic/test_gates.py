@@ -89,7 +89,7 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.5, 0.2])
+@pytest.mark.parametrize("share", [0.5, pytest.param(0.2, marks=pytest.mark.long)])
 def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     """The light of pixel green is NaN; the other pixels keep theirs, in both ways of keeping gates alone."""
     scene = gated(lidar_scene)

@@ -163,7 +163,7 @@ def test_derivatives_by_absorption_and_scattering(lidar_scene, integrator, albed
     if integrator == "lidar_volpath":
         options |= {"guiding_probability": 0.0, "roulette_threshold": 0.5}
     else:
-        options |= {"photons_per_pass": 2**14, "cell_size": 0.2, "point_spacing": 0.3 * mu}
+        options |= {"paths_per_pass": 2**13, "photons_per_pass": 2**13, "cell_size": 0.2, "point_spacing": 0.3 * mu}
     scene = half_space(lidar_scene, degrees, albedo, view, beam, options)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     parameters = path_parameters(renderer, ["attenuation", "scattering"])

@@ -17,6 +17,7 @@ from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MERGING = {"type": "lidar_merging"}
+FEW = {**MERGING, "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 #: Waves in the water that scatters most of the published scenes' light more than once.
 WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"}
 
@@ -47,18 +48,17 @@ def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
 @pytest.mark.slow
 def test_cells_of_any_width_and_beam_give_finite_light(lidar_scene, passes):
     """Areas of rings overflowed; and beams of kilometres had cells in which level light grew by factors of 1e8."""
-    few = {"paths_per_pass": 8192, "photons_per_pass": 8192}
     for width in (1e-30, 1e4):
-        found = passes(lidar_scene(integrator={**MERGING, **few, "cell_size": width}), 2)
+        found = passes(lidar_scene(integrator={**FEW, "cell_size": width}), 2)
         assert np.isfinite(found).all()
         assert found.sum() > 0
     high, film = {"altitude": 1.2e5}, {"time_start_ns": 8.5e5, "bin_width_ns": 1000.0, "bin_count": 20}
     merged, reference = (
         passes(lidar_scene(integrator=integrator, tx=high, rx=high, film=film, bottom=None), 4)
-        for integrator in (MERGING, {})
+        for integrator in (FEW, {})
     )
-    # The fast one has a standard error of a third.
-    assert 0 < merged.sum() < 3 * reference.sum()
+    # The fast one has a standard error of about one.
+    assert 0 < merged.sum() < 30 * reference.sum()
     with pytest.raises(UserError, match=r"the beam is 4\.26e\+04 m wide on the sea, more than 1000"):
         passes(lidar_scene(integrator=MERGING, tx={"altitude": 1e6, "divergence_mrad": 20.0}, rx={"altitude": 1e6}), 1)
 
@@ -77,10 +77,10 @@ def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
 
 @pytest.mark.slow
 def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
-    four = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
-    again = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
+    four = passes(lidar_scene(integrator=FEW, sea=WAVES), 2, 5)
+    again = passes(lidar_scene(integrator=FEW, sea=WAVES), 2, 5)
     np.testing.assert_array_equal(four, again)
-    single = passes(lidar_scene(integrator=MERGING, sea=WAVES, rx={"layout": "1x1"}), 2, 5)
+    single = passes(lidar_scene(integrator=FEW, sea=WAVES, rx={"layout": "1x1"}), 2, 5)
     np.testing.assert_allclose(four.sum(axis=1), single[:, 0], rtol=1e-12, atol=1e-30)
     assert not np.array_equal(four[0], four[1])
 
@@ -302,8 +302,9 @@ def kernels_of_pass(scene, sensor, integrator):
     return found
 
 
-#: Bubbles below the wind, and a bottom with an opposition effect.
-OPPOSED = {"bottom_model": "hapke", "bubble_wind_speed": 9}
+#: Changes of numbers alone.
+NUMBERS = {"attenuation": 0.3, "scattering": 0.21, "bottom_depth": 7.5, "bottom_reflectance": 0.2}
+NUMBERS |= {"altitude": 230, "off_nadir_deg": 17, "pulse_energy_mj": 3, "pulse_fwhm_ns": 4, "bubble_wind_speed": 11}
 
 
 @pytest.mark.slow
@@ -311,16 +312,15 @@ OPPOSED = {"bottom_model": "hapke", "bubble_wind_speed": 9}
 @pytest.mark.parametrize(
     ("name", "parameters", "changes"),
     [
-        ("table1", {}, {"attenuation": 0.3, "scattering": 0.21, "bottom_depth": 7.5, "bottom_reflectance": 0.2}),
+        ("table1", {"bubble_wind_speed": 9}, NUMBERS),
         pytest.param("table1", {}, {"wind_speed": 4, "surface_seed": 3}, marks=pytest.mark.long),
         pytest.param("table1", {}, {"time_start_ns": 1310, "bin_count": 270}, marks=pytest.mark.long),
-        ("table1", {}, {"altitude": 230, "off_nadir_deg": 17, "pulse_energy_mj": 3, "pulse_fwhm_ns": 4}),
         pytest.param("table1", {}, {"divergence_mrad": 8, "field_of_view_mrad": 28}, marks=pytest.mark.long),
         pytest.param(
             "table1", {"layout": "hex7"}, {"field_of_view_mrad": 20, "group_index": 1.36}, marks=pytest.mark.long
         ),
-        ("ship_wake", STRATA, OTHER_STRATA),
-        ("table1", OPPOSED, {"bottom_reflectance": 0.2, "lobe_asymmetry": 0.2, "bubble_wind_speed": 11}),
+        # Its bottom has an opposition effect.
+        ("ship_wake", {**STRATA, "bottom_model": "hapke"}, {**OTHER_STRATA, "lobe_asymmetry": 0.2}),
     ],
     ids=lambda value: next(iter(value), "none") if isinstance(value, dict) else value,
 )
@@ -381,11 +381,12 @@ def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, tw
     """Light on the bottom under the plate would be seen on the plate, and late: 28 ns after the plate's echo."""
     water = {"attenuation": 0.1, "scattering": 0.05, "backscattering": 0.002}
     means, errors = [], []
-    for kind in ("lidar_merging", "lidar_volpath"):
-        scene = lidar_scene(integrator={"type": kind}, bottom=None, water=water, extra={"levels": two_levels})
+    for integrator in (FEW, {}):
+        scene = lidar_scene(integrator=integrator, bottom=None, water=water, extra={"levels": two_levels})
         energy = passes(scene, 8).sum(axis=1)[:, 50:130].reshape(8, 16, 5).sum(axis=-1)
         means.append(energy.mean(axis=0))
         errors.append(energy.std(axis=0, ddof=1) / np.sqrt(8))
     z = (means[0] - means[1]) / np.hypot(*errors)
     assert np.all(np.abs(z) < largest_z(8, z.size)), z
     assert np.median(errors[1] / means[1]) < largest_error(8, 0.02)
+    assert np.median(errors[0] / means[0]) < largest_error(8, 0.03)

@@ -336,7 +336,8 @@ def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, v
     [
         pytest.param("rayleigh", 0.9, 4.85e-2, 0.015, marks=pytest.mark.slow),
         pytest.param("rayleigh", 0.2, 1.72e-3, 0.044, marks=pytest.mark.long),
-        pytest.param("petzold", 0.9, 6.99e-3, 0.063, marks=pytest.mark.slow),
+        # 8 s.
+        pytest.param("petzold", 0.9, 6.99e-3, 0.063, marks=pytest.mark.long),
         pytest.param("petzold", 0.2, 5.47e-5, 0.060, marks=pytest.mark.long),
     ],
 )

@@ -13,6 +13,11 @@ INDEX, GROUP, THICKNESS = np.array([1.34, 1.6, 1.2]), np.array([1.36, 1.25, 1.2]
 WATER = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.6, 1.2", "group_index": "1.36, 1.25, 1.2"}
 
 
+def few(integrator):
+    """Return the parameter of photons of the integrator that has them."""
+    return {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
+
+
 def across(theta):
     """Return how far a ray gets sideways from the receiver to the bottom [m], and its angles in the index layers."""
     phi = np.arcsin(np.sin(theta) / INDEX)
@@ -42,7 +47,7 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scen
     arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
     narrow = {"divergence_mrad": 0.2}
     scene = lidar_scene(
-        integrator={"type": integrator, "paths_per_pass": 2**14},
+        integrator={"type": integrator, "paths_per_pass": 2**14, **few(integrator)},
         tx=narrow,
         rx={"field_of_view_mrad": 20.0, "layout": "1x1"},
         film={"bin_width_ns": 0.25, "bin_count": 640},
@@ -82,7 +87,7 @@ def test_layers_below_the_bottom_are_refused(lidar_scene, passes):
         passes(lidar_scene(water={"layer_tops": "0, 9", "attenuation": "0.3, 0.4"}), 1)
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_a_plate_on_a_boundary_is_that_above_it(lidar_scene, integrator):
     """The same random numbers: light would pass through the plate, upwards as well, and 8 % of its echo be missing."""
     energies = []
@@ -90,7 +95,7 @@ def test_a_plate_on_a_boundary_is_that_above_it(lidar_scene, integrator):
         place = mi.ScalarTransform4f().translate([0, 0, above - 2]).scale(0.8)
         plate = {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
         scene = lidar_scene(
-            integrator={"type": integrator, "paths_per_pass": 2**13},
+            integrator={"type": integrator, "paths_per_pass": 2**13, **few(integrator)},
             water={**WATER, "attenuation": 0.2, "scattering": 0.1},
             extra={"plate": plate},
             film={"bin_width_ns": 1000.0, "bin_count": 1},

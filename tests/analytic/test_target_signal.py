@@ -13,7 +13,7 @@ SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2
 
 @pytest.fixture(scope="module")
 def squares():
-    return target_signal("fig13_2x2", NEAR, passes=16, integrator={"type": "lidar_merging", "paths_per_pass": 2**14})
+    return target_signal("fig13_2x2", NEAR, passes=16, integrator=SMALL)
 
 
 @pytest.fixture(scope="module")

@@ -27,10 +27,11 @@ INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 def build(lidar_scene):
     """Builder of scenes with a lidar under water."""
 
-    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**15, bins=BINS, **options):
+    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**14, bins=BINS, **options):
         pose = {"altitude": altitude, "off_nadir_deg": off_nadir_deg}
+        photons = {"photons_per_pass": paths // 2} if integrator == "lidar_merging" else {}
         return lidar_scene(
-            integrator={"type": integrator, "paths_per_pass": paths},
+            integrator={"type": integrator, "paths_per_pass": paths, **photons},
             tx={**pose, "divergence_mrad": 4.0, **(tx or {})},
             rx={**pose, "layout": "1x1", "field_of_view_mrad": 40.0, **(rx or {})},
             film={"time_start_ns": START, "bin_width_ns": 1.0, "bin_count": bins},
@@ -49,7 +50,7 @@ def test_bottom_below_a_boat(build, passes, z_score, integrator):
     expected = SYSTEM * 0.1 / np.pi * np.exp(-0.2 * distance) / distance**2
     z, error = z_score(energy.sum(axis=1), expected)
     assert abs(z) < largest_z(8) + 1e-3 / error  # the beam's rim is 0.1 % weaker
-    assert error < largest_error(8, 0.005)
+    assert error < largest_error(8, 0.01)
     due = 2e9 * GROUP * distance / C0
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
 
@@ -62,7 +63,7 @@ def test_single_scattering_below_a_boat(build, passes, integrator, view):
     scattering = 1.5e-5
     water = {"attenuation": 0.4, "scattering": scattering, "backscattering": 3e-7}
     water |= {"phase_function": "hg", "phase_g": 0.6}
-    scene = build(-1.0, 0.0, integrator, water=water, bottom=60.0, rx={"field_of_view_mrad": view}, paths=2**16)
+    scene = build(-1.0, 0.0, integrator, water=water, bottom=60.0, rx={"field_of_view_mrad": view})
     energy = passes(scene, 16)[:, 0].reshape(16, -1, 8).sum(axis=2)[:, :8]
     level = SYSTEM * scattering * float(henyey_greenstein(np.pi, 0.6)) * (1 - np.exp(-0.5 * (view / 4.0) ** 2))
     edges = 1e-9 * C0 / (2 * GROUP) * (START + 8.0 * np.arange(9))
@@ -71,7 +72,7 @@ def test_single_scattering_below_a_boat(build, passes, integrator, view):
     error = energy.std(axis=0, ddof=1) / np.sqrt(16)
     z = (energy.mean(axis=0) - expected) / error
     assert np.abs(z).max() < largest_z(16, z.size), z
-    assert np.all(error < largest_error(16, 0.015) * expected)
+    assert np.all(error < largest_error(16, 0.03) * expected)
 
 
 @pytest.mark.slow
@@ -85,7 +86,7 @@ def test_surface_above_a_diver(build, passes, z_score, integrator):
     expected = SYSTEM * reflectance * np.exp(-0.2 * depth) / (4 * np.pi * variance * depth**2)
     z, error = z_score(energy.sum(axis=1), expected)
     assert abs(z) < largest_z(8) + 1e-3 / error
-    assert error < largest_error(8, 0.004)
+    assert error < largest_error(8, 0.008)
     due = 2e9 * GROUP * depth / C0
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
 
@@ -113,7 +114,7 @@ def test_both_integrators_agree_under_water(build, passes, case):
     options = {**options, "tx": {"divergence_mrad": 60.0}, "rx": {"field_of_view_mrad": 150.0, **options.get("rx", {})}}
     scenes = [
         build(altitude, angle, integrator, water=TURBID, sea=WAVES, paths=paths, **options)
-        for integrator, paths in zip(INTEGRATORS, (2**15, 2**16), strict=True)
+        for integrator, paths in zip(INTEGRATORS, (2**16, 2**16), strict=True)
     ]
     merged, reference = (
         passes(scene, count, seed)[:, 0].reshape(count, -1, 8).sum(axis=2)

@@ -32,7 +32,7 @@ def surface_echoes(wind, angle, wave):
         scene = mi.load_dict(
             {
                 "type": "scene",
-                "integrator": {"type": "lidar_volpath", "max_scatterings": 0, "paths_per_pass": 2**16},
+                "integrator": {"type": "lidar_volpath", "max_scatterings": 0, "paths_per_pass": 2**14},
                 "tx": {"type": "lidar_transmitter", **lidar},
                 "rx": {"type": "multipixel_receiver", **lidar, "field_of_view_mrad": 80.0, "layout": "1x1", "f": film},
                 "sea": {**sea, "size": 400.0, "interior": {"type": "layered_water"}},

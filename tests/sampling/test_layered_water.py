@@ -38,7 +38,7 @@ def radiance(medium):
             },
         }
     )
-    return np.array([mi.render(scene, spp=256, seed=seed) for seed in range(16)])[..., 0]
+    return np.array([mi.render(scene, spp=256, seed=seed) for seed in range(4)])[..., 0]
 
 
 def assert_same_light(first, second):
@@ -131,7 +131,7 @@ def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes, hom
         # Part of the blend.
         pytest.param({"type": "rayleigh"}, marks=pytest.mark.long),
         pytest.param(BLEND, marks=pytest.mark.slow),
-        pytest.param({"type": "isotropic"}, marks=pytest.mark.slow),
+        pytest.param({"type": "isotropic"}, marks=pytest.mark.long),
         pytest.param({"type": "two_term_henyey_greenstein"}, marks=pytest.mark.slow),
     ],
 )

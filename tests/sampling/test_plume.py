@@ -114,17 +114,3 @@ def test_bubbles_brighten_the_water_that_they_fill_and_darken_the_bottom(lidar_s
     for gate, factor in ((upper, 2), (lower, 0.95)):
         brighter, error = mean_and_error(np.sign(factor - 1) * (wake - factor * clear)[:, gate].sum(axis=1))
         assert brighter > limit * error
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"plume_scattering": -1.0}, "plume_scattering = -1 must lie between"),
-        ({"plume_width": 0.0}, "plume_width = 0 must lie between"),
-        ({"plume_depth": 200.0}, "plume_depth = 200 must lie between 0.01 and 100"),
-        ({"plume_backscatter_ratio": 0.9}, "plume_backscatter_ratio = 0.9 must lie between"),
-    ],
-)
-def test_invalid_input_is_refused(change, message):
-    with pytest.raises(RuntimeError, match=message):
-        mi.load_dict({"type": "layered_water", **change})

@@ -120,16 +120,3 @@ def test_components_can_be_asked_for_alone():
         parts.append(float(bsdf.eval(context, interaction(OBLIQUE), wo)[0][0]))
     assert parts[1] == pytest.approx(0.6 * 0.25 * OBLIQUE[2] / np.pi, rel=1e-5)
     assert sum(parts) == pytest.approx(value(bsdf, OBLIQUE, OBLIQUE), rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"reflectance": 1.2}, "reflectance = 1.2 must lie between 0 and 1"),
-        ({"width_deg": 0.0}, "width_deg = 0 must lie between 0.01 and 180"),
-        ({"diffuse_share": -0.1}, "diffuse_share = -0.1 must lie between 0 and 1"),
-    ],
-)
-def test_invalid_input_is_refused(parameters, message):
-    with pytest.raises(RuntimeError, match=message):
-        surface(**parameters)

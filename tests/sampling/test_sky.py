@@ -114,13 +114,9 @@ def test_mitsubas_path_tracer_sees_a_plate_in_sun_and_sky():
 @pytest.mark.parametrize(
     ("plugin", "message"),
     [
-        ({"type": "sun", "zenith_deg": 90.0}, "zenith_deg = 90 must lie between 0 and 89"),
-        ({"type": "sun", "irradiance": -1.0}, "irradiance = -1 must lie between"),
-        ({"type": "sun", "angular_radius_deg": 20.0}, "angular_radius_deg = 20 must lie"),
         ({"type": "sky", "distribution": "starry"}, "distribution = 'starry' must be one of clear, overcast, uniform"),
         ({"type": "sky", "distribution": "overcast"}, "irradiance is missing"),
         ({"type": "sky", "distribution": "uniform", "irradiance": 1.0, "sun_zenith_deg": 3.0}, "leave it out"),
-        ({"type": "sky", "sun_zenith_deg": float("nan")}, "sun_zenith_deg = nan must be finite"),
     ],
 )
 def test_invalid_input_is_refused(plugin, message):

@@ -47,7 +47,7 @@ def ball(x, y):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+@pytest.mark.parametrize("integrator", [pytest.param("lidar_merging", marks=pytest.mark.long), "lidar_volpath"])
 def test_far_scene_has_the_bits_of_that_at_the_origin(integrator):
     """Single precision alone loses 24 % of the beam through the sea there, and the bottom comes 4 ns too early."""
     few = {"type": integrator, "paths_per_pass": 4096}

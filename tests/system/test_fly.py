@@ -70,8 +70,10 @@ def seeded(seed):
     return {**FLIGHT, "seed": seed, "platform": {**FLIGHT["platform"], "noise": noise}}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("seed", "turns_with"), [(1, "scan"), (2, "platform")])
+@pytest.mark.parametrize(
+    ("seed", "turns_with"),
+    [pytest.param(1, "scan", marks=pytest.mark.slow), pytest.param(2, "platform", marks=pytest.mark.long)],
+)
 def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed, turns_with):
     """All round the compass, with a rolling platform, over a slope: a wrong azimuth, sign or index is metres off.
 
@@ -233,7 +235,7 @@ def test_flights_that_cannot_be_rendered(change, message):
         FlightRenderer.of(FlightPlan.of({**FLIGHT, **change}))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
     """The other pulses have their points."""
     path, folder = tmp_path / "short.toml", tmp_path / "failed"

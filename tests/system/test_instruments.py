@@ -35,8 +35,17 @@ def few(scene, integrator=FEW, **options):
 OWN = {"published_airborne": "table1", "published_mast": "fig04_mast"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", instruments.instrument_names())
+#: Of each kind: one pixel and many, a mast, an orbit, and scenes' own.
+KINDS = (*OWN, "icesat2_atlas", "riegl_vq840g", "teledyne_czmil")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
+        for name in instruments.instrument_names()
+    ],
+)
 def test_every_instrument_renders(name):
     """Surface and bottom return light at their times, in every channel; a scene's own lidar gives the same bits."""
     scene = OWN.get(name, "table1")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from few_paths import few_paths
 
 import mitransient_lidar
 
@@ -159,30 +160,32 @@ app.main()
 
 COARSE = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
 STUDIES = {
-    "detect": (["fig13_2x2", *COARSE, "--passes", 16, "-o", "d.png"], "detection needs all renders, and none"),
+    "detect": (["small.xml", *COARSE, "--passes", 16, "-o", "d.png"], "detection needs all renders, and none"),
     "target-signal": (
-        ["fig13_2x2", *COARSE, "--grid", 2, "--passes", 16, "-o", "t.png"],
+        ["small.xml", *COARSE, "--grid", 2, "--passes", 16, "-o", "t.png"],
         "a map needs all places, and",
     ),
     "depth-bias": (
-        ["published_airborne", "--winds", 3, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
-        "of 3 renders, and none is kept.",
+        ["published_airborne", "--winds", 0, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],
+        "of 6 renders, and none is kept.",
     ),
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("study", STUDIES)
+@pytest.mark.parametrize(
+    "study", [pytest.param(name, marks=pytest.mark.slow if name == "detect" else pytest.mark.long) for name in STUDIES]
+)
 def test_a_study_that_needs_all_of_its_renders_ends_with_the_first_interruption(tmp_path, study):
     """It once went on with the next render, and counted the interrupted one as complete."""
     arguments, text = STUDIES[study]
+    few_paths("fig13_2x2", tmp_path)
     process = start(IN_A_RENDER, study, *arguments, "-q", stderr=subprocess.PIPE, cwd=tmp_path)
     _, stderr = process.communicate(timeout=600)
     assert process.returncode == 130, stderr
     (line,) = stderr.splitlines()
     assert line.startswith("interrupted")
     assert text in line
-    assert names(tmp_path) == []
+    assert names(tmp_path) == ["small.xml"]
 
 
 #: The command line, with a signal when the command has ended and the process has not.
@@ -197,8 +200,14 @@ app.main()
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
+    ],
+)
 def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
     """Ctrl-C once gave a traceback and exit code 0."""
     process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -208,7 +217,7 @@ def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", [pytest.param("2>&-", marks=pytest.mark.long), "<&- >&- 2>&-"])
 def test_a_render_with_closed_streams_writes_its_files_and_nothing_into_them(tmp_path, closed):
     """It once wrote nothing, with exit code 2; files took the number of stderr, which libraries write to."""
     arguments = [*RENDER, "--passes", "2", "-D", "surface_size=60", "-D", "surface_cell_size=0.5", "-o", str(tmp_path)]

@@ -27,7 +27,7 @@ SIZE = 12
 
 
 def rendered(layout):
-    integrator = {"type": "lidar_merging", "paths_per_pass": 2**15}
+    integrator = {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}
     params = {**PLACE, "layout": layout}
     return mitransient_lidar.render("fig13_2x2", params=params, passes=6, seed=3, integrator=integrator)
 

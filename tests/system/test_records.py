@@ -48,7 +48,7 @@ def beside(offset, film=None):
     transform = mi.ScalarTransform4f()
     origin = np.array([-200 * np.tan(np.radians(20)), 0, 200]) + offset
     return {
-        "integrator": {"type": "lidar_merging"},
+        "integrator": {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14},
         "tx": {"type": "lidar_transmitter"},
         "rx": {
             "type": "multipixel_receiver",

@@ -29,7 +29,7 @@ def shot(lidar_scene):
 
     def render(tx=None, rx=None, water=None):
         scene = lidar_scene(
-            integrator={"type": "lidar_merging", "paths_per_pass": 2**15},
+            integrator={"type": "lidar_merging", "paths_per_pass": 2**15, "photons_per_pass": 2**14},
             tx=tx,
             rx=rx,
             water=water or {"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006},
@@ -57,6 +57,7 @@ def shot(lidar_scene):
             {"divergence_mrad": 16.0, "divergence_across_mrad": 4.0, "ellipse_deg": 30.0},
             {"field_of_view_mrad": 20.0},
             id="ellipse",
+            marks=pytest.mark.long,
         ),
         pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
         pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="top hat in a narrow view"),
@@ -93,7 +94,11 @@ def test_forward_scattering_leaves_no_bias(jerlov, shot):
     ("field_of_view", "water"),
     [
         (30.0, {"attenuation": "0.9, 0.5", "scattering": "0.45, 0.25", "backscattering": "0.018, 0.010"}),
-        (10.0, {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"}),
+        pytest.param(
+            10.0,
+            {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_two_layers_leave_no_class_that_looks_sure(field_of_view, water, shot):

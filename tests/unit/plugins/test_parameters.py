@@ -3,14 +3,17 @@
 import gc
 import importlib
 import json
+import math
 import re
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import PLUGINS as DECLARED
 from mitransient_lidar.loading.scene_record import object_values, plugin_values
+from mitransient_lidar.loading.scenes import as_user_error
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
@@ -48,6 +51,25 @@ WITHOUT_VALUE = {
 }
 
 PLUGINS = [name.rpartition(".")[2] for name in PLUGIN_MODULES if name not in ("bases", "phase.tabulated")]
+#: What else is given where a number needs it.
+RECTANGLE, SECTOR, STRIP = ({"shape": shape} for shape in ("rectangle", "sector", "strip"))
+NEEDED = {
+    "ellipse_deg": {"divergence_across_mrad": 2.0},
+    "profile_mrad": {"beam_profile": "image", "profile_file": "image.npy"},
+    "focal_length_mm": {"pixel_pitch_um": 10.0},
+    "pixel_pitch_um": {"focal_length_mm": 100.0},
+    "blur_file_mrad": {"blur_file": "image.npy"},
+    "inner_mrad": {"shape": "ring"},
+    **{"start_deg": SECTOR, "extent_deg": SECTOR, "width_mrad": RECTANGLE, "height_mrad": RECTANGLE},
+    **{"angle_x_min_mrad": STRIP, "angle_x_max_mrad": STRIP},
+    **{name: {"gate_count": 2} for name in ("gate_start_ns", "gate_start_depth")},
+    **{
+        name: {"gate_count": 2, "gate_start_ns": 1400.0}
+        for name in ("gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns", "pulses")
+    },
+    "junge_slope": {"refractive_index": 1.1},
+    "single_scattering_albedo": {"model": "hapke"},
+}
 
 
 def _values(plugin, folder):
@@ -71,6 +93,29 @@ def test_every_declared_parameter_is_kept_with_its_default(plugin, tmp_path):
     defaults = {name: each.default for name, each in declared.items() if each.default not in (None, "")}
     defaults = {name: default for name, default in defaults.items() if name != "model" and values[name] is not None}
     assert {name: values[name] for name in defaults} == defaults
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_number_outside_its_range_is_refused(plugin, tmp_path, monkeypatch):
+    """Below, above, and where a number has no end: the sentence names parameter and value, and what is allowed."""
+    np.save(tmp_path / "image.npy", np.ones((4, 4)))
+    monkeypatch.chdir(tmp_path)
+    for each in DECLARED[plugin]:
+        if each.kind not in ("float", "integer") and not each.is_list:
+            continue
+        beyond = [each.low - 0.1 * abs(each.low) - 1e-3, each.high + 0.1 * abs(each.high) + 1e-3, *[0.0] * each.above]
+        whole = each.kind == "integer"
+        wrong = [math.floor(value) if whole else value for value in beyond if np.isfinite(value)]
+        wrong = [wrong[0], math.ceil(beyond[1])] if whole else [*wrong, math.nan, math.inf]
+        needed = NEEDED.get(each.name, {})
+        if (plugin, each.name) == ("fournier_forand", "refractive_index"):
+            needed = {"junge_slope": 4.0}
+        for value in wrong:
+            given = str(value) if each.is_list else value
+            with pytest.raises(UserError, match=rf"^{each.name} (=|holds) .* must ") as caught, as_user_error():
+                mi.load_dict({"type": plugin, **needed, each.name: given})
+            assert re.search("finite|must lie between|must be greater than 0|must not be negative", str(caught.value))
+            assert f"{value:g}" in str(caught.value) or str(value) in str(caught.value)
 
 
 def test_manual_pages_have_the_table_of_the_declared_parameters():

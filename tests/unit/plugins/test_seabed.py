@@ -164,16 +164,9 @@ def test_reads_from_xml():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"depth": 0.0}, "depth = 0 must be greater than 0"),
-        ({"depth": -3.0}, "depth = -3 must lie between 0 and 100000"),
-        ({"slope_x_deg": 50.0}, "slope_x_deg = 50 must lie between -45 and 45"),
-        ({"curvature": 2.0}, "curvature = 2 must lie between -1 and 1"),
-        ({"reflectance": 1.5}, "reflectance = 1.5 must lie between 0 and 1"),
         ({"ripple_height": 0.1}, "ripple_height = 0.1 must be at most 0.3 of ripple_length = 0.2"),
         ({"ripple_height": 0.01, "cell_size": 0.1}, "cell_size = 0.1 must be at most a quarter of ripple_length"),
         ({"cell_size": 0.001}, "size = 20 with cell_size = 0.001 needs 20000 cells a side: allowed are 2048"),
-        ({"cell_size": 0.0}, "cell_size = 0 must be greater than 0"),
-        ({"size": 0.0}, "size = 0 must lie between 0.001 and 1e\\+06"),
         ({"map_size": 4.0}, "map_size = 4.0 needs a height map"),
         ({"origin_y": 4.0}, "origin_y = 4.0 needs a height map"),
         ({"map_holes": "fill"}, "map_holes = fill needs a height map"),

@@ -227,8 +227,7 @@ def test_command_refuses_before_it_writes(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("flips", [False, True])
-@pytest.mark.parametrize("inwards", [False, True])
+@pytest.mark.parametrize(("flips", "inwards"), [(False, False), (True, False), (False, True)])
 def test_closed_mesh_with_faces_inwards_is_told(lidar_scene, caplog, tmp_path, inwards, flips):
     mesh = mi.load_dict({"type": "cube"})
     buffers = mi.traverse(mesh)

@@ -230,9 +230,9 @@ def test_description_of_the_sea_can_be_left_out(rendered):
 @pytest.mark.slow
 def test_series_that_does_not_fit_the_memory(rendered):
     with pytest.raises(
-        UserError, match=r"^3000 shots of 4096 pixels x 19\d bins, and 3 components of each, take 6\d\d GB of memory"
+        UserError, match=r"^3 shots of 1048576 pixels x 19\d bins, and 3 components of each, take 1\d\d GB of memory"
     ):
-        shot_series.render_shots("table1", {**FLAT, "layout": "64x64"}, positions=[(0, 0)] * 3000, components=True)
+        shot_series.render_shots("table1", {**FLAT, "layout": "1024x1024"}, positions=PLACES, components=True)
 
 
 @pytest.mark.slow
@@ -380,8 +380,6 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
         ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
         ("fig09_2x2", {"positions": [(0, -2e7)]}, r"positions = -2e\+07 must lie between"),
         ("fig09_2x2", {"positions": [(0, 1e5), (0, 1e6)]}, "positions are 900000 m apart along x or y: at most 20000"),
-        ("fig09_2x2", {"positions": PLACES, "passes": 1}, "passes = 1 must lie between 2"),
-        ("fig09_2x2", {"positions": PLACES, "max_time": 0}, "max_time = 0 must be greater than 0"),
         ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
         ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
         ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
@@ -410,7 +408,6 @@ def test_command_mounts_an_instrument(monkeypatch, tmp_path):
         (["--at", "1;2"], "--at = '1;2' must hold numbers only"),
         (["--places", "missing.csv"], "cannot read missing.csv"),
         (["-o", "shots.exr"], "--output shots.exr must end in .nc"),
-        (["--count", "1"], "count = 1 must lie between 2 and 100000"),
     ],
 )
 def test_command_refuses_invalid_options(arguments, message):

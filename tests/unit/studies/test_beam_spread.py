@@ -43,9 +43,7 @@ def test_depths_that_are_refused(lidar_scene, depths, message):
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"passes": 1}, "passes = 1 must lie between 2 and 10000"),
         ({"photons": 10}, "photons = 10 must lie between 1024 and 16777216"),
-        ({"seed": -1}, "seed = -1 must lie between 0"),
         ({"params": {"bottom_depth": 3}}, "params = ['bottom_depth'] need an XML scene"),
     ],
 )
@@ -220,8 +218,6 @@ def test_command(tmp_path):
         (["--depths", "2;5"], "--depths = '2;5' must hold numbers only"),
         (["--depths", "2,nan"], "depths holds nan"),
         (["--depths", "9"], "depths = 9 m must not lie below the bottom, at 8 m"),
-        (["--depths", "2", "--passes", "1"], "passes = 1 must lie between 2 and 10000"),
-        (["--depths", "2", "--seed", "-1"], "seed = -1 must lie between"),
         (["--depths", "2", "-o", "spread.txt"], "must end in .png, .pdf or .svg"),
         (["--depths", "2", "-D", "wind=3"], "parameter 'wind' is not one of scene fig09_1x1"),
     ],

@@ -242,8 +242,6 @@ def test_values_with_commas_are_separated_by_semicolons():
         ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
         ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
         ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
-        ({"renders": 1}, "renders = 1 must lie between 2 and 1000"),
-        ({"passes": 1}, "passes = 1 must lie between 2"),
         ({"background_power_w": -1}, "background_power_w = -1 must not be negative"),
     ],
 )

@@ -63,7 +63,7 @@ def test_errors_that_neighbours_share_widen_the_covariance():
     inflation = [np.sqrt(1 + 2 * sum((1 - k / n) * lags[k] for k in range(1, min(n, 5)))) for n in bins]
     true = closed_form(TRUTH)["waveform"]
     fits = []
-    for _ in range(50):
+    for _ in range(16):
         errors = 0.002 * np.convolve(random.normal(size=TIME.size + 4), kernel, "valid")
         data = {"waveform": true + errors, "waveform_stderr": xr.full_like(true, 0.002)}
         attributes = {**BIN, "error_inflation_bins": bins, "error_inflation": inflation}
@@ -83,7 +83,7 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
     truth = {"attenuation": 0.2, "bottom_reflectance": 0.1, "scale": 5000.0, "time_offset_ns": -500.3}
     starts = {"attenuation": 0.3, "bottom_reflectance": 0.05}
     distances = []
-    for _ in range(40):
+    for _ in range(16):
         counts = 5000 * closed_form(TRUTH, times)["waveform"].values[0] + random.normal(0, 10, times.size)
         lines = (f"{time - 500.3:.6f},{count:.9g},10" for time, count in zip(times, counts, strict=True))
         (tmp_path / "counts.csv").write_text("\n".join(["time_ns,apd,apd_stderr", *lines]))
@@ -98,9 +98,9 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
 def test_errors_of_records_of_a_receiver_are_those_of_its_closed_form():
     """Records of 40 shots behind an avalanche photodiode, whose bandwidth correlates neighbouring samples."""
     light = closed_form(TRUTH, pixels=("a", "b"), power=3e-7)
-    recorded = detect_waveforms(light, "apd", shots=40 * 40, seed=4)
+    recorded = detect_waveforms(light, "apd", shots=20 * 40, seed=4)
     distances, probabilities = [], []
-    for number in range(40):
+    for number in range(20):
         found = recorded.isel(shot=slice(40 * number, 40 * number + 40)).assign_attrs(shots=40)
 
         def model(values):
@@ -121,7 +121,7 @@ def test_noise_of_the_model_widens_the_covariance():
     """
     random = np.random.default_rng(5)
     distances = []
-    for _ in range(50):
+    for _ in range(20):
         errors = random.normal(0, 0.002, TIME.size)
 
         def model(values, errors=errors):
@@ -184,7 +184,7 @@ def test_standard_errors_from_few_passes_widen_the_covariance():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("receiver", [None, "apd"])
+@pytest.mark.parametrize("receiver", [None, pytest.param("apd", marks=pytest.mark.long)])
 def test_errors_of_a_result_without_batches_agree_as_those_of_the_model(receiver):
     """Data of 16 passes whose errors are a common factor for the larger part, which the batches of the model tell.
 

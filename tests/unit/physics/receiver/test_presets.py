@@ -130,7 +130,7 @@ def test_signal_and_shot_noise_by_hand():
 
 
 @pytest.mark.parametrize("response", ["single_pole", "gaussian"])
-@pytest.mark.parametrize("width", [2.0, 1.0, 0.5, 0.1])
+@pytest.mark.parametrize("width", [2.0, 0.2])
 def test_noise_of_steady_light_does_not_depend_on_the_bins(width, response):
     """2 q I F times the noise bandwidth, and the same with the amplifier's density, to the 0.5 % of the parts."""
     detector = LinearDetector(0.6, 50.0, 2.96)
@@ -144,7 +144,7 @@ def test_noise_of_steady_light_does_not_depend_on_the_bins(width, response):
     assert expected == pytest.approx(density * factor * 200e6 * 1e4**2, rel=6e-3, abs=0)
     # Shots agree: of n normal samples the variance has the relative error sqrt(2/n).
     found = chain.apply(light, width, SHOTS, 21).signal[:, middle].astype(np.float64).var(ddof=1)
-    assert abs(found / expected - 1) < largest_z(SHOTS, 8) * np.sqrt(2 / SHOTS)
+    assert abs(found / expected - 1) < largest_z(SHOTS, 4) * np.sqrt(2 / SHOTS)
 
 
 def test_noise_of_neighbouring_samples_is_correlated():
