@@ -318,7 +318,8 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     for node in parsed.nodes:
         for name in list(node.props.keys()):
             node.props.mark_queried(name, False)
-    return mi.parser.instantiate(config, parsed)
+    with variants.several_threads():
+        return mi.parser.instantiate(config, parsed)
 
 
 @contextlib.contextmanager

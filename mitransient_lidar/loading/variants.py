@@ -151,6 +151,22 @@ def limit_threads() -> None:
         dr.set_thread_count(usable_processors())
 
 
+@contextlib.contextmanager
+def several_threads() -> Iterator[None]:
+    """Let Dr.Jit use two threads at least, for a while: with one, Mitsuba waits for ever where it reads an EXR file."""
+    import drjit as dr
+
+    count = dr.thread_count()
+    if count >= 2:
+        yield
+        return
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
+
+
 def set_variant(name: str | None = None) -> str:
     """Set Mitsuba's variant, register the plugins, and return the name of the variant.
 

@@ -141,3 +141,23 @@ def test_description_names_versions_and_llvm():
     described = variants.describe()
     assert {"mitransient-lidar", "mitsuba", "drjit", "python", "variant", "LLVM", "GPU", "threads"} == set(described)
     assert described["variant"] == mi.variant()
+
+
+def test_scenes_are_loaded_by_two_threads_at_least(monkeypatch):
+    """With one, as in the processes of campaigns, Mitsuba waits for ever where a texture is an EXR file."""
+    counts, instantiate = [], mi.parser.instantiate
+
+    def counted(*args):
+        counts.append(dr.thread_count())
+        return instantiate(*args)
+
+    monkeypatch.setattr(mi.parser, "instantiate", counted)
+    before = dr.thread_count()
+    try:
+        for count in (1, 3):
+            dr.set_thread_count(count)
+            open_scene("table1")
+            assert dr.thread_count() == count
+    finally:
+        dr.set_thread_count(before)
+    assert counts == [2, 3]
