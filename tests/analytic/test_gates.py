@@ -140,9 +140,9 @@ def test_gates_that_cannot_be(lidar_scene, film, gigabytes, words):
         ({"gate_width_ns": 0.0}, "gate_width_ns = 0"),
         ({"gate_step_ns": -1.0}, "gate_step_ns = -1"),
         ({"gate_count": -1}, "gate_count = -1"),
-        ({"gate_start_depth": 3.0}, "either gate_start_ns or gate_start_depth"),
+        ({"gate_start_depth": 3.0}, "and gate_start_depth = 3.0 describe the same"),
         ({"pulses": 0}, "pulses = 0"),
-        ({"gate_profile": "missing.txt"}, "gate_width_ns = 8 and gate_profile"),
+        ({"gate_profile": "missing.txt"}, "gate_width_ns = 8.0 and gate_profile = 'missing.txt' describe the same"),
     ],
 )
 def test_parameters_of_gates_out_of_range(film, words):
