@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import BoolArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
-from mitransient_lidar.transport.opaque import aligned, changed, is_one_of, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape
@@ -161,13 +162,15 @@ class SolidPatches:
         cores = dr.maximum(cores, opaque(self.least) / ring_widths)
         # Of each solid: core radius, and width of rings over it.
         self._sizes = dr.ravel(mi.Point2f(cores, ring_widths))
-        self._near = self._near_others(solids)
-        cut = [*self.uneven, *self._near]
-        self._bounded = [
-            solid
+        # Of each solid: whether others may cover it closely, and whether its patches may be cut by an edge.
+        near, cut = np.zeros((2, depths.size), bool)
+        near[numbers] = self._near_others(solids)
+        cut[numbers] = [
+            not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
             for solid in solids
-            if not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in cut)
         ]
+        self._any_near, self._any_cut = bool(near.any()), bool((near | cut).any())
+        self._near, self._cut = (aligned(mi.UInt32, one.astype(np.uint32)) for one in (near, near | cut))
 
     def of_pass(self, scene: LidarScene, shift: mi.Point2f) -> SolidPatches:
         """Return the patches of a pass over a scene, shifted by two uniform random numbers of each shot."""
@@ -198,7 +201,7 @@ class SolidPatches:
         # Solids with overhangs have several levels over one square. Sectors far from the beam are wide, and so high.
         height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self._side)
         start = dr.floor(w / height + self._shift.x)
-        level = dr.select(is_one_of(met_shape(si), self._bounded), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
+        level = dr.select(self._is(self._cut, met_shape(si)), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
         corner = mi.Point3f(
             (cu - self._shift.x) * self._side, (cv - self._shift.y) * self._side, (start - self._shift.x) * height
         )
@@ -243,30 +246,35 @@ class SolidPatches:
         x, y = self.rings.slant
         below = -si.p.z - self._plane
         along, across = self.rings.offset(si.p.x - x * below, si.p.y - y * below, self.rings.depth_at(-self._plane))
-        number = dr.minimum(
-            dr.reinterpret_array(mi.UInt32, met_shape(si)), opaque_index(dr.width(self._sizes) // 2 - 1)
-        )
-        return along, across, dr.gather(mi.Point2f, self._sizes, number)
+        return along, across, dr.gather(mi.Point2f, self._sizes, self._number(met_shape(si)))
 
-    def _near_others(self, solids: Sequence[mi.Shape]) -> list[mi.Shape]:
-        """Return solids that others may cover closely: boxes about both are less than a level apart."""
+    def _number(self, shape: mi.ShapePtr) -> mi.UInt32:
+        """Return the numbers of solids; one of them for other shapes."""
+        return dr.minimum(dr.reinterpret_array(mi.UInt32, shape), opaque_index(dr.width(self._near) - 1))
+
+    def _is(self, marks: mi.UInt32, shape: mi.ShapePtr) -> mi.Bool:
+        """Return whether solids have a mark."""
+        return dr.gather(mi.UInt32, marks, self._number(shape)) > 0
+
+    def _near_others(self, solids: Sequence[mi.Shape]) -> BoolArray:
+        """Return which solids others may cover closely: boxes about both are less than a level apart."""
         boxes = np.array([[solid.bbox().min, solid.bbox().max] for solid in solids], np.float64).reshape(-1, 2, 3)
         distance = 0.5 * _LEVEL_WIDTHS * max(self.width * self.widening, self.least)
         low, high = boxes[:, 0] - distance, boxes[:, 1] + distance
         meets = np.all((low[:, None] < high) & (low < high[:, None]), axis=-1)
-        return [solid for solid, others in zip(solids, meets.sum(axis=0), strict=True) if others > 1]
+        return np.asarray(meets.sum(axis=0) > 1)
 
     def _is_hidden(self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, height: mi.Float) -> mi.Bool:
         """Return whether another solid lies before points, in projection, within the height of a level [m].
 
         Light that such a solid stops is not spread over what it hides.
         """
-        if not self._near:
+        if not self._any_near:
             return mi.Bool(False)
         inwards = self._inwards(axis, faces)
         ray = mi.Ray3f(si.p - inwards * height, inwards)
         ray.maxt = height - dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(si.p)))
-        before = self.scene.ray_intersect(ray, is_one_of(met_shape(si), self._near) & (ray.maxt > 0))
+        before = self.scene.ray_intersect(ray, self._is(self._near, met_shape(si)) & (ray.maxt > 0))
         return before.is_valid() & ~self.scene.is_surface(before.shape)
 
     def _inwards(self, axis: mi.UInt32, faces: mi.Float) -> mi.Vector3f:
@@ -285,7 +293,7 @@ class SolidPatches:
         The mean of the number of random points in the square up to the first one on the patch (Booth 2007,
         Nucl. Sci. Eng. 156, 403).
         """
-        if not self._bounded:
+        if not self._any_cut:
             return mi.Float(1)
         margin = _PROBE_MARGIN * patch.height
         # From the side that the patch faces to the other side of its level.
@@ -316,7 +324,7 @@ class SolidPatches:
             searching &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
             return samples + dr.select(searching & fresh, mi.Float(1), 0), rng, searching, uvw, fresh
 
-        state = mi.Float(1), mi.PCG32(rng), active & is_one_of(shape, self._bounded), mi.Point3f(0), mi.Bool(True)
+        state = mi.Float(1), mi.PCG32(rng), active & self._is(self._cut, shape), mi.Point3f(0), mi.Bool(True)
         samples, advanced, *_ = dr.while_loop(state, lambda *state: state[2], probe, label="coverage")
         rng.state = advanced.state
         return samples
