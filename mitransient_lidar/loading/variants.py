@@ -153,7 +153,7 @@ def limit_threads() -> None:
 
 @contextlib.contextmanager
 def several_threads() -> Iterator[None]:
-    """Let Dr.Jit use two threads at least, for a while: with one, Mitsuba waits for ever where it reads an EXR file."""
+    """Give Dr.Jit at least two threads for a while: with one thread, Mitsuba never finishes reading an EXR file."""
     import drjit as dr
 
     count = dr.thread_count()
