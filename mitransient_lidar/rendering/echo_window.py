@@ -15,12 +15,12 @@ from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.results.geometry import LinesOfSight
-from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.opaque import aligned, shape_number
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
-from mitransient_lidar.transport.solids import met_shape
+from mitransient_lidar.transport.solids import met_numbers
 
 #: Number of rays, and share of the beam excluded at either end of an echo.
 _RAYS = 2**16
@@ -112,7 +112,7 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     outside = ~surface & ~np.array(in_air) if scene.surfaces and not scene.submerged else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
     surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
-    met = dr.select(solid, met_shape(below), met_shape(first))
+    met = np.where(np.array(solid), met_numbers(below), met_numbers(first))
     length = air + dr.select(solid, water, 0)
     of_solid = solid | (first.is_valid() & ~at_sea)
     solids = _solid_echoes(scene, met, time_ns(length), weight * np.array(of_solid))
@@ -120,12 +120,14 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
 
 
 def _solid_echoes(
-    scene: LidarScene, met: mi.ShapePtr, times_ns: NDArray[np.floating], weight: NDArray[np.float64]
+    scene: LidarScene, numbers: NDArray[np.integer], times_ns: NDArray[np.floating], weight: NDArray[np.float64]
 ) -> list[SolidEcho]:
-    """Return the echoes of the solids that rays of some weight meet."""
-    numbers, echoes = np.array(dr.reinterpret_array(mi.UInt32, met)), []
+    """Return the echoes of the solids, by their numbers, that rays of some weight meet."""
+    echoes, met = [], {*numbers[weight > 0].tolist()}
     for solid in scene.solids:
-        own = weight * (numbers == np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))))
+        if shape_number(solid) not in met:
+            continue
+        own = weight * (numbers == shape_number(solid))
         mean, latest = _quantiles(times_ns, own, np.zeros(len(own), dtype=np.int64), 1, (None, 1 - _TAIL))[0]
         if np.isfinite(mean):
             echoes.append(SolidEcho(solid, float(mean), float(latest)))
@@ -141,16 +143,16 @@ def _pierced(
 ) -> list[mi.Shape]:
     """Return the solids that rise through the sea in the field of view."""
     crest, bottoms = max(_heights(scene, "max"), default=-np.inf), scene.bottoms
+    above, lower = (
+        {*met_numbers(hit)[np.array(active)].tolist()} for hit, active in ((first, in_air), (below, under_water))
+    )
     return [
         solid
         for solid in scene.solids
         if float(solid.bbox().min.z) <= crest
-        and dr.any(in_air & (met_shape(first) == mi.ShapePtr(solid)))
+        and shape_number(solid) in above
         # A receiver may look at the land alone.
-        and (
-            not any(solid is bottom for bottom in bottoms)
-            or dr.any(under_water & (met_shape(below) == mi.ShapePtr(solid)))
-        )
+        and (shape_number(solid) in lower or not any(solid is bottom for bottom in bottoms))
     ]
 
 

@@ -15,13 +15,13 @@ from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
-from mitransient_lidar.transport.opaque import is_one_of, opaque_point
+from mitransient_lidar.transport.opaque import opaque_point, shape_number
 from mitransient_lidar.transport.records import total_reflection_ns
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
-from mitransient_lidar.transport.solids import met_shape
+from mitransient_lidar.transport.solids import met_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -252,7 +252,8 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
         _, weight = hit.bsdf().sample(mi.BSDFContext(), hit, random.x, random, active)
         if dr.any(active & (weight[0] > 0)):
             return
-        found += [solid for solid in scene.solids if dr.any(active & is_one_of(met_shape(hit), [solid]))]
+        met = {*met_numbers(hit)[np.array(active)].tolist()}
+        found += [solid for solid in scene.solids if shape_number(solid) in met]
     if any(view.meets(solid) and not any(solid is other for other in found) for solid in scene.solids):
         return
     names = ", ".join(repr(solid.id()) for solid in dict.fromkeys(found)) or "no shape"

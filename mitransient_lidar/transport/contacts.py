@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.scene import WaterScene
-from mitransient_lidar.transport.solids import box_rays, met_shape, scene_of_shapes
+from mitransient_lidar.transport.solids import BEFORE, box_rays, scene_of_shapes
 
 #: Distance within which faces coincide, and by which they are moved apart: absolute [m] and over coordinates.
 _SAME, _APART, _ROUNDING = 2e-5, 1e-4, 2.0**-20
@@ -23,8 +25,8 @@ _PARALLEL, _LEAST_RAYS = 0.9999, 3
 #: Largest vertical component of a direction that counts as level.
 _LEVEL = 1e-3
 
-#: Rays along each side of a box.
-_TICKS = 32
+#: Rays along each side of a box, and boxes of which rays are traced at once.
+_TICKS, _PAIRS_AT_ONCE = 32, 256
 
 #: Largest size of a shape that lies on another one, over that of the other one.
 _SMALLER = 0.99
@@ -35,13 +37,29 @@ _MOST_IN_A_STACK = 64
 
 @dataclass(frozen=True)
 class _Contact:
-    """A shape and a larger one that coincide: a point of their faces [m], and the normals of both there, shape (3,)."""
+    """A shape and a larger one that coincide: a point of their faces [m], and the normals of both there, shape (3,).
+
+    `has_body` says whether the shape has another face behind the one that coincides.
+    """
 
     shape: mi.Shape
     larger: mi.Shape
     point: FloatArray
     normal: FloatArray
     normal_of_larger: FloatArray
+    has_body: bool
+
+
+class _Separation(NamedTuple):
+    """A shape that is moved, in which unit direction, and whether off a face that looks the same way."""
+
+    shape: mi.Shape
+    direction: FloatArray
+    flush: bool = False
+
+
+#: A larger shape and one whose bounding box touches its own.
+_Pair = tuple[mi.Shape, mi.Shape]
 
 
 def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
@@ -58,119 +76,169 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
     # Waves coincide with nothing.
     waves = [sea for sea in scene.seas if np.isfinite(sea.sea.cell_size)]
     shapes = [shape for shape in scene.mitsuba_scene.shapes() if not any(shape is sea for sea in waves)]
-    pending = _neighbours(shapes, scene.surfaces)
+    pending, bottoms = _neighbours(shapes, scene.surfaces), scene.bottoms
     moved: dict[int, mi.Shape] = {}
     for _ in range(_MOST_IN_A_STACK):
-        found = [contact for larger, others in pending for contact in _contacts(larger, others, scene.groups)]
-        separations = [_separation(contact, scene) for contact in found]
+        found = _contacts(pending, scene.groups)
+        separations = [_separation(contact, scene.surfaces, bottoms) for contact in found]
         if not any(separations):
             _refuse_visible(found, shapes, scene.groups)
             return list(moved.values())
-        # Once in a round, so that others on both sides of a shape do not push it to and fro.
-        for moving, direction in {id(one[0]): one for one in separations if one is not None}.values():
+        # Once in a round, so that others on both sides of a shape do not push it to and fro; off what it looks at
+        # rather than off what it is flush with.
+        separations.sort(key=lambda one: one is not None and one.flush, reverse=True)
+        for moving, direction, _ in {id(one.shape): one for one in separations if one is not None}.values():
             _move(moving, direction)
             moved[id(moving)] = moving
-        pending = [
-            (larger, others)
-            for larger, others in pending
-            if any(one is contact.larger or one is contact.shape for contact in found for one in (larger, *others))
-        ]
+        touched = {id(one) for contact in found for one in (contact.shape, contact.larger)}
+        pending = [pair for pair in pending if any(id(one) in touched for one in pair)]
     raise _refusal(found[0], f"they are two of more than {_MOST_IN_A_STACK} that lie on each other")
 
 
-def _neighbours(shapes: Sequence[mi.Shape], surfaces: Sequence[mi.Shape]) -> list[tuple[mi.Shape, list[mi.Shape]]]:
-    """Return shapes with the smaller ones whose bounding boxes touch theirs, pairs of surfaces of the water aside."""
+def _neighbours(shapes: Sequence[mi.Shape], surfaces: Sequence[mi.Shape]) -> list[_Pair]:
+    """Return pairs of shapes whose bounding boxes touch, those of two surfaces of the water aside."""
     if len(shapes) < 2:
         return []
-    low, high = (np.array([getattr(shape.bbox(), end) for shape in shapes], np.float64) for end in ("min", "max"))
+    low, high = _corners(shapes)
     margin = _tolerance(np.abs([low, high]).max(axis=(0, 2)))[:, None]
     is_surface = np.array([any(shape is surface for surface in surfaces) for shape in shapes])
     sizes = np.where(is_surface, np.inf, np.linalg.norm(high - low, axis=1))
-    order, found = np.lexsort((np.arange(len(shapes)), -sizes)), []
+    # By name where equal in size: Mitsuba returns shapes in any order.
+    order, found = np.lexsort(([shape.id() for shape in shapes], -sizes)), []
     for rank, number in enumerate(order):
         others = order[rank + 1 :]
         touch = (low[others] <= high[number] + margin[others]) & (high[others] >= low[number] - margin[others])
         others = others[touch.all(axis=1) & ~(is_surface[number] & is_surface[others])]
-        if len(others):
-            found.append((shapes[number], [shapes[other] for other in others]))
+        found += [(shapes[number], shapes[other]) for other in others]
     return found
 
 
-def _contacts(larger: mi.Shape, others: list[mi.Shape], groups: Sequence[mi.Shape]) -> list[_Contact]:
-    """Return where other shapes coincide with a larger one."""
-    around, found = larger.bbox(), []
-    boxes = []
-    for other in others:
-        box = mi.ScalarBoundingBox3f(other.bbox())
-        box.clip(around)
-        boxes.append(box)
-    origins, directions = (
-        np.concatenate(arrays)
-        for arrays in zip(*(box_rays(np.array(box.min), np.array(box.max), _TICKS) for box in boxes), strict=True)
-    )
-    if len(origins) == 0:
+def _contacts(pairs: Sequence[_Pair], groups: Sequence[mi.Shape]) -> list[_Contact]:
+    """Return where the shapes of pairs coincide, in the order of the pairs."""
+    groups_of_pairs: dict[tuple[int, int], list[int]] = {}
+    shapes = list({id(shape): shape for pair in pairs for shape in pair}.values())
+    apart = _apart(shapes)
+    group_of = {id(shape): number for number, group in enumerate(apart) for shape in group}
+    for number, pair in enumerate(pairs):
+        larger, other = (group_of[id(shape)] for shape in pair)
+        groups_of_pairs.setdefault((larger, other), []).append(number)
+    scenes = [scene_of_shapes(group, groups) for group in apart]
+    found: dict[int, _Contact] = {}
+    for (larger, other), numbers in groups_of_pairs.items():
+        for start in range(0, len(numbers), _PAIRS_AT_ONCE):
+            some = numbers[start : start + _PAIRS_AT_ONCE]
+            contacts = _contacts_apart([pairs[number] for number in some], scenes[larger], scenes[other])
+            found.update({some[number]: contact for number, contact in contacts.items()})
+    return [found[number] for number in sorted(found)]
+
+
+def _apart(shapes: Sequence[mi.Shape]) -> list[list[mi.Shape]]:
+    """Return shapes in few groups: a ray through the bounding box of one meets no other one of its group there."""
+    if not shapes:
         return []
+    low, high = _corners(shapes)
+    # Rays begin this far before a box.
+    margin = (2 * BEFORE * (1 + np.abs([low, high]).max(axis=(0, 2))))[:, None]
+    low, high, groups = low - margin, high + margin, np.zeros(len(shapes), np.int64)
+    for number in range(1, len(shapes)):
+        touch = ((low[:number] <= high[number]) & (high[:number] >= low[number])).all(axis=1)
+        taken = np.zeros(number + 1, bool)
+        taken[groups[:number][touch]] = True
+        groups[number] = np.argmin(taken)
+    found: list[list[mi.Shape]] = [[] for _ in range(groups.max() + 1)]
+    for shape, group in zip(shapes, groups, strict=True):
+        found[group].append(shape)
+    return found
+
+
+def _contacts_apart(pairs: Sequence[_Pair], largers: mi.Scene, others: mi.Scene) -> dict[int, _Contact]:
+    """Return contacts by the numbers of their pairs, whose larger and whose other shapes are apart in scenes."""
+    rays = [_rays(larger, other) for larger, other in pairs]
+    owners = np.repeat(np.arange(len(pairs)), [len(origins) for origins, _, _ in rays])
+    if len(owners) == 0:
+        return {}
+    origins, directions, ends = (np.concatenate(arrays) for arrays in zip(*rays, strict=True))
     ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
-    si = scene_of_shapes(others, groups).ray_intersect(ray)
+    ray.maxt = mi.Float(ends)
+    si = others.ray_intersect(ray)
     dr.eval(si)
     tolerance = _tolerance(dr.max(dr.abs(si.p)))
     back = mi.Ray3f(dr.fma(2 * tolerance, si.n, si.p), -si.n)
     back.maxt = 4 * tolerance
-    on_larger = scene_of_shapes([larger], groups).ray_intersect(back, si.is_valid())
+    on_larger = largers.ray_intersect(back, si.is_valid())
     same = si.is_valid() & on_larger.is_valid() & (dr.abs(on_larger.t - 2 * tolerance) < tolerance)
     same &= dr.abs(dr.dot(si.n, on_larger.n)) > _PARALLEL
-    shape = dr.reinterpret_array(mi.UInt32, met_shape(si))
     # One by one, each would trace the rays again.
-    dr.eval(same, shape, si.p, si.n, on_larger.n)
-    met = np.array(same)
-    rows = [np.array(values, np.float64).T[met] for values in (si.p, si.n, on_larger.n)]
-    numbers = np.array(shape)[met]
-    for other in others:
-        own = numbers == int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(other))[0])
-        if own.sum() >= _LEAST_RAYS:
-            found.append(_Contact(other, larger, *(row[own][0] for row in rows)))
-    return found
+    dr.eval(same, si.p, si.n, on_larger.n)
+    met = np.flatnonzero(np.array(same))
+    numbers, first, count = np.unique(owners[met], return_index=True, return_counts=True)
+    numbers, first = numbers[count >= _LEAST_RAYS], met[first[count >= _LEAST_RAYS]]
+    if len(numbers) == 0:
+        return {}
+    points, normals, of_larger = (np.array(values, np.float64).T[first] for values in (si.p, si.n, on_larger.n))
+    bodies = _have_bodies([pairs[number][1] for number in numbers.tolist()], points, normals, others)
+    rows = zip(numbers, points, normals, of_larger, bodies, strict=True)
+    return {int(number): _Contact(*pairs[number][::-1], *row) for number, *row in rows}
 
 
-def _separation(contact: _Contact, scene: WaterScene) -> tuple[mi.Shape, FloatArray] | None:
-    """Return the shape of a contact that is moved, and in which unit direction; None where it is not defined."""
+def _rays(larger: mi.Shape, other: mi.Shape) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return origins, directions (n, 3) and lengths (n,) of rays through the box that two bounding boxes share."""
+    box = mi.ScalarBoundingBox3f(other.bbox())
+    box.clip(larger.bbox())
+    low, high = np.array(box.min, np.float64), np.array(box.max, np.float64)
+    origins, directions = box_rays(low, high, _TICKS)
+    ends = np.where(directions > 0, high, low)
+    lengths = np.abs((ends - origins) * directions).sum(axis=1)
+    return origins, directions, lengths + BEFORE
+
+
+def _have_bodies(
+    shapes: Sequence[mi.Shape], points: FloatArray, normals: FloatArray, scene: mi.Scene
+) -> NDArray[np.bool_]:
+    """Return which shapes of a scene have another face behind the points (n, 3) of theirs, within their boxes."""
+    low, high = _corners(shapes)
+    tolerance = _tolerance(np.abs(points).max(axis=1))
+    starts = points - 2 * tolerance[:, None] * normals
+    along = np.abs(normals) > _LEVEL
+    ends = (np.where(normals < 0, high, low) - starts) / np.where(along, -normals, 1.0)
+    ray = mi.Ray3f(mi.Point3f(starts.T), mi.Vector3f(-normals.T))
+    # A flat shape ends before the ray begins.
+    ray.maxt = mi.Float(np.maximum(np.where(along, ends, np.inf).min(axis=1) + tolerance, tolerance))
+    return np.array(scene.ray_test(ray))
+
+
+def _separation(contact: _Contact, surfaces: Sequence[mi.Shape], bottoms: Sequence[mi.Shape]) -> _Separation | None:
+    """Return how a contact is separated; None where it is not defined."""
     pair = contact.shape, contact.larger
-    if any(one is surface for one in pair for surface in scene.surfaces):
+    if any(one is surface for one in pair for surface in surfaces):
         raise _refusal(contact, "one of them is the surface of the water")
-    bottoms = [any(one is bottom for bottom in scene.bottoms) for one in pair]
-    if bottoms[0] != bottoms[1]:
-        moving, normal = pair if bottoms[1] else pair[::-1], contact.normal_of_larger if bottoms[1] else contact.normal
-        return moving[0], np.copysign(1.0, normal[2]) * normal
+    is_bottom, on_bottom = (any(one is bottom for bottom in bottoms) for one in pair)
+    if is_bottom != on_bottom:
+        normal = contact.normal_of_larger if on_bottom else contact.normal
+        return _Separation(pair[int(is_bottom)], np.copysign(1.0, normal[2]) * normal)
     if contact.normal @ contact.normal_of_larger < 0:
         # Bodies leave each other, single faces pass each other; what goes up stays off all that lies below.
-        direction = contact.normal_of_larger if _has_body(contact, scene.groups) else contact.normal
-        return pair[int(direction[2] < -_LEVEL)], np.copysign(1.0, direction[2] + _LEVEL) * direction
-    return (contact.shape, contact.normal_of_larger) if _lies_within(contact) else None
+        direction = contact.normal_of_larger if contact.has_body else contact.normal
+        return _Separation(pair[int(direction[2] < -_LEVEL)], np.copysign(1.0, direction[2] + _LEVEL) * direction)
+    return _Separation(contact.shape, contact.normal_of_larger, flush=True) if _lies_within(contact) else None
 
 
 def _refuse_visible(contacts: Sequence[_Contact], shapes: Sequence[mi.Shape], groups: Sequence[mi.Shape]) -> None:
     """Refuse contacts that nothing covers."""
-    for contact in contacts:
-        start = contact.point + 2 * _tolerance(np.abs(contact.point).max()) * contact.normal
-        ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(contact.normal))
-        ray.maxt = 4 * _step(contact.point)
-        if not scene_of_shapes(shapes, groups).ray_test(ray)[0]:
-            raise _refusal(contact, "it is not defined which one is seen")
-
-
-def _has_body(contact: _Contact, groups: Sequence[mi.Shape]) -> bool:
-    """Return whether the shape of a contact has another face behind the one that coincides."""
-    start = contact.point - 2 * _tolerance(np.abs(contact.point).max()) * contact.normal
-    ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(-contact.normal))
-    return bool(scene_of_shapes([contact.shape], groups).ray_test(ray)[0])
+    if not contacts:
+        return
+    points, normals = (np.array([getattr(one, name) for one in contacts]) for name in ("point", "normal"))
+    starts = points + 2 * _tolerance(np.abs(points).max(axis=1))[:, None] * normals
+    ray = mi.Ray3f(mi.Point3f(starts.T), mi.Vector3f(normals.T))
+    ray.maxt = mi.Float(4 * _step(points))
+    covered = np.array(scene_of_shapes(shapes, groups).ray_test(ray))
+    for number in np.flatnonzero(~covered):
+        raise _refusal(contacts[int(number)], "it is not defined which one is seen")
 
 
 def _lies_within(contact: _Contact) -> bool:
     """Return whether the shape of a contact is smaller than the larger one and lies within its bounding box."""
-    (low, high), (lowest, highest) = (
-        (np.array(one.bbox().min, np.float64), np.array(one.bbox().max, np.float64))
-        for one in (contact.shape, contact.larger)
-    )
+    (low, lowest), (high, highest) = _corners((contact.shape, contact.larger))
     margin = _tolerance(np.abs([lowest, highest]).max())
     smaller = np.linalg.norm(high - low) < _SMALLER * np.linalg.norm(highest - lowest)
     # Beside the face, a body reaches beyond it.
@@ -181,7 +249,7 @@ def _lies_within(contact: _Contact) -> bool:
 def _move(shape: mi.Shape, direction: FloatArray) -> None:
     """Move a shape off another one."""
     values = mi.traverse(shape)
-    by = _step(np.array([shape.bbox().min, shape.bbox().max])) * direction
+    by = _step(np.ravel(_corners([shape]))) * direction
     if "to_world" in values:
         values["to_world"] = type(values["to_world"])().translate(by.tolist()) @ values["to_world"]
     elif "vertex_positions" in values:
@@ -192,9 +260,15 @@ def _move(shape: mi.Shape, direction: FloatArray) -> None:
     values.update()
 
 
-def _step(coordinates: FloatArray) -> float:
-    """Return the distance by which a shape of coordinates is moved [m]."""
-    return float(_APART + 2 * _ROUNDING * np.abs(coordinates).max())
+def _corners(shapes: Sequence[mi.Shape]) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and highest corners of bounding boxes, shape (n, 3) [m]."""
+    boxes = [shape.bbox() for shape in shapes]
+    return np.array([box.min for box in boxes], np.float64), np.array([box.max for box in boxes], np.float64)
+
+
+def _step(coordinates: FloatArray) -> FloatArray:
+    """Return the distances by which shapes of coordinates (..., 3) are moved [m]."""
+    return np.asarray(_APART + 2 * _ROUNDING * np.abs(coordinates).max(axis=-1))
 
 
 def _tolerance(coordinate: FloatArray | mi.Float) -> FloatArray | mi.Float:

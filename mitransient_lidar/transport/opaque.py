@@ -35,13 +35,17 @@ def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
     return mi.Point3f(*(opaque(value) for value in values))
 
 
+def shape_number(shape: mi.Shape) -> int:
+    """Return the number of a shape, above 0, as kernels know it."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
 def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
     """Return whether a pointer refers to one of the shapes."""
     number = dr.reinterpret_array(mi.UInt32, pointer)
     found = mi.Bool(False)
     for shape in shapes:
-        wanted = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-        found |= number == opaque_index(int(wanted[0]))
+        found |= number == opaque_index(shape_number(shape))
     return found
 
 

@@ -34,6 +34,9 @@ from mitransient_lidar.transport.solids import children, shape_groups, without_u
 
 logger = logging.getLogger(__name__)
 
+#: Largest number of instances without a warning of the time that they take.
+_MANY_INSTANCES = 20
+
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
@@ -195,8 +198,16 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
             _check_bsdf(shape)
     seen = without_unseen(scene, groups)
     found = WaterScene(seen, receiver, *find_water(seen), groups=groups)
-    for solid in found.solids:
+    solids = found.solids
+    for solid in solids:
         _check_mirrored(solid)
+    instances = sum(solid.class_name() == "Instance" for solid in solids)
+    if instances > _MANY_INSTANCES:
+        logger.warning(
+            "the scene has %d instances: Mitsuba compiles code of its own for each, in about 1 s; shapes of their own "
+            "share their code",
+            instances,
+        )
     moved = separate_contacts(found)
     if not moved:
         return found

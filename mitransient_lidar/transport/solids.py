@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -15,7 +16,7 @@ from mitransient_lidar.core.validation import FloatArray
 _DIELECTRICS = ("SmoothDielectric", "ThinDielectric")
 
 #: Places of rays within the cells of a side, as shares of these, and distance before a box at which they begin [m].
-_PLACES, _BEFORE = (0.4142, 0.5858), 1e-3
+_PLACES, BEFORE = (0.4142, 0.5858), 1e-3
 
 #: Thickness of a flat box over its coordinates, or 1 m: rays along it would meet edges alone.
 _FLAT = 1e-4
@@ -110,7 +111,7 @@ def box_rays(low: FloatArray, high: FloatArray, ticks: int) -> tuple[FloatArray,
         u, v = (axis + 1) % 3, (axis + 2) % 3
         if min(high[u] - low[u], high[v] - low[v]) <= _FLAT * max(np.abs([low, high]).max(), 1.0):
             continue
-        margin = _BEFORE + _BEFORE * np.abs([low[axis], high[axis]]).max()
+        margin = BEFORE + BEFORE * np.abs([low[axis], high[axis]]).max()
         for start, sign in ((low[axis] - margin, 1.0), (high[axis] + margin, -1.0)):
             origin, direction = (np.zeros((ticks * ticks, 3)) for _ in range(2))
             origin[:, axis], direction[:, axis] = start, sign
@@ -124,3 +125,8 @@ def box_rays(low: FloatArray, high: FloatArray, ticks: int) -> tuple[FloatArray,
 def met_shape(si: mi.SurfaceInteraction3f) -> mi.ShapePtr:
     """Return the shapes of the scene at intersections: an instance in place of the shape that it repeats."""
     return dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711
+
+
+def met_numbers(si: mi.SurfaceInteraction3f) -> NDArray[np.uint32]:
+    """Return the numbers of the shapes that rays meet, as of `shape_number`; 0 where they meet none."""
+    return np.array(dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, met_shape(si)), 0))

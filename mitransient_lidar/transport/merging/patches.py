@@ -13,7 +13,7 @@ from mitransient_lidar.core.validation import BoolArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
-from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index, shape_number
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape
@@ -89,14 +89,16 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
     looking = dr.full(mi.Bool, True, shots * rays)
-    met = [mi.UInt32(0) for _ in scene.solids]
+    met = []
     for _ in range(_MOST_LEVELS):
         si = scene.ray_intersect(ray, looking)
         looking &= si.is_valid()
-        for i, solid in enumerate(scene.solids):
-            met[i] += dr.select(looking & (met_shape(si) == mi.ShapePtr(solid)), mi.UInt32(1), 0)
+        met.append(dr.select(looking, dr.reinterpret_array(mi.UInt32, met_shape(si)), 0))
         ray = si.spawn_ray(ray.d)
-    return [solid for solid, count in zip(scene.solids, met, strict=True) if bool(dr.any(count > 1)[0])]
+    dr.eval(met)
+    levels = np.sort([np.array(numbers) for numbers in met], axis=0)
+    uneven = {*levels[1:][levels[1:] == levels[:-1]].tolist()}
+    return [solid for solid in scene.solids if shape_number(solid) in uneven]
 
 
 @dataclass(eq=False)
@@ -149,7 +151,7 @@ class SolidPatches:
         self._side, self._plane = opaque(max(self.width, self.least)), opaque(self.depth)
         # Sizes suit the light at the middle of a solid.
         solids = self.scene.solids
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))[0]) for solid in solids]
+        numbers = [shape_number(solid) for solid in solids]
         depths = np.zeros(max(numbers, default=0) + 1)
         for number, solid in zip(numbers, solids, strict=True):
             depths[number] = np.clip(-float(solid.bbox().center().z), 0, self.depth)
