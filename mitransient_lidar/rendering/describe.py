@@ -17,12 +17,13 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
+from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.probe import Probe, Rays
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
+from mitransient_lidar.transport.solids import box_of, box_rays, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
@@ -35,9 +36,6 @@ _TOLERANCE = 5e-4
 
 #: Most samples of a pulse.
 _MOST_SAMPLES = 1000
-
-#: Rays along each side of the view that tell which targets are near it.
-_VIEW_TICKS = 9
 
 #: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
 _SAMPLED, _TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
@@ -52,34 +50,26 @@ def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
     return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
 
 
-def describe_scene(
-    lidar: LidarScene, probe: EchoProbe, window: ErrorWindow, focusing: RippleFocusing | None
-) -> dict[str, Any]:
+def describe_scene(probe: Probe, window: ErrorWindow, focusing: RippleFocusing | None) -> dict[str, Any]:
     """Return the attributes of a result that describe lidar, sea and expected echoes."""
+    heights = probe.scene.sea_heights
     # Depths are relative to the mean arrival of the surface echo over all pixels.
-    arrivals = probe.surface_ns[:, 1]
+    arrivals = probe.echoes.surface_ns[:, 1]
     surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
     return {
-        "beam_outside_surface": probe.missed_beam,
-        **describe_lidar(lidar),
+        "beam_outside_surface": probe.echoes.missed_beam,
+        **describe_lidar(probe),
         **surface,
-        **_surface_heights(lidar),
+        **({} if heights is None else {"surface_heights_m": list(heights)}),
         **({} if focusing is None else focusing.describe()),
         "window_start_ns": float(window.start_ns.min()),
         "window_end_ns": float(window.end_ns.max()),
     }
 
 
-def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
-    """Return the lowest and highest point of the sea [m] as an attribute; none without a surface."""
-    boxes = [surface.bbox() for surface in lidar.surfaces]
-    if not boxes:
-        return {}
-    return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
-
-
-def describe_lidar(scene: LidarScene) -> dict[str, Any]:
+def describe_lidar(probe: Probe) -> dict[str, Any]:
     """Return the attributes of a result that describe lidar, refractive indices, and layout."""
+    scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
     pixels, optics, profile = receiver.pixels, receiver.optics, transmitter.profile
     return {
@@ -106,7 +96,7 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
         "refractive_index": scene.refractive_index,
         "group_index": scene.group_index,
         "surface_slope_variance": scene.slope_variance,
-        **describe_layout(scene),
+        **describe_layout(probe),
     }
 
 
@@ -121,7 +111,7 @@ def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
     return {"pulse_times_ns": times.tolist(), "pulse_power": power.tolist()}
 
 
-def describe_layout(scene: LidarScene) -> dict[str, Any]:
+def describe_layout(probe: Probe) -> dict[str, Any]:
     """Return the attributes of a result that `plot_layout` draws.
 
     ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
@@ -136,8 +126,9 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
     targets. Texts above the limit are omitted.
     """
+    scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
-    targets = [solid for solid in scene.targets if _is_near(scene, solid)]
+    targets = [solid for solid in scene.targets if _is_near(probe.view, solid)]
     found = axis_on_bottom(scene)[0]
     bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {
@@ -165,18 +156,12 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     return described
 
 
-def _is_near(scene: LidarScene, solid: mi.Shape) -> bool:
-    """Return whether a solid is in or near the square about the view at its mean height."""
-    pose, box = scene.receiver.pose, solid.bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    ticks = 0.5 * scene.receiver.pixels.field_of_view * np.linspace(-1, 1, _VIEW_TICKS)
-    angles = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    height = min(0.5 * (low[2] + high[2]), 0.5 * float(pose.origin[2]))
-    seen = scene.level_sea.at_height(pose.origin, pose.rays(angles), height)
-    seen = seen[np.isfinite(seen).all(axis=1)]
+def _is_near(view: Rays, solid: mi.Shape) -> bool:
+    """Return whether a solid is in or near the box about a view at its mean height."""
+    seen = view.at_height(view.middle_height(solid))
     if len(seen) == 0:
         return False
-    first, last = seen.min(axis=0), seen.max(axis=0)
+    (low, high), first, last = box_of(solid), seen.min(axis=0), seen.max(axis=0)
     near = 0.5 * (last - first)
     return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
 

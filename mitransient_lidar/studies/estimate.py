@@ -24,6 +24,7 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_structures,
 )
 from mitransient_lidar.rendering.accumulators import PassAccumulator
+from mitransient_lidar.rendering.accuracy import ErrorWindow
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -106,22 +107,20 @@ def estimate(
     paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
+    from mitransient_lidar.transport.probe import Probe
     from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
-    from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
     lidar = find_lidar_scene(session.scene, session.sensor)
     model = _model(lidar)
     session.tell_axis(lidar.axis, lidar.record_end)
-    sampler = SensorSampler(lidar.receiver, lidar.transmitter)
-    probe = probe_echoes(lidar, sampler)
-    window = error_window(lidar, probe)
+    probe = Probe(lidar)
+    window = ErrorWindow.of_probe(probe)
     accumulator = PassAccumulator(lidar, window, origins=_ORIGINS)
     for generator in np.random.SeedSequence(seed).spawn(_PARTS):
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)
-    described = describe_scene(lidar, probe, window, RippleFocusing.of_scene(lidar))
+    described = describe_scene(probe, window, RippleFocusing.of_scene(lidar))
     attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
 

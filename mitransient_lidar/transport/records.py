@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -18,13 +18,11 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
-from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
-#: Rays of beam and view from which the record of a lidar under water follows.
-_RECORD_RAYS = 1024
-
-#: Share of these rays that the sea must reflect totally for the record to end there.
+#: Share of the rays of beam or view that the sea must reflect totally for the record to end there.
 _REFLECTED = 0.1
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
@@ -92,13 +90,13 @@ def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFil
         If the bins are too many.
     """
     column = scene.required_water.column
-    hits = _first_hits(scene, transmitter)
-    ranges = [np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64) for si in hits]
+    view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
+    looks = [view, Rays.of_beam(scene, transmitter)]
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     least = min(InherentProperties(*map(float, row)).kd for row in rows)
     visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
-    nearest, farthest = (float(np.max(each)) for each in (np.minimum(*ranges), np.concatenate(ranges)))
-    to_solid = farthest if np.isfinite(farthest) else nearest
+    ends = [float(rays.ranges.max()) for rays in looks]
+    to_solid = max(ends) if np.isfinite(ends).all() else min(ends)
     apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
     distance = min(to_solid, visible) + apart
     echo = 2e9 / C0 * scene.group_index * distance
@@ -106,7 +104,7 @@ def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFil
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
     fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    last, mirrored = 1.25 * echo + 40.0 + tail, total_reflection_ns(scene, transmitter)
+    last, mirrored = 1.25 * echo + 40.0 + tail, total_reflection_ns(scene, transmitter, looks)
     axis = TimeAxis.covering(-lead, last, *fixed)
     if film.bin_count is None and axis.end_ns > mirrored:
         bins = max(int((mirrored - axis.start_ns) / axis.bin_width_ns), 1)
@@ -114,33 +112,21 @@ def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFil
     return axis, end
 
 
-def total_reflection_ns(scene: WaterScene, transmitter: Transmitter) -> float:
+def total_reflection_ns(scene: WaterScene, transmitter: Transmitter, looks: Sequence[Rays]) -> float:
     """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
 
-    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
-    by few paths and in cells about an axis that light has left: it is not rendered.
+    Infinite where that happens to less than a tenth of the rays of `looks`, each of beam and view. What lies beyond is
+    seen by reflection alone, by few paths and in cells about an axis that light has left: it is not rendered.
     """
     found = [np.inf]
     lidar = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
-    for si in _first_hits(scene, transmitter):
-        beyond = si.is_valid() & scene.is_surface(si.shape)
-        beyond &= scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1
+    for rays in looks:
+        si = rays.first
+        beyond = rays.on_sea & (scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1)
         time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
-        if dr.count(beyond)[0] > _REFLECTED * _RECORD_RAYS:
+        if dr.count(beyond)[0] > _REFLECTED * len(rays.directions):
             found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
     return min(found)
-
-
-def _first_hits(scene: WaterScene, transmitter: Transmitter) -> list[mi.SurfaceInteraction3f]:
-    """Return what rays of view and beam meet first."""
-    points = unit_points(_RECORD_RAYS)
-    return [
-        scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
-        for pose, angles in (
-            (scene.receiver.pose, scene.receiver.pixels.sample(points)),
-            (transmitter.pose, transmitter.sample_tangent(points)),
-        )
-    ]
 
 
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
@@ -172,13 +158,12 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     kd = [InherentProperties(*map(float, row)).kd for row in rows]
     spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
     attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    heights = [(float(surface.bbox().min.z), float(surface.bbox().max.z)) for surface in scene.surfaces]
     return LidarView(
         view,
         beam,
         scene.level_sea,
         ColumnDecay(column.layer_tops, attenuation),
-        (min(low for low, _ in heights), max(high for _, high in heights)),
+        scene.sea_heights or (0.0, 0.0),
         reach,
         0.0 if plume is None else plume.depth,
     )

@@ -163,12 +163,18 @@ class WaterScene:
     def empty_heights(self) -> tuple[float, float]:
         """Heights of the top of the highest solid and of the lowest point of the sea: no shape lies between [m]."""
         highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
-        return highest, min((float(surface.bbox().min.z) for surface in self.surfaces), default=-np.inf)
+        return highest, -np.inf if self.sea_heights is None else self.sea_heights[0]
+
+    @property
+    def sea_heights(self) -> tuple[float, float] | None:
+        """Lowest and highest point of the sea [m], None without one."""
+        boxes = [surface.bbox() for surface in self.surfaces]
+        return (min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)) if boxes else None
 
     @property
     def has_specular_or_dry_solids(self) -> bool:
         """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
-        lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
+        lowest, _ = self.sea_heights or (0.0, 0.0)
         mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
         return self._have_solids(mirror) or any(float(solid.bbox().max.z) > lowest for solid in self.solids)
 
@@ -342,10 +348,9 @@ class WaterScene:
 
     def outside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
         """Return whether a height [m] can be reached outside the surface mesh only: wet above it, or dry below it."""
-        if not self.surfaces:
+        if self.sea_heights is None:
             return mi.Bool(False)
-        boxes = [surface.bbox() for surface in self.surfaces]
-        lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
+        lowest, highest = self.sea_heights
         # A margin of a millimetre for points that lie on the surface to rounding.
         return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
 

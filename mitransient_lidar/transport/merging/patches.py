@@ -11,9 +11,10 @@ import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
-from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
+from mitransient_lidar.transport.merging.region import Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
+from mitransient_lidar.transport.probe import PROBE_RAYS
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import met_shape

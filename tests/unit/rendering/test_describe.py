@@ -10,6 +10,7 @@ from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import axis_on_bottom, describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.snell import refract
 
@@ -19,7 +20,7 @@ TRIANGLE = {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "20 0, 26 
 
 
 def described(scene):
-    return describe_layout(find_lidar_scene(scene, scene.sensors()[0]))
+    return describe_layout(Probe(find_lidar_scene(scene, scene.sensors()[0])))
 
 
 def lines(text):
