@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
-from mitransient_lidar.transport.opaque import aligned
-from mitransient_lidar.transport.probe import Probe, Rays
+from mitransient_lidar.transport.probe import Probe, Rays, axis_on_bottom
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
@@ -129,7 +124,7 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
     scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
     targets = [solid for solid in scene.targets if _is_near(probe.view, solid)]
-    found = axis_on_bottom(scene)[0]
+    found = axis_on_bottom(scene, receiver.pose.origin[None], receiver.pose.axis)[0]
     bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {
         "target_outlines": [_describe_target(scene, target, bottom) for target in targets],
@@ -164,52 +159,6 @@ def _is_near(view: Rays, solid: mi.Shape) -> bool:
     (low, high), first, last = box_of(solid), seen.min(axis=0), seen.max(axis=0)
     near = 0.5 * (last - first)
     return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
-
-
-def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), poses: Pose | None = None) -> FloatArray:
-    """Return where the receiver's axis, refracted by a level sea, first meets a bottom.
-
-    Parameters
-    ----------
-    scene
-        The scene; `WaterScene.bottoms` are its bottoms.
-    shifts
-        Horizontal displacements of the lidar, x and y [m], shape (places, 2).
-    poses
-        Poses of the receiver in the scene instead, with arrays of shape (places, 3).
-
-    Returns
-    -------
-    ndarray
-        Points x, y, z in the scene [m], shape (places, 3); NaN where the axis meets no bottom.
-    """
-    own, sea, bottoms = scene.receiver.pose, scene.level_sea, scene.bottoms
-    at = scene.frame_origin
-    origins, axes = own.origin + np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), own.axis
-    if poses is not None:
-        origins, axes = poses.origin - at, poses.axis
-    found = np.full((len(origins), 3), np.nan)
-    if not bottoms or np.any(axes[..., 2] >= 0):
-        return found
-    # Corners of the axis: receiver, sea level, boundaries of the index layers, and a point below everything.
-    lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
-    heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
-    directions = np.broadcast_to(axes, origins.shape)
-    corners = [
-        origins,
-        *(np.column_stack([sea.at_height(origins, directions, z), np.full(len(origins), z)]) for z in heights),
-    ]
-    active, shapes = aligned(mi.Bool, np.ones(len(origins), dtype=bool)), scene_of_shapes(bottoms, scene.groups)
-    for start, end in itertools.pairwise(corners):
-        origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
-        ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
-        ray.maxt = dr.norm(leg)
-        hit = shapes.ray_intersect(ray, active)
-        ends = active & hit.is_valid()
-        at_end = np.array(ends)
-        found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
-        active &= ~ends
-    return found + at
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:

@@ -27,8 +27,6 @@ from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 
 if TYPE_CHECKING:
-    import mitsuba as mi
-
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -177,6 +175,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import Recorded
+    from mitransient_lidar.transport.solids import scene_of_shapes
 
     column = lidar.required_water.column
     if not lidar.bottoms:
@@ -186,26 +185,15 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     if isinstance(bsdf, Recorded) and bsdf.parameters.get("model") == "hapke":
         raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
-    si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1])))
+    start = mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1]))
+    si = scene_of_shapes(lidar.bottoms, lidar.groups).ray_intersect(mi.Ray3f(start, mi.Vector3f(0, 0, -1)))
     box = lidar.bottoms[0].bbox()
     depth, height = -float(si.p.z[0]), float(box.max.z - box.min.z)
-    if not depth > 0:
+    if not (si.is_valid()[0] and depth > 0):
         raise UserError("the axis of the receiver must meet water above the bottom for an estimate")
     if height > _LEVEL * depth:
         logger.warning("the estimate takes the bottom as level, at its depth of %.3g m on the axis", depth)
     return depth, float(np.array(si.bsdf().eval_diffuse_reflectance(si))[0, 0])
-
-
-def _below(lidar: LidarScene, point: mi.Point3f) -> mi.SurfaceInteraction3f:
-    """Return the bottom below a point."""
-    import mitsuba as mi
-
-    for _ in range(8):
-        si = lidar.mitsuba_scene.ray_intersect(mi.Ray3f(point, mi.Vector3f(0, 0, -1)))
-        if any(si.shape[0] is bottom for bottom in lidar.bottoms):
-            return si
-        point = si.p - mi.Vector3f(0, 0, 1e-4)
-    raise UserError("the axis of the receiver must meet water above the bottom for an estimate")
 
 
 def _slopes(lidar: LidarScene) -> tuple[FloatArray, Callable[[FloatArray], FloatArray] | None]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,13 +14,14 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
-from mitransient_lidar.transport.solids import box_of, met_shape
+from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
 
 #: Rays of a view and of a beam; those of a Gaussian beam reach 4.2 standard deviations.
 PROBE_RAYS = 4096
@@ -284,3 +287,47 @@ def _quantiles(
             else:
                 result[index, column] = values[part][np.searchsorted(cumulative, share * cumulative[-1])]
     return result
+
+
+def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return where axes, refracted by a level sea, first meet a bottom (`WaterScene.bottoms`).
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    origins, axes
+        Points in its frame from which the axes start [m], and their directions, shape (n, 3), or (3,) of all axes.
+
+    Returns
+    -------
+    ndarray
+        Points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
+    """
+    sea, bottoms = scene.level_sea, scene.bottoms
+    if not bottoms or np.any(axes[..., 2] >= 0):
+        return np.full(origins.shape, np.nan)
+    # Corners: start, sea level, boundaries of the index layers, and a point below everything.
+    lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
+    heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
+    directions = np.broadcast_to(axes, origins.shape)
+    corners = [np.insert(sea.at_height(origins, directions, z), 2, z, axis=1) for z in heights]
+    return first_along(scene, bottoms, [origins, *corners]) + scene.frame_origin
+
+
+def first_along(scene: WaterScene, shapes: Sequence[mi.Shape], corners: Sequence[FloatArray]) -> FloatArray:
+    """Return where lines through corners in the frame [m], shape (n, 3) each, first meet one of some shapes, or NaN."""
+    found = np.full(corners[0].shape, np.nan)
+    if not shapes:
+        return found
+    active, some = aligned(mi.Bool, np.ones(len(found), dtype=bool)), scene_of_shapes(shapes, scene.groups)
+    for start, end in itertools.pairwise(corners):
+        origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
+        ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
+        ray.maxt = dr.norm(leg)
+        hit = some.ray_intersect(ray, active)
+        ends = active & hit.is_valid()
+        at_end = np.array(ends)
+        found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
+        active &= ~ends
+    return found
