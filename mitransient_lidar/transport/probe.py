@@ -60,7 +60,9 @@ class Rays:
     def of_view(cls, scene: WaterScene, sampler: SensorSampler) -> Rays:
         """Return rays of the field of view."""
         start = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
-        return cls(scene, scene.receiver.pose, start.angles, start.direction, start.weight > 0)
+        seen = start.weight > 0
+        dr.eval(start, seen)
+        return cls(scene, scene.receiver.pose, start.angles, start.direction, seen)
 
     @classmethod
     def of_beam(cls, scene: WaterScene, transmitter: Transmitter) -> Rays:

@@ -11,10 +11,12 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, ColumnDecay, Cone, LidarView, Solid
+from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
@@ -37,79 +39,64 @@ def fitted_record(
 ) -> tuple[TimeAxis, str]:
     """Return time bins of a film for all light that returns, and what the last light comes from.
 
-    `shifts` are horizontal displacements of the lidar [m]: the bins hold the
-    light of all its positions.
+    `shifts` are horizontal displacements of a lidar above water [m]: the bins hold the light of all its positions.
 
     Raises
     ------
     UserError
         If the bins are too many.
     """
-    solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
-    found = [_lidar_view(scene, transmitter, shift).limits(solids, film.gates is not None) for shift in shifts]
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
+    latest = np.inf
+    if transmitter.pose.submerged:
+        first, last, end, latest = _light_under_water(scene, transmitter)
+        start = first - lead
+    else:
+        first, last, end = _light_above_water(scene, transmitter, film.gates, shifts)
+        start = first - lead
+        if scene.surfaces:
+            quiet = _quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns
+            start = min(start, max(quiet, start - _LONGEST_NS))
+    axis = TimeAxis.covering(start, last + tail, film.bin_width_ns, film.time_start_ns, film.bin_count)
+    if film.bin_count is None and axis.end_ns > latest:
+        bins = max(int((latest - axis.start_ns) / axis.bin_width_ns), 1)
+        return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
+    return axis, end
+
+
+def _light_above_water(
+    scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None, shifts: Iterable[tuple[float, float]]
+) -> tuple[float, float, str]:
+    """Return the times of the first and the last light [ns], and what the last light comes from."""
+    solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
+    found = [_lidar_view(scene, transmitter, shift).limits(solids, gates is not None) for shift in shifts]
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
-    if film.gates is not None:
+    if gates is not None:
         for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = film.gates.placed(time, scene.depth_per_ns).spans_ns
+            spans = gates.placed(time, scene.depth_per_ns).spans_ns
             end = "after the last gate" if spans[-1, 1] > limits[1] else end
             limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    start = limits[0] - lead
-    if scene.surfaces:
-        start = min(start, max(_quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns, start - _LONGEST_NS))
-    return TimeAxis.covering(start, limits[1] + tail, *fixed), end
+    return *limits, end
 
 
-def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
-    """Return the end [ns] of what echo detection takes as the baseline of noise (`analysis.waveforms.records`)."""
-    pose, field = transmitter.pose, scene.receiver.pixels.field_of_view
-    spot = pose.ground_point()
-    arrival = sum(float(np.linalg.norm(spot - origin)) for origin in (pose.origin, scene.receiver.pose.origin))
-    angle = np.deg2rad(min(pose.off_nadir_deg, 89.9))
-    slope = 2 * float(pose.origin[2]) * np.sin(angle) / np.cos(angle) ** 2
-    spread = FWHM_PER_SIGMA * min(transmitter.widest_angular_spread, 0.25 * field) * slope
-    pulse_ns = transmitter.pulse.fwhm_ns + 2 * scene.receiver.optics.response_time_ns
-    width_ns = float(np.hypot(pulse_ns, 1e9 / C0 * spread))
-    return float(1e9 / C0 * (arrival - 0.5 * field * slope) - 2 * width_ns)
+def _light_under_water(scene: WaterScene, transmitter: Transmitter) -> tuple[float, float, str, float]:
+    """Return the same of a lidar under water, and when the sea first reflects beam or view totally [ns].
 
-
-def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFilm) -> tuple[TimeAxis, str]:
-    """Return time bins of a film of a lidar under water, and what the last light comes from.
-
-    The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
-    quarter of its time and 40 ns more for light that is scattered several times, or at the range where the signal of
-    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer; at
-    the latest where `total_reflection_ns` says.
-
-    Raises
-    ------
-    UserError
-        If the bins are too many.
+    The first light is scattered at the lidar. The last one is the farthest echo of beam and view, with a quarter of its
+    time and 40 ns more for light that is scattered several times, or comes from the range where the signal of the
+    water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
     """
-    column = scene.required_water.column
     view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
     looks = [view, Rays.of_beam(scene, transmitter)]
-    rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    least = min(InherentProperties(*map(float, row)).kd for row in rows)
-    visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
+    visible = -0.5 * np.log(COLUMN_LEVEL) / max(float(_kd(scene.required_water.column).min()), 1e-9)
     ends = [float(rays.ranges.max()) for rays in looks]
     to_solid = max(ends) if np.isfinite(ends).all() else min(ends)
     apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
-    distance = min(to_solid, visible) + apart
-    echo = 2e9 / C0 * scene.group_index * distance
+    echo = 2e9 / C0 * scene.group_index * (min(to_solid, visible) + apart)
     end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
-    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
-    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    last, mirrored = 1.25 * echo + 40.0 + tail, total_reflection_ns(scene, transmitter, looks)
-    axis = TimeAxis.covering(-lead, last, *fixed)
-    if film.bin_count is None and axis.end_ns > mirrored:
-        bins = max(int((mirrored - axis.start_ns) / axis.bin_width_ns), 1)
-        return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
-    return axis, end
+    return 0.0, 1.25 * echo + 40.0, end, total_reflection_ns(scene, transmitter, looks)
 
 
 def total_reflection_ns(scene: WaterScene, transmitter: Transmitter, looks: Sequence[Rays]) -> float:
@@ -127,6 +114,19 @@ def total_reflection_ns(scene: WaterScene, transmitter: Transmitter, looks: Sequ
         if dr.count(beyond)[0] > _REFLECTED * len(rays.directions):
             found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
     return min(found)
+
+
+def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
+    """Return the end [ns] of what echo detection takes as the baseline of noise (`analysis.waveforms.records`)."""
+    pose, field = transmitter.pose, scene.receiver.pixels.field_of_view
+    spot = pose.ground_point()
+    arrival = sum(float(np.linalg.norm(spot - origin)) for origin in (pose.origin, scene.receiver.pose.origin))
+    angle = np.deg2rad(min(pose.off_nadir_deg, 89.9))
+    slope = 2 * float(pose.origin[2]) * np.sin(angle) / np.cos(angle) ** 2
+    spread = FWHM_PER_SIGMA * min(transmitter.widest_angular_spread, 0.25 * field) * slope
+    pulse_ns = transmitter.pulse.fwhm_ns + 2 * scene.receiver.optics.response_time_ns
+    width_ns = float(np.hypot(pulse_ns, 1e9 / C0 * spread))
+    return float(1e9 / C0 * (arrival - 0.5 * field * slope) - 2 * width_ns)
 
 
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
@@ -150,23 +150,21 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
         (float(np.hypot(*(np.abs(corners - one.pose.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
         default=float(pose.origin[2]),
     )
-    if scene.water is None:
-        none = np.zeros(1)
-        return LidarView(view, beam, scene.level_sea, ColumnDecay(none, none), (0.0, 0.0), reach, None)
-    column, plume = scene.water.column, scene.water.plume
+    none, deepest = np.zeros(1), None
+    decay = WaterColumn(none, none, none, none)
+    if scene.water is not None:
+        column, plume = scene.water.column, scene.water.plume
+        spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
+        attenuation = system_attenuation(column.attenuation, np.minimum(_kd(column), column.attenuation), spot)
+        none, deepest = np.zeros(column.count), 0.0 if plume is None else plume.depth
+        decay = WaterColumn(column.layer_tops, attenuation, none, none)
+    return LidarView(view, beam, scene.level_sea, decay, scene.sea_heights or (0.0, 0.0), reach, deepest)
+
+
+def _kd(column: WaterColumn) -> FloatArray:
+    """Return the diffuse attenuation coefficient of each layer [1/m]."""
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    kd = [InherentProperties(*map(float, row)).kd for row in rows]
-    spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
-    attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    return LidarView(
-        view,
-        beam,
-        scene.level_sea,
-        ColumnDecay(column.layer_tops, attenuation),
-        scene.sea_heights or (0.0, 0.0),
-        reach,
-        0.0 if plume is None else plume.depth,
-    )
+    return np.array([InherentProperties(*map(float, row)).kd for row in rows])
 
 
 def _name(shape: mi.Shape) -> str:

@@ -12,6 +12,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 #: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
@@ -121,27 +122,6 @@ class Solid:
         return float(lowest.min()), float(highest.max())
 
 
-@dataclass(frozen=True, eq=False)
-class ColumnDecay:
-    """Decay of the column signal: upper edges of the layers [m], the first one 0, and system attenuation [1/m]."""
-
-    tops: FloatArray
-    attenuation: FloatArray
-
-    def to(self, depth: float) -> float:
-        """Return the integral of the attenuation down to a depth [1]."""
-        thickness = np.clip(depth - self.tops, 0, np.diff(self.tops, append=np.inf))
-        return float(thickness @ self.attenuation)
-
-    def depth_of(self, decay: float) -> float:
-        """Return the depth [m] at which the integral of the attenuation reaches a value, else that of its end."""
-        edges = np.array([self.to(top) for top in self.tops])
-        layer = int(np.searchsorted(edges, decay, side="right")) - 1
-        if self.attenuation[layer] > 0:
-            return float(self.tops[layer] + (decay - edges[layer]) / self.attenuation[layer])
-        return float(self.tops[layer])
-
-
 @dataclass(frozen=True)
 class RecordLimits:
     """First and last arrival of light over all pixels, for an ideal pulse."""
@@ -186,7 +166,7 @@ class LidarView:
     view, beam
         Field of view with its blur, and beam.
     sea, decay
-        Index layers of the water below z = 0, and its signal.
+        Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
     heights
         Lowest and highest point of the sea [m].
     reach
@@ -198,7 +178,7 @@ class LidarView:
     view: Cone
     beam: Cone
     sea: LevelSea
-    decay: ColumnDecay
+    decay: WaterColumn
     heights: tuple[float, float]
     reach: float
     column: float | None
@@ -229,7 +209,7 @@ class LidarView:
             lowest, highest = limits
             if self.column is None or highest > self.heights[1]:
                 firsts.append(self._earliest(highest))
-            if np.exp(-slant * self.decay.to(-lowest)) >= SOLID_LEVEL:
+            if np.exp(-slant * self.decay.cumulative(max(-lowest, 0.0))) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
                 later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
                 later = 0.0 if direct else later
