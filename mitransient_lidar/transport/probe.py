@@ -138,10 +138,9 @@ class Rays:
         """Return whether rays, or light that waves or scattering deflect, may meet a shape's box at three heights."""
         low, high = box_of(shape)
         heights = np.minimum([low[2], 0.5 * (low[2] + high[2]), high[2]], 0.5 * self.pose.origin[2])
-        found = (places for z in heights if len(places := self.at_height(z)))
-        return min((float(gaps(places, shape).min()) for places in found), default=np.inf) <= _REACH_PER_DEPTH * max(
-            -float(low[2]), 0.0
-        )
+        found = (gaps(places, shape) for z in heights if len(places := self.at_height(z)))
+        nearest = min((float(each.min()) for each in found), default=np.inf)
+        return nearest <= _REACH_PER_DEPTH * max(-float(low[2]), 0.0)
 
 
 def gaps(places: FloatArray, shape: mi.Shape) -> FloatArray:
@@ -240,22 +239,19 @@ class Probe:
         pixel = np.array(start.pixel) if count > 1 else np.zeros(_ECHO_RAYS, dtype=np.int64)
         surface, under_water = np.array(on_sea), np.array(solid)
         times, later = time_ns(length), time_ns(length + water)
-        surface_ns, bottom_ns = (
-            np.broadcast_to(_quantiles(*one, pixel, count, wanted), (pixels, 2))
-            for one, wanted in (
-                ((times, weight * surface), (_TAIL, None)),
-                ((later, weight * under_water), (None, 1 - _TAIL)),
-            )
-        )
+        surface_ns = _quantiles(times, weight * surface, pixel, count, (_TAIL, None))
+        bottom_ns = _quantiles(later, weight * under_water, pixel, count, (None, 1 - _TAIL))
         lowest, crest = scene.sea_heights or (0.0, -np.inf)
         dry = np.array(first.is_valid() & ~on_sea)
         # Solids visible outside a small surface mesh lie lower.
         in_air = dry & np.array(first.p.z > lowest)
         outside = ~surface & ~in_air if scene.surfaces and not scene.submerged else np.zeros_like(surface)
         missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
+        numbers = [np.array(dr.reinterpret_array(mi.UInt32, met_shape(hit))) for hit in (first, below)]
         pierced, solids, bottoms = [], [], scene.bottoms
         for shape in scene.solids:
-            is_first, is_below = (np.array(met_shape(hit) == mi.ShapePtr(shape)) for hit in (first, below))
+            own = np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
+            is_first, is_below = (each == own for each in numbers)
             met = np.where(under_water, is_below, dry & is_first)
             arrivals = _quantiles(np.where(under_water, later, times), weight * met, 0 * pixel, 1, (None, 1 - _TAIL))
             if np.isfinite(arrivals[0, 0]):
@@ -264,6 +260,7 @@ class Probe:
             is_seen = not any(shape is bottom for bottom in bottoms) or np.any(under_water & is_below)
             if float(shape.bbox().min.z) <= crest and np.any(in_air & is_first) and is_seen:
                 pierced.append(shape)
+        surface_ns, bottom_ns = (np.broadcast_to(each, (pixels, 2)) for each in (surface_ns, bottom_ns))
         return Echoes(surface_ns, bottom_ns, missed, pierced, solids)
 
 
