@@ -14,11 +14,11 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
-from mitransient_lidar.transport.probe import Probe, Rays, axis_on_bottom
+from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.solids import box_of, box_rays, scene_of_shapes
+from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
@@ -123,7 +123,7 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
     """
     scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
-    targets = [solid for solid in scene.targets if _is_near(probe.view, solid)]
+    targets = [solid for solid in scene.targets if probe.view.meets(solid)]
     found = axis_on_bottom(scene, receiver.pose.origin[None], receiver.pose.axis)[0]
     bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {
@@ -149,16 +149,6 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
         if value and len(text) <= _LONGEST_TEXT:
             described[name] = text
     return described
-
-
-def _is_near(view: Rays, solid: mi.Shape) -> bool:
-    """Return whether a solid is in or near the box about a view at its mean height."""
-    seen = view.at_height(view.middle_height(solid))
-    if len(seen) == 0:
-        return False
-    (low, high), first, last = box_of(solid), seen.min(axis=0), seen.max(axis=0)
-    near = 0.5 * (last - first)
-    return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
