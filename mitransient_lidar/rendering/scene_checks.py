@@ -78,7 +78,7 @@ def _check_under_water(probe: Probe) -> None:
             f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {_NEAREST_RANGE:g} m from "
             "the lidar: at one place, laser and receiver return without limit from less and less range"
         )
-    reflected_ns = total_reflection_ns(scene, scene.transmitter, [probe.view, probe.beam])
+    reflected_ns = total_reflection_ns(probe.view, probe.beam)
     if axis.end_ns > reflected_ns:
         raise UserError(
             f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns end "

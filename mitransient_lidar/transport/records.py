@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import drjit as dr
@@ -89,25 +89,25 @@ def _light_under_water(scene: WaterScene, transmitter: Transmitter) -> tuple[flo
     water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
     """
     view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
-    looks = [view, Rays.of_beam(scene, transmitter)]
+    beam = Rays.of_beam(scene, transmitter)
     visible = -0.5 * np.log(COLUMN_LEVEL) / max(float(_kd(scene.required_water.column).min()), 1e-9)
-    ends = [float(rays.ranges.max()) for rays in looks]
+    ends = [float(rays.ranges.max()) for rays in (view, beam)]
     to_solid = max(ends) if np.isfinite(ends).all() else min(ends)
     apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
     echo = 2e9 / C0 * scene.group_index * (min(to_solid, visible) + apart)
     end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
-    return 0.0, 1.25 * echo + 40.0, end, total_reflection_ns(scene, transmitter, looks)
+    return 0.0, 1.25 * echo + 40.0, end, total_reflection_ns(view, beam)
 
 
-def total_reflection_ns(scene: WaterScene, transmitter: Transmitter, looks: Sequence[Rays]) -> float:
+def total_reflection_ns(view: Rays, beam: Rays) -> float:
     """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
 
-    Infinite where that happens to less than a tenth of the rays of `looks`, each of beam and view. What lies beyond is
-    seen by reflection alone, by few paths and in cells about an axis that light has left: it is not rendered.
+    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
+    by few paths and in cells about an axis that light has left: it is not rendered.
     """
-    found = [np.inf]
-    lidar = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
-    for rays in looks:
+    found, scene = [np.inf], view.scene
+    lidar = [opaque_point(rays.pose.origin) for rays in (beam, view)]
+    for rays in (view, beam):
         si = rays.first
         beyond = rays.on_sea & (scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1)
         time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
