@@ -115,7 +115,7 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
     ``index_boundaries``, the depths between them [m].
 
     JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of
-    imagers) and ``target_outlines``, for each target in or near the view: ``id``, ``z`` (lowest and
+    imagers) and ``target_outlines``, for each target that the view may see (`Rays.meets`): ``id``, ``z`` (lowest and
     highest point [m]), ``line`` (its vertical projection), ``seen`` (its outline on the sea level along the receiver's
     refracted lines of sight) and, with a ``bottom_point``, ``shadow`` (that of its shadow in the laser's light at the
     height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
