@@ -23,6 +23,7 @@ from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transm
 from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.solids import box_of
 
 #: Share of the rays of beam or view that the sea must reflect totally for the record to end there.
 _REFLECTED = 0.1
@@ -136,20 +137,12 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     blurred = 0.0 if blur is None else blur.reach
     half_angles = 0.5 * sides[0] + blurred, 0.5 * sides[1] + blurred
     edge = transmitter.profile.reach
-    moved = np.array([*shift, 0.0])
-    view, beam = (
-        Cone(replace(one, origin=one.origin + moved), angles, is_round)
-        for one, angles, is_round in (
-            (pose, half_angles, pixels.field_of_view_shape == "circle"),
-            (transmitter.pose, (edge, edge), True),
-        )
-    )
-    boxes = [shape.bbox() for shape in scene.mitsuba_scene.shapes()]
-    corners = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 3)[:, :2]
-    reach = max(
-        (float(np.hypot(*(np.abs(corners - one.pose.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
-        default=float(pose.origin[2]),
-    )
+    poses = [replace(each, origin=np.add(each.origin, [*shift, 0.0])) for each in (pose, transmitter.pose)]
+    view = Cone(poses[0], half_angles, pixels.field_of_view_shape == "circle")
+    beam = Cone(poses[1], (edge, edge))
+    corners = np.reshape([box_of(shape) for shape in scene.mitsuba_scene.shapes()], (-1, 3))[:, :2]
+    farthest = [np.abs(corners - each.origin[:2]).max(axis=0) for each in poses if len(corners)]
+    reach = max((float(np.hypot(*each)) for each in farthest), default=float(pose.origin[2]))
     none, deepest = np.zeros(1), None
     decay = WaterColumn(none, none, none, none)
     if scene.water is not None:
@@ -183,7 +176,7 @@ def _triangles(shape: mi.Shape) -> FloatArray:
         matrix = np.array(known["to_world"].matrix, dtype=np.float64).reshape(4, 4)
         corners = (square @ matrix.T)[None, :, :3]
     else:
-        low, high = (np.array(corner, dtype=np.float64) for corner in (shape.bbox().min, shape.bbox().max))
+        low, high = box_of(shape)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         corners = np.array([middle + (square[:, :3] + [0, 0, side]) * half for side in (-1.0, 1.0)])
     return np.asarray(corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3))

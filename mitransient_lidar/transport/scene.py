@@ -24,7 +24,7 @@ from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import children
+from mitransient_lidar.transport.solids import box_of, children
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -145,7 +145,7 @@ class WaterScene:
         The shorter horizontal side of a bottom's bounding box is at least the width of the field of view at its
         distance, and at least a quarter of that of the largest solid.
         """
-        boxes = [np.array([solid.bbox().min, solid.bbox().max], dtype=np.float64) for solid in self.solids]
+        boxes = [box_of(solid) for solid in self.solids]
         sides = [float((high - low)[:2].min()) for low, high in boxes]
         origin, field_of_view = self.receiver.pose.origin, self.receiver.pixels.field_of_view
         widths = [field_of_view * float(np.linalg.norm(np.clip(origin, *box) - origin)) for box in boxes]
