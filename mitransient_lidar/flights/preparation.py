@@ -104,9 +104,8 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
         If the bottom does not cover the places of the pulses or lies elsewhere than the flight says, or its light
         arrives after the record.
     """
-    from mitransient_lidar.rendering.describe import axis_on_bottom
-    from mitransient_lidar.rendering.shots.truth import solids_below
     from mitransient_lidar.transport.plugin_types import SeabedShape
+    from mitransient_lidar.transport.probe import axis_on_bottom
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     angle, height, *aim = lidar_of(inputs)
@@ -117,14 +116,10 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
     if lidar.receiver.pixels.grid is not None:
         raise UserError(f"scene {plan.scene} has an imager: a flight needs a receiver whose pixels are a list")
     poses = shot_poses(lidar, inputs)
-    bottom = axis_on_bottom(lidar, poses=poses.in_scene)[:, 2]
+    given = poses_of(inputs.__getitem__)
+    x, y, bottom = axis_on_bottom(lidar, given.origin - lidar.frame_origin, given.axis).T
     if not lidar.bottoms:
         raise UserError(f"scene {plan.scene} has no bottom below the flight")
-    # The axis may meet a target before the bottom.
-    level = float(np.nanmedian(bottom)) if np.isfinite(bottom).any() else -1.0
-    given = poses_of(inputs.__getitem__)
-    x, y = lidar.level_sea.at_height(given.origin, given.axis, level).T
-    bottom = np.where(np.isnan(bottom), solids_below(lidar, x, y, bottoms=True)[0], bottom)
     if missed := np.count_nonzero(np.isnan(bottom)):
         row = int(np.argmax(np.isnan(bottom)))
         raise UserError(

@@ -13,6 +13,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import waveform
 
 if TYPE_CHECKING:
+    from mitransient_lidar.transport.probe import Probe
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Pixels darker than this fraction of the median are excluded from the errors of radiance.
@@ -193,6 +194,15 @@ class ErrorWindow:
     start_ns: FloatArray
     end_ns: FloatArray
     time_ns: FloatArray
+
+    @classmethod
+    def of_probe(cls, probe: Probe) -> ErrorWindow:
+        """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
+        scene, echoes, time_ns = probe.scene, probe.echoes, probe.scene.axis.centres_ns
+        start, end = echoes.surface_ns[:, 0], echoes.bottom_ns[:, 1] + 0.5 * scene.transmitter.pulse.fwhm_ns
+        # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
+        start = np.where(np.isnan(start), time_ns[0], start)
+        return cls(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
         """Return the relative standard errors of a waveform, infinite where it is 0.

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
-from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
@@ -36,9 +32,6 @@ _TOLERANCE = 5e-4
 #: Most samples of a pulse.
 _MOST_SAMPLES = 1000
 
-#: Rays along each side of the view that tell which targets are near it.
-_VIEW_TICKS = 9
-
 #: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
 _SAMPLED, _TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
 
@@ -52,34 +45,26 @@ def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
     return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
 
 
-def describe_scene(
-    lidar: LidarScene, probe: EchoProbe, window: ErrorWindow, focusing: RippleFocusing | None
-) -> dict[str, Any]:
+def describe_scene(probe: Probe, window: ErrorWindow, focusing: RippleFocusing | None) -> dict[str, Any]:
     """Return the attributes of a result that describe lidar, sea and expected echoes."""
+    heights = probe.scene.sea_heights
     # Depths are relative to the mean arrival of the surface echo over all pixels.
-    arrivals = probe.surface_ns[:, 1]
+    arrivals = probe.echoes.surface_ns[:, 1]
     surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
     return {
-        "beam_outside_surface": probe.missed_beam,
-        **describe_lidar(lidar),
+        "beam_outside_surface": probe.echoes.missed_beam,
+        **describe_lidar(probe),
         **surface,
-        **_surface_heights(lidar),
+        **({} if heights is None else {"surface_heights_m": list(heights)}),
         **({} if focusing is None else focusing.describe()),
         "window_start_ns": float(window.start_ns.min()),
         "window_end_ns": float(window.end_ns.max()),
     }
 
 
-def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
-    """Return the lowest and highest point of the sea [m] as an attribute; none without a surface."""
-    boxes = [surface.bbox() for surface in lidar.surfaces]
-    if not boxes:
-        return {}
-    return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
-
-
-def describe_lidar(scene: LidarScene) -> dict[str, Any]:
+def describe_lidar(probe: Probe) -> dict[str, Any]:
     """Return the attributes of a result that describe lidar, refractive indices, and layout."""
+    scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
     pixels, optics, profile = receiver.pixels, receiver.optics, transmitter.profile
     return {
@@ -106,7 +91,7 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
         "refractive_index": scene.refractive_index,
         "group_index": scene.group_index,
         "surface_slope_variance": scene.slope_variance,
-        **describe_layout(scene),
+        **describe_layout(probe),
     }
 
 
@@ -121,7 +106,7 @@ def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
     return {"pulse_times_ns": times.tolist(), "pulse_power": power.tolist()}
 
 
-def describe_layout(scene: LidarScene) -> dict[str, Any]:
+def describe_layout(probe: Probe) -> dict[str, Any]:
     """Return the attributes of a result that `plot_layout` draws.
 
     ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
@@ -130,15 +115,16 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     ``index_boundaries``, the depths between them [m].
 
     JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of
-    imagers) and ``target_outlines``, for each target in or near the view: ``id``, ``z`` (lowest and
+    imagers) and ``target_outlines``, for each target that the view may see (`Rays.meets`): ``id``, ``z`` (lowest and
     highest point [m]), ``line`` (its vertical projection), ``seen`` (its outline on the sea level along the receiver's
     refracted lines of sight) and, with a ``bottom_point``, ``shadow`` (that of its shadow in the laser's light at the
     height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
     targets. Texts above the limit are omitted.
     """
+    scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
-    targets = [solid for solid in scene.targets if _is_near(scene, solid)]
-    found = axis_on_bottom(scene)[0]
+    targets = [solid for solid in scene.targets if probe.view.meets(solid)]
+    found = axis_on_bottom(scene, receiver.pose.origin[None], receiver.pose.axis)[0]
     bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {
         "target_outlines": [_describe_target(scene, target, bottom) for target in targets],
@@ -163,68 +149,6 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
         if value and len(text) <= _LONGEST_TEXT:
             described[name] = text
     return described
-
-
-def _is_near(scene: LidarScene, solid: mi.Shape) -> bool:
-    """Return whether a solid is in or near the square about the view at its mean height."""
-    pose, box = scene.receiver.pose, solid.bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    ticks = 0.5 * scene.receiver.pixels.field_of_view * np.linspace(-1, 1, _VIEW_TICKS)
-    angles = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    height = min(0.5 * (low[2] + high[2]), 0.5 * float(pose.origin[2]))
-    seen = scene.level_sea.at_height(pose.origin, pose.rays(angles), height)
-    seen = seen[np.isfinite(seen).all(axis=1)]
-    if len(seen) == 0:
-        return False
-    first, last = seen.min(axis=0), seen.max(axis=0)
-    near = 0.5 * (last - first)
-    return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
-
-
-def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), poses: Pose | None = None) -> FloatArray:
-    """Return where the receiver's axis, refracted by a level sea, first meets a bottom.
-
-    Parameters
-    ----------
-    scene
-        The scene; `WaterScene.bottoms` are its bottoms.
-    shifts
-        Horizontal displacements of the lidar, x and y [m], shape (places, 2).
-    poses
-        Poses of the receiver in the scene instead, with arrays of shape (places, 3).
-
-    Returns
-    -------
-    ndarray
-        Points x, y, z in the scene [m], shape (places, 3); NaN where the axis meets no bottom.
-    """
-    own, sea, bottoms = scene.receiver.pose, scene.level_sea, scene.bottoms
-    at = scene.frame_origin
-    origins, axes = own.origin + np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), own.axis
-    if poses is not None:
-        origins, axes = poses.origin - at, poses.axis
-    found = np.full((len(origins), 3), np.nan)
-    if not bottoms or np.any(axes[..., 2] >= 0):
-        return found
-    # Corners of the axis: receiver, sea level, boundaries of the index layers, and a point below everything.
-    lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
-    heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
-    directions = np.broadcast_to(axes, origins.shape)
-    corners = [
-        origins,
-        *(np.column_stack([sea.at_height(origins, directions, z), np.full(len(origins), z)]) for z in heights),
-    ]
-    active, shapes = aligned(mi.Bool, np.ones(len(origins), dtype=bool)), scene_of_shapes(bottoms, scene.groups)
-    for start, end in itertools.pairwise(corners):
-        origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
-        ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
-        ray.maxt = dr.norm(leg)
-        hit = shapes.ray_intersect(ray, active)
-        ends = active & hit.is_valid()
-        at_end = np.array(ends)
-        found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
-        active &= ~ends
-    return found + at
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:

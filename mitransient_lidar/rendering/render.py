@@ -11,6 +11,7 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
+from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
 
@@ -210,14 +211,12 @@ def _render(
     if changes := perturbations(parameters):
         renderer = renderer.perturbed(changes)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time
     from mitransient_lidar.rendering.scene_checks import check_scene
 
-    probe = probe_echoes(lidar, renderer.sampler)
-    window = error_window(lidar, probe)
-    check_scene(lidar, renderer.sampler, probe)
-    described = describe_scene(lidar, probe, window, renderer.focusing)
+    window = ErrorWindow.of_probe(renderer.probe)
+    check_scene(renderer.probe)
+    described = describe_scene(renderer.probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
     accumulator = choose_accumulator(
@@ -249,11 +248,12 @@ def _render(
         verify=accumulator.require_light,
         progress=progress,
     )
-    if lidar.surfaces and probe.missed_beam > TOLERATED_LOSS:
+    missed = renderer.probe.echoes.missed_beam
+    if lidar.surfaces and missed > TOLERATED_LOSS:
         logger.warning(
             "the surface is smaller than the footprint: %.2g %% of the beam in the field of view passes outside it; "
             "enlarge the surface's size",
-            100 * probe.missed_beam,
+            100 * missed,
         )
     lost = log.edge_loss_share(accumulator.received)
     warn_of_edge_loss(lost)

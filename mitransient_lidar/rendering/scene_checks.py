@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -13,23 +12,14 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
-from mitransient_lidar.transport.opaque import opaque_point, shape_number
+from mitransient_lidar.transport.opaque import shape_number
+from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
 from mitransient_lidar.transport.records import total_reflection_ns
-from mitransient_lidar.transport.rng import pass_streams, unit_points
-from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.snell import refract
-from mitransient_lidar.transport.solids import met_numbers
+from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.scene import LidarScene, WaterScene
+from mitransient_lidar.transport.solids import box_of, met_numbers
 
 logger = logging.getLogger(__name__)
-
-#: Rays of the view and of the beam; those of a Gaussian beam reach 4.2 standard deviations.
-_RAYS = 4096
-
-#: Distance outside view or beam within which waves and scattering still light a shape, over its depth.
-_REACH_PER_DEPTH = 0.3
 
 #: Distance of the axes that is told, over the radii of beam and view, whichever is larger.
 _APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
@@ -47,59 +37,8 @@ _CLOSED = 1e-3
 _PULSES = 5.0
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Rays of the view or of the beam: pose, and unit directions of shape (n, 3)."""
-
-    scene: LidarScene
-    pose: Pose
-    directions: FloatArray
-
-    @classmethod
-    def of_view(cls, scene: LidarScene, sampler: SensorSampler) -> _Rays:
-        """Return rays that pixels see."""
-        sample = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
-        seen = np.array(sample.weight) > 0
-        return cls(scene, scene.receiver.pose, np.array(sample.direction, dtype=np.float64).T[seen])
-
-    @classmethod
-    def of_beam(cls, scene: LidarScene) -> _Rays:
-        """Return rays of the laser."""
-        transmitter = scene.transmitter
-        directions = transmitter.pose.direction(*transmitter.sample_tangent(unit_points(_RAYS)))
-        return cls(scene, transmitter.pose, np.array(directions, dtype=np.float64).T)
-
-    def at_height(self, z: float) -> FloatArray:
-        """Return where the rays meet a height after refraction by a level sea, x, y [m], without those that do not."""
-        places = self.scene.level_sea.at_height(self.pose.origin, self.directions, z)
-        return places[np.isfinite(places).all(axis=1)]
-
-    def axis_at_height(self, z: float | FloatArray) -> FloatArray:
-        """Return where the axis meets heights after refraction by a level sea, x, y [m]; NaN if it does not."""
-        axes = np.broadcast_to(self.pose.axis, (*np.shape(z), 3))
-        return self.scene.level_sea.at_height(self.pose.origin, axes, z)
-
-    def distance_to(self, shape: mi.Shape) -> float:
-        """Return the distance from the rays to the bounding box of a shape at three of its heights [m]."""
-        low, high = _box(shape)
-        heights = np.minimum([low[2], 0.5 * (low[2] + high[2]), high[2]], 0.5 * self.pose.origin[2])
-        return min(
-            (float(_gaps(places, low, high).min()) for z in heights if len(places := self.at_height(z))), default=np.inf
-        )
-
-    def covered_by(self, shape: mi.Shape) -> bool:
-        """Return whether all rays meet the bounding box of a shape at its mean height."""
-        low, high = _box(shape)
-        places = self.at_height(min(0.5 * (low[2] + high[2]), 0.5 * self.pose.origin[2]))
-        return len(places) == len(self.directions) and not _gaps(places, low, high).any()
-
-    def meets(self, shape: mi.Shape) -> bool:
-        """Return whether rays, or light that waves or scattering deflect, may meet a shape."""
-        return self.distance_to(shape) <= _REACH_PER_DEPTH * max(-float(shape.bbox().min.z), 0.0)
-
-
-def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> None:
-    """Refuse a scene that can return no light within its record, and warn of parts that cannot contribute.
+def check_scene(probe: Probe) -> None:
+    """Refuse the scene of a probe that can return no light within its record, and warn of parts that cannot contribute.
 
     Warnings name shapes whose echo comes before or after the record, which lie out of view or outside the beam, or
     partly in the air, and a laser and a receiver whose axes do not meet.
@@ -111,27 +50,27 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
         nothing in view reflects or scatters light, the record holds no echo, a bottom rises above the sea, or a target
         lies below the bottom.
     """
+    scene, view, beam = probe.scene, probe.view, probe.beam
     if scene.submerged:
-        _check_under_water(scene, probe)
+        _check_under_water(probe)
         return
-    view, beam = _Rays.of_view(scene, sampler), _Rays.of_beam(scene)
     _check_rays(view, "no pixel sees the sea or a solid: the receiver")
     _check_rays(beam, "the beam misses the sea and every solid: the laser")
     _check_overlap(scene, view, beam)
-    _check_record(scene, view, probe)
+    _check_record(probe)
     _check_reflection(scene, view)
-    _check_solids(scene, probe)
+    _check_solids(probe)
     _warn_of_axes(scene, view, beam)
     for solid in scene.solids:
         _warn_of_place(solid, view, beam)
         _warn_of_inside_out(solid)
-    for echo in probe.solids:
-        _warn_of_time(scene, probe, echo)
+    for echo in probe.echoes.solids:
+        _warn_of_time(probe, echo)
 
 
-def _check_under_water(scene: LidarScene, probe: EchoProbe) -> None:
+def _check_under_water(probe: Probe) -> None:
     """Check the record of a lidar under water: without the laser itself and total reflection, and with every echo."""
-    axis = scene.axis
+    scene, axis = probe.scene, probe.scene.axis
     apart = float(np.linalg.norm(scene.transmitter.pose.origin - scene.receiver.pose.origin))
     first_ns = 2e9 * scene.group_index * _NEAREST_RANGE / C0
     if apart < _NEAREST_RANGE and axis.start_ns < first_ns:
@@ -139,62 +78,49 @@ def _check_under_water(scene: LidarScene, probe: EchoProbe) -> None:
             f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {_NEAREST_RANGE:g} m from "
             "the lidar: at one place, laser and receiver return without limit from less and less range"
         )
-    reflected_ns = total_reflection_ns(scene, scene.transmitter)
+    reflected_ns = total_reflection_ns(probe.view, probe.beam)
     if axis.end_ns > reflected_ns:
         raise UserError(
             f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns end "
             f"the record at {axis.end_ns:g} ns: it must end by {reflected_ns:.1f} ns, when the sea reflects beam or "
             "view totally; what lies beyond is not rendered"
         )
-    for echo in probe.solids:
-        _warn_of_time(scene, probe, echo)
+    for echo in probe.echoes.solids:
+        _warn_of_time(probe, echo)
 
 
-def _box(shape: mi.Shape) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of the bounding box of a shape [m]."""
-    box = shape.bbox()
-    return np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-
-
-def _gaps(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the horizontal distances of places (x, y) from a box [m]."""
-    outside = np.maximum(np.maximum(low[:2] - places, places - high[:2]), 0)
-    return np.asarray(np.hypot(*outside.T))
-
-
-def _place(scene: LidarScene, point: FloatArray) -> str:
+def _place(scene: WaterScene, point: FloatArray) -> str:
     """Return a point as x, y in the scene [m]."""
     x, y = scene.receiver.pose.in_scene(point[:2])
     return f"({x:.1f}, {y:.1f})"
 
 
-def _check_record(scene: LidarScene, view: _Rays, probe: EchoProbe) -> None:
+def _check_record(probe: Probe) -> None:
     """Refuse a record that ends before the surface echo, or begins after the echo of a bottom below all pixels."""
-    axis, surface = scene.axis, probe.surface_ns[:, 0]
+    axis, surface = probe.scene.axis, probe.echoes.surface_ns[:, 0]
     first = float(np.nanmin(surface)) if np.isfinite(surface).any() else np.nan
     if axis.end_ns <= first:
         raise UserError(
             f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns "
             f"end the record at {axis.end_ns:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
         )
-    for echo in probe.solids:
+    for echo in probe.echoes.solids:
         # Light that was scattered several times comes later.
         column = max(echo.latest_ns - first, 0.0) if np.isfinite(first) else 0.0
-        late = axis.start_ns > echo.latest_ns + column + _echo_length(scene)
-        if late and view.covered_by(echo.shape):
+        late = axis.start_ns > echo.latest_ns + column + _echo_length(probe.scene)
+        if late and probe.view.covered_by(echo.shape):
             raise UserError(
                 f"time_start_ns = {axis.start_ns:g} starts the record after every echo: it must be less than "
                 f"{echo.latest_ns:.1f} ns, when the echo of shape {echo.shape.id()!r} ends"
             )
 
 
-def _check_rays(rays: _Rays, subject: str) -> None:
+def _check_rays(rays: Rays, subject: str) -> None:
     """Refuse rays that meet neither the sea nor a solid."""
     surfaces = rays.scene.surfaces
     for surface in surfaces:
-        low, high = _box(surface)
-        for z in (0.0, min(high[2], 0.5 * rays.pose.origin[2])):
-            if len(places := rays.at_height(z)) and _gaps(places, low, high).min() == 0:
+        for z in (0.0, min(float(surface.bbox().max.z), 0.5 * rays.pose.origin[2])):
+            if len(places := rays.at_height(z)) and gaps(places, surface).min() == 0:
                 return
     if any(rays.meets(solid) for solid in rays.scene.solids):
         return
@@ -204,7 +130,7 @@ def _check_rays(rays: _Rays, subject: str) -> None:
         raise UserError(f"{subject} looks above the horizon, along ({x:.3g}, {y:.3g}, {z:.3g}); it must look down")
     where = "where no shape is"
     if surfaces:
-        lows, highs = zip(*map(_box, surfaces), strict=True)
+        lows, highs = zip(*map(box_of, surfaces), strict=True)
         first, last = (_place(rays.scene, corner) for corner in (np.min(lows, axis=0), np.max(highs, axis=0)))
         where = f"outside the sea from {first} to {last} m"
     first, last = (_place(rays.scene, corner) for corner in (places.min(axis=0), places.max(axis=0)))
@@ -212,7 +138,7 @@ def _check_rays(rays: _Rays, subject: str) -> None:
     raise UserError(f"{subject} looks at the sea level {extent}, {where}; change aim_x and aim_y")
 
 
-def _check_overlap(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
+def _check_overlap(scene: LidarScene, view: Rays, beam: Rays) -> None:
     """Refuse beam and view so far apart that light could not pass from one to the other before the record ends."""
     seen, lit = view.at_height(0.0), beam.at_height(0.0)
     if not (len(seen) and len(lit)):
@@ -224,7 +150,7 @@ def _check_overlap(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
         for rays, places in ((view, seen), (beam, lit))
     )
     # Bounds of the path from below: solids in the air may reflect it, which shortens its way through the air.
-    highest = max((_box(solid)[1][2] for solid in scene.solids), default=0.0)
+    highest = max((float(solid.bbox().max.z) for solid in scene.solids), default=0.0)
     if highest <= 0 and gap > 0 and air + gap > scene.axis.path_end:
         raise UserError(
             f"beam and field of view do not overlap: they are {gap:.3g} m apart on the sea level, so that scattered "
@@ -233,7 +159,7 @@ def _check_overlap(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
         )
 
 
-def _check_reflection(scene: LidarScene, view: _Rays) -> None:
+def _check_reflection(scene: LidarScene, view: Rays) -> None:
     """Refuse black solids in water that does not scatter, below a smooth surface."""
     rough = mi.BSDFFlags.Glossy.value | mi.BSDFFlags.Diffuse.value
     if any(int(surface.bsdf().flags()) & rough for surface in scene.surfaces):
@@ -241,14 +167,9 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
     water = scene.water
     if water is not None and (water.plume is not None or water.column.scattering.max() > 0):
         return
-    ray = mi.Ray3f(opaque_point(view.pose.origin), mi.Vector3f(*view.directions.T))
-    first = scene.ray_intersect(ray)
-    at_sea = first.is_valid() & scene.is_surface(first.shape)
-    down = -dr.normalize(refract(-ray.d, first.n, 1 / scene.refractive_index))
-    below = scene.ray_intersect(scene.spawn_ray(first, down), at_sea)
     found: list[mi.Shape] = []
-    random = unit_points(len(view.directions))
-    for hit, active in ((first, first.is_valid() & ~at_sea), (below, at_sea & below.is_valid())):
+    random = unit_points(PROBE_RAYS)
+    for hit, active in ((view.first, view.first.is_valid() & ~view.on_sea), (view.below, view.below.is_valid())):
         _, weight = hit.bsdf().sample(mi.BSDFContext(), hit, random.x, random, active)
         if dr.any(active & (weight[0] > 0)):
             return
@@ -263,11 +184,11 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
     )
 
 
-def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
+def _check_solids(probe: Probe) -> None:
     """Refuse a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
-    bottoms = scene.bottoms
+    scene, bottoms = probe.scene, probe.scene.bottoms
     lowest = min(bottoms, key=lambda bottom: float(bottom.bbox().min.z), default=None)
-    highest = max((float(surface.bbox().max.z) for surface in scene.surfaces), default=np.inf)
+    _, highest = scene.sea_heights or (np.inf, np.inf)
     for solid in scene.solids:
         low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
         if lowest is not None and high < float(lowest.bbox().min.z):
@@ -277,7 +198,7 @@ def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
             )
         if low > highest:
             logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
-    for solid in probe.pierced:
+    for solid in probe.echoes.pierced:
         if any(solid is bottom for bottom in bottoms):
             raise DryBottomError(
                 f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
@@ -286,9 +207,9 @@ def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
         logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())
 
 
-def _warn_of_axes(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
+def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:
     """Warn of axes of laser and receiver that do not meet in the water or on the surface."""
-    boxes = [_box(solid) for solid in scene.solids]
+    boxes = [box_of(solid) for solid in scene.solids]
     highest = max([0.0, *(min(high[2], 0.5 * view.pose.origin[2]) for _, high in boxes)])
     # Without a solid, to the depth from which light returns within the record.
     reach = 0.5 * (scene.axis.path_end - 2 * view.pose.origin[2]) / scene.group_index
@@ -310,19 +231,18 @@ def _warn_of_axes(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
         )
 
 
-def _warn_of_place(solid: mi.Shape, view: _Rays, beam: _Rays) -> None:
+def _warn_of_place(solid: mi.Shape, view: Rays, beam: Rays) -> None:
     """Warn of a solid that lies out of view or outside the beam."""
-    low, high = _box(solid)
-    z = 0.5 * (low[2] + high[2])
+    z = float(solid.bbox().center().z)
     for rays, problem, name in ((view, "out of view", "receiver"), (beam, "outside the beam", "laser")):
-        if rays.meets(solid) or not np.isfinite(axis := rays.axis_at_height(min(z, 0.5 * rays.pose.origin[2]))).all():
+        if rays.meets(solid) or not np.isfinite(axis := rays.axis_at_height(rays.middle_height(solid))).all():
             continue
         logger.warning(
             "shape %r lies %s: it is %.1f m from the %s's axis, which passes x = %.1f m, y = %.1f m at its height of "
             "z = %.1f m; move the shape there, or the lidar by aim_x and aim_y",
             solid.id(),
             problem,
-            float(_gaps(axis[None], low, high)[0]),
+            float(gaps(axis[None], solid)[0]),
             name,
             *rays.scene.receiver.pose.in_scene(axis),
             z,
@@ -364,9 +284,9 @@ def _is_inside_out(solid: mi.Shape) -> bool:
     return bool((volume < 0) != solid.has_flipped_normals())
 
 
-def _warn_of_time(scene: LidarScene, probe: EchoProbe, echo: SolidEcho) -> None:
+def _warn_of_time(probe: Probe, echo: SolidEcho) -> None:
     """Warn of the echo of a solid that comes before the record, or after one that is not of the surface echo alone."""
-    axis, fwhm_ns = scene.axis, scene.transmitter.pulse.fwhm_ns
+    axis, fwhm_ns = probe.scene.axis, probe.scene.transmitter.pulse.fwhm_ns
     name, mean = echo.shape.id(), echo.mean_ns
     if mean < axis.start_ns:
         logger.warning(
@@ -376,8 +296,8 @@ def _warn_of_time(scene: LidarScene, probe: EchoProbe, echo: SolidEcho) -> None:
             axis.start_ns,
         )
         return
-    surface = probe.surface_ns[:, 1]
-    of_surface = np.isfinite(surface).any() and axis.end_ns < np.nanmax(surface) + _echo_length(scene)
+    surface = probe.echoes.surface_ns[:, 1]
+    of_surface = np.isfinite(surface).any() and axis.end_ns < np.nanmax(surface) + _echo_length(probe.scene)
     if mean > axis.end_ns and not of_surface:
         logger.warning(
             "the echo of shape %r comes at %.1f ns, after the record ends at %g ns: a bin_count of %d would hold it",

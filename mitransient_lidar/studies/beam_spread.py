@@ -134,8 +134,6 @@ def beam_spread(
 
     lidar = find_lidar_scene(session.scene, session.sensor)
     lidar.transmitter.pose.require_above_sea()
-    if lidar.water is None:
-        raise UserError("the scene has no water: give its surface a layered_water as interior medium")
     planes = _planes(lidar, wanted)
     tracer = CrossingTracer(lidar, planes, photons)
     measured: list[list[dict[str, Any]]] = []

@@ -24,10 +24,9 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_structures,
 )
 from mitransient_lidar.rendering.accumulators import PassAccumulator
+from mitransient_lidar.rendering.accuracy import ErrorWindow
 
 if TYPE_CHECKING:
-    import mitsuba as mi
-
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -106,22 +105,20 @@ def estimate(
     paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
+    from mitransient_lidar.transport.probe import Probe
     from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
-    from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
     lidar = find_lidar_scene(session.scene, session.sensor)
     model = _model(lidar)
     session.tell_axis(lidar.axis, lidar.record_end)
-    sampler = SensorSampler(lidar.receiver, lidar.transmitter)
-    probe = probe_echoes(lidar, sampler)
-    window = error_window(lidar, probe)
+    probe = Probe(lidar)
+    window = ErrorWindow.of_probe(probe)
     accumulator = PassAccumulator(lidar, window, origins=_ORIGINS)
     for generator in np.random.SeedSequence(seed).spawn(_PARTS):
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)
-    described = describe_scene(lidar, probe, window, RippleFocusing.of_scene(lidar))
+    described = describe_scene(probe, window, RippleFocusing.of_scene(lidar))
     attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
 
@@ -178,6 +175,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import Recorded
+    from mitransient_lidar.transport.solids import scene_of_shapes
 
     column = lidar.required_water.column
     if not lidar.bottoms:
@@ -187,26 +185,15 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     if isinstance(bsdf, Recorded) and bsdf.parameters.get("model") == "hapke":
         raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
-    si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1])))
+    start = mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1]))
+    si = scene_of_shapes(lidar.bottoms, lidar.groups).ray_intersect(mi.Ray3f(start, mi.Vector3f(0, 0, -1)))
     box = lidar.bottoms[0].bbox()
     depth, height = -float(si.p.z[0]), float(box.max.z - box.min.z)
-    if not depth > 0:
+    if not (si.is_valid()[0] and depth > 0):
         raise UserError("the axis of the receiver must meet water above the bottom for an estimate")
     if height > _LEVEL * depth:
         logger.warning("the estimate takes the bottom as level, at its depth of %.3g m on the axis", depth)
     return depth, float(np.array(si.bsdf().eval_diffuse_reflectance(si))[0, 0])
-
-
-def _below(lidar: LidarScene, point: mi.Point3f) -> mi.SurfaceInteraction3f:
-    """Return the bottom below a point."""
-    import mitsuba as mi
-
-    for _ in range(8):
-        si = lidar.mitsuba_scene.ray_intersect(mi.Ray3f(point, mi.Vector3f(0, 0, -1)))
-        if any(si.shape[0] is bottom for bottom in lidar.bottoms):
-            return si
-        point = si.p - mi.Vector3f(0, 0, 1e-4)
-    raise UserError("the axis of the receiver must meet water above the bottom for an estimate")
 
 
 def _slopes(lidar: LidarScene) -> tuple[FloatArray, Callable[[FloatArray], FloatArray] | None]:

@@ -208,9 +208,7 @@ def _water(lidar: LidarScene, min_depth: float, max_depth: float) -> InherentPro
     """Return the water between two depths [m]; reject several layers."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
-    water = lidar.water
-    if water is None:
-        raise UserError("the scene has no water: give its surface a layered_water as interior medium")
+    water = lidar.required_water
     if water.plume is not None:
         raise UserError(
             "the scene has bubbles: the slope needs the same water everywhere, plume_scattering = 0 and "

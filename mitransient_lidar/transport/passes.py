@@ -15,10 +15,11 @@ from mitransient_lidar.transport.histogram import GateWeights, TransientHistogra
 from mitransient_lidar.transport.opaque import changed
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSampler
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class PassRecord:
@@ -87,7 +88,8 @@ class PassRenderer(ABC):
         #: Enhancement by ripples, or None.
         self.focusing = RippleFocusing.of_scene(scene)
         self.classes = replace(classes, counted=self.focusing is not None)
-        self.sampler = SensorSampler(scene.receiver, scene.transmitter)
+        self.probe = Probe(scene)
+        self.sampler = self.probe.sampler
 
     @property
     def path_count(self) -> int:

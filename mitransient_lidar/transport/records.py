@@ -11,20 +11,21 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, ColumnDecay, Cone, LidarView, Solid
+from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
-from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.solids import box_of
 
-#: Rays of beam and view from which the record of a lidar under water follows.
-_RECORD_RAYS = 1024
-
-#: Share of these rays that the sea must reflect totally for the record to end there.
+#: Share of the rays of beam or view that the sea must reflect totally for the record to end there.
 _REFLECTED = 0.1
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
@@ -39,30 +40,81 @@ def fitted_record(
 ) -> tuple[TimeAxis, str]:
     """Return time bins of a film for all light that returns, and what the last light comes from.
 
-    `shifts` are horizontal displacements of the lidar [m]: the bins hold the
-    light of all its positions.
+    `shifts` are horizontal displacements of a lidar above water [m]: the bins hold the light of all its positions.
 
     Raises
     ------
     UserError
         If the bins are too many.
     """
-    solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
-    found = [_lidar_view(scene, transmitter, shift).limits(solids, film.gates is not None) for shift in shifts]
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
+    latest = np.inf
+    if transmitter.pose.submerged:
+        first, last, end, latest = _light_under_water(scene, transmitter)
+        start = first - lead
+    else:
+        first, last, end = _light_above_water(scene, transmitter, film.gates, shifts)
+        start = first - lead
+        if scene.surfaces:
+            quiet = _quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns
+            start = min(start, max(quiet, start - _LONGEST_NS))
+    axis = TimeAxis.covering(start, last + tail, film.bin_width_ns, film.time_start_ns, film.bin_count)
+    if film.bin_count is None and axis.end_ns > latest:
+        bins = max(int((latest - axis.start_ns) / axis.bin_width_ns), 1)
+        return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
+    return axis, end
+
+
+def _light_above_water(
+    scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None, shifts: Iterable[tuple[float, float]]
+) -> tuple[float, float, str]:
+    """Return the times of the first and the last light [ns], and what the last light comes from."""
+    solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
+    found = [_lidar_view(scene, transmitter, shift).limits(solids, gates is not None) for shift in shifts]
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
-    if film.gates is not None:
+    if gates is not None:
         for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = film.gates.placed(time, scene.depth_per_ns).spans_ns
+            spans = gates.placed(time, scene.depth_per_ns).spans_ns
             end = "after the last gate" if spans[-1, 1] > limits[1] else end
             limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    start = limits[0] - lead
-    if scene.surfaces:
-        start = min(start, max(_quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns, start - _LONGEST_NS))
-    return TimeAxis.covering(start, limits[1] + tail, *fixed), end
+    return *limits, end
+
+
+def _light_under_water(scene: WaterScene, transmitter: Transmitter) -> tuple[float, float, str, float]:
+    """Return the same of a lidar under water, and when the sea first reflects beam or view totally [ns].
+
+    The first light is scattered at the lidar. The last one is the farthest echo of beam and view, with a quarter of its
+    time and 40 ns more for light that is scattered several times, or comes from the range where the signal of the
+    water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
+    """
+    view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
+    beam = Rays.of_beam(scene, transmitter)
+    visible = -0.5 * np.log(COLUMN_LEVEL) / max(float(_kd(scene.required_water.column).min()), 1e-9)
+    ends = [float(rays.ranges.max()) for rays in (view, beam)]
+    to_solid = max(ends) if np.isfinite(ends).all() else min(ends)
+    apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
+    echo = 2e9 / C0 * scene.group_index * (min(to_solid, visible) + apart)
+    end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
+    return 0.0, 1.25 * echo + 40.0, end, total_reflection_ns(view, beam)
+
+
+def total_reflection_ns(view: Rays, beam: Rays) -> float:
+    """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
+
+    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
+    by few paths and in cells about an axis that light has left: it is not rendered.
+    """
+    found, scene = [np.inf], view.scene
+    lidar = [opaque_point(rays.pose.origin) for rays in (beam, view)]
+    for rays in (view, beam):
+        si = rays.first
+        beyond = rays.on_sea & (scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1)
+        time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
+        if dr.count(beyond)[0] > _REFLECTED * len(rays.directions):
+            found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
+    return min(found)
 
 
 def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
@@ -78,71 +130,6 @@ def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
     return float(1e9 / C0 * (arrival - 0.5 * field * slope) - 2 * width_ns)
 
 
-def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFilm) -> tuple[TimeAxis, str]:
-    """Return time bins of a film of a lidar under water, and what the last light comes from.
-
-    The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
-    quarter of its time and 40 ns more for light that is scattered several times, or at the range where the signal of
-    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer; at
-    the latest where `total_reflection_ns` says.
-
-    Raises
-    ------
-    UserError
-        If the bins are too many.
-    """
-    column = scene.required_water.column
-    hits = _first_hits(scene, transmitter)
-    ranges = [np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64) for si in hits]
-    rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    least = min(InherentProperties(*map(float, row)).kd for row in rows)
-    visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
-    nearest, farthest = (float(np.max(each)) for each in (np.minimum(*ranges), np.concatenate(ranges)))
-    to_solid = farthest if np.isfinite(farthest) else nearest
-    apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
-    distance = min(to_solid, visible) + apart
-    echo = 2e9 / C0 * scene.group_index * distance
-    end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
-    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
-    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    last, mirrored = 1.25 * echo + 40.0 + tail, total_reflection_ns(scene, transmitter)
-    axis = TimeAxis.covering(-lead, last, *fixed)
-    if film.bin_count is None and axis.end_ns > mirrored:
-        bins = max(int((mirrored - axis.start_ns) / axis.bin_width_ns), 1)
-        return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
-    return axis, end
-
-
-def total_reflection_ns(scene: WaterScene, transmitter: Transmitter) -> float:
-    """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
-
-    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
-    by few paths and in cells about an axis that light has left: it is not rendered.
-    """
-    found = [np.inf]
-    lidar = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
-    for si in _first_hits(scene, transmitter):
-        beyond = si.is_valid() & scene.is_surface(si.shape)
-        beyond &= scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1
-        time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
-        if dr.count(beyond)[0] > _REFLECTED * _RECORD_RAYS:
-            found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
-    return min(found)
-
-
-def _first_hits(scene: WaterScene, transmitter: Transmitter) -> list[mi.SurfaceInteraction3f]:
-    """Return what rays of view and beam meet first."""
-    points = unit_points(_RECORD_RAYS)
-    return [
-        scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
-        for pose, angles in (
-            (scene.receiver.pose, scene.receiver.pixels.sample(points)),
-            (transmitter.pose, transmitter.sample_tangent(points)),
-        )
-    ]
-
-
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
     """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
     pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
@@ -150,38 +137,27 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     blurred = 0.0 if blur is None else blur.reach
     half_angles = 0.5 * sides[0] + blurred, 0.5 * sides[1] + blurred
     edge = transmitter.profile.reach
-    moved = np.array([*shift, 0.0])
-    view, beam = (
-        Cone(replace(one, origin=one.origin + moved), angles, is_round)
-        for one, angles, is_round in (
-            (pose, half_angles, pixels.field_of_view_shape == "circle"),
-            (transmitter.pose, (edge, edge), True),
-        )
-    )
-    boxes = [shape.bbox() for shape in scene.mitsuba_scene.shapes()]
-    corners = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 3)[:, :2]
-    reach = max(
-        (float(np.hypot(*(np.abs(corners - one.pose.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
-        default=float(pose.origin[2]),
-    )
-    if scene.water is None:
-        none = np.zeros(1)
-        return LidarView(view, beam, scene.level_sea, ColumnDecay(none, none), (0.0, 0.0), reach, None)
-    column, plume = scene.water.column, scene.water.plume
+    poses = [replace(each, origin=np.add(each.origin, [*shift, 0.0])) for each in (pose, transmitter.pose)]
+    view = Cone(poses[0], half_angles, pixels.field_of_view_shape == "circle")
+    beam = Cone(poses[1], (edge, edge))
+    corners = np.reshape([box_of(shape) for shape in scene.mitsuba_scene.shapes()], (-1, 3))[:, :2]
+    farthest = [np.abs(corners - each.origin[:2]).max(axis=0) for each in poses if len(corners)]
+    reach = max((float(np.hypot(*each)) for each in farthest), default=float(pose.origin[2]))
+    none, deepest = np.zeros(1), None
+    decay = WaterColumn(none, none, none, none)
+    if scene.water is not None:
+        column, plume = scene.water.column, scene.water.plume
+        spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
+        attenuation = system_attenuation(column.attenuation, np.minimum(_kd(column), column.attenuation), spot)
+        none, deepest = np.zeros(column.count), 0.0 if plume is None else plume.depth
+        decay = WaterColumn(column.layer_tops, attenuation, none, none)
+    return LidarView(view, beam, scene.level_sea, decay, scene.sea_heights or (0.0, 0.0), reach, deepest)
+
+
+def _kd(column: WaterColumn) -> FloatArray:
+    """Return the diffuse attenuation coefficient of each layer [1/m]."""
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    kd = [InherentProperties(*map(float, row)).kd for row in rows]
-    spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
-    attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    heights = [(float(surface.bbox().min.z), float(surface.bbox().max.z)) for surface in scene.surfaces]
-    return LidarView(
-        view,
-        beam,
-        scene.level_sea,
-        ColumnDecay(column.layer_tops, attenuation),
-        (min(low for low, _ in heights), max(high for _, high in heights)),
-        reach,
-        0.0 if plume is None else plume.depth,
-    )
+    return np.array([InherentProperties(*map(float, row)).kd for row in rows])
 
 
 def _name(shape: mi.Shape) -> str:
@@ -200,7 +176,7 @@ def _triangles(shape: mi.Shape) -> FloatArray:
         matrix = np.array(known["to_world"].matrix, dtype=np.float64).reshape(4, 4)
         corners = (square @ matrix.T)[None, :, :3]
     else:
-        low, high = (np.array(corner, dtype=np.float64) for corner in (shape.bbox().min, shape.bbox().max))
+        low, high = box_of(shape)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         corners = np.array([middle + (square[:, :3] + [0, 0, side]) * half for side in (-1.0, 1.0)])
     return np.asarray(corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3))

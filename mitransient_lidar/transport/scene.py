@@ -24,7 +24,7 @@ from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import children
+from mitransient_lidar.transport.solids import box_of, children
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -145,7 +145,7 @@ class WaterScene:
         The shorter horizontal side of a bottom's bounding box is at least the width of the field of view at its
         distance, and at least a quarter of that of the largest solid.
         """
-        boxes = [np.array([solid.bbox().min, solid.bbox().max], dtype=np.float64) for solid in self.solids]
+        boxes = [box_of(solid) for solid in self.solids]
         sides = [float((high - low)[:2].min()) for low, high in boxes]
         origin, field_of_view = self.receiver.pose.origin, self.receiver.pixels.field_of_view
         widths = [field_of_view * float(np.linalg.norm(np.clip(origin, *box) - origin)) for box in boxes]
@@ -163,12 +163,18 @@ class WaterScene:
     def empty_heights(self) -> tuple[float, float]:
         """Heights of the top of the highest solid and of the lowest point of the sea: no shape lies between [m]."""
         highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
-        return highest, min((float(surface.bbox().min.z) for surface in self.surfaces), default=-np.inf)
+        return highest, -np.inf if self.sea_heights is None else self.sea_heights[0]
+
+    @property
+    def sea_heights(self) -> tuple[float, float] | None:
+        """Lowest and highest point of the sea [m], None without one."""
+        boxes = [surface.bbox() for surface in self.surfaces]
+        return (min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)) if boxes else None
 
     @property
     def has_specular_or_dry_solids(self) -> bool:
         """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
-        lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
+        lowest, _ = self.sea_heights or (0.0, 0.0)
         mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
         return self._have_solids(mirror) or any(float(solid.bbox().max.z) > lowest for solid in self.solids)
 
@@ -342,10 +348,9 @@ class WaterScene:
 
     def outside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
         """Return whether a height [m] can be reached outside the surface mesh only: wet above it, or dry below it."""
-        if not self.surfaces:
+        if self.sea_heights is None:
             return mi.Bool(False)
-        boxes = [surface.bbox() for surface in self.surfaces]
-        lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
+        lowest, highest = self.sea_heights
         # A margin of a millimetre for points that lie on the surface to rounding.
         return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
 

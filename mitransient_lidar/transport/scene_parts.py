@@ -27,7 +27,7 @@ from mitransient_lidar.transport.plugin_types import (
     WaterMedium,
 )
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.records import fitted_record, submerged_record
+from mitransient_lidar.transport.records import fitted_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
@@ -81,14 +81,12 @@ def find_lidar_scene(
         )
     parts = find_solids(scene, receiver)
     _check_wavelength(parts.water, transmitters[0])
-    submerged = _check_place(parts, transmitters[0])
-    if not submerged:
+    if not _check_place(parts, transmitters[0]):
         _check_cells(parts.surfaces, transmitters[0])
     axis, end = film.axis or axis, ""
     if axis is None:
         # The bins are those of the sensor, whatever replaces its receiver.
-        found = replace(parts, receiver=find_receiver(sensor)), transmitters[0], film
-        axis, end = submerged_record(*found) if submerged else fitted_record(*found, shifts)
+        axis, end = fitted_record(replace(parts, receiver=find_receiver(sensor)), transmitters[0], film, shifts)
     end = end if film.bin_count is None else ""
     return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis, gates=film.gates, record_end=end)
 

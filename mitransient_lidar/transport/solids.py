@@ -99,6 +99,12 @@ def _is_unseen(shape: mi.Shape) -> bool:
     return all((value == 1).all() for value in through)
 
 
+def box_of(shape: mi.Shape) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and highest coordinates of the bounding box of a shape [m], shape (3,) each."""
+    box = shape.bbox()
+    return np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+
+
 def box_rays(low: FloatArray, high: FloatArray, ticks: int) -> tuple[FloatArray, FloatArray]:
     """Return origins and directions, shape (n, 3), of rays from all sides through a box, `ticks` along each side.
 

@@ -12,9 +12,9 @@ from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCel
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import BeamRings
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MERGING = {"type": "lidar_merging"}
 FEW = {**MERGING, "paths_per_pass": 2**13, "photons_per_pass": 2**13}
@@ -92,7 +92,7 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
 def wavy_sea(lidar_scene):
     scene = lidar_scene(integrator=MERGING, sea=WAVES)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    region = Region.of_probe(Probe(lidar))
     return lidar, region
 
 
@@ -116,7 +116,7 @@ def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsew
     scene = lidar_scene(integrator=MERGING, tx=pose, rx=pose, sea=sea, bottom=1.25)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
     assert min(float(surface.bbox().min.z) for surface in lidar.surfaces) < -1.25
-    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    region = Region.of_probe(Probe(lidar))
     assert region.track_length(lidar) == pytest.approx(1.25, rel=0.01)
 
 
@@ -145,7 +145,7 @@ def test_beds_are_found_where_refracted_light_is(lidar_scene):
     narrow = {"tx": {"divergence_mrad": 0.1}, "rx": {"field_of_view_mrad": 0.3}}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"bottom": sand}, **narrow)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
-    heights = SurfaceHeights(lidar, Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter)), 8.0)
+    heights = SurfaceHeights(lidar, Region.of_probe(Probe(lidar)), 8.0)
     down = mi.Ray3f(mi.Point3f(2.0, 0.1, -0.5), mi.Vector3f(0, 0, -1))
     true = float(lidar.mitsuba_scene.ray_intersect(down).p.z[0])
     assert float(heights.bed_at(mi.Float(2.0), mi.Float(0.1))[0]) == pytest.approx(true, abs=0.02)
@@ -167,7 +167,7 @@ def test_region_and_axis_follow_the_waves(lidar_scene):
     met = np.array(scene.ray_intersect(ray).p)[:, 0]
     assert abs(met[2]) > 0.1
     np.testing.assert_allclose(beam_entries(lidar)[0], met, atol=0.05)
-    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    region = Region.of_probe(Probe(lidar))
     assert region.low[0] < met[0] < region.high[0]
     assert region.high[1] - region.low[1] < 0.2
 
@@ -222,7 +222,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene, height):
     extra = {"target": plate(0.1, 0.05, -4.0 if height is None else bottom + height, half)}
     scene = lidar_scene(integrator=MERGING, extra=extra)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    region = Region.of_probe(Probe(lidar))
     width, count, side = 0.1, 2**18, half if height is None else 0.7
     rings, shift = BeamRings(lidar.transmitter.pose, 1.0, 1.34), mi.Point2f(0.37, 0.61)
     patches = SolidPatches(lidar, region, rings, 8.0, width).of_pass(lidar, shift)
@@ -372,7 +372,7 @@ def test_levels_of_one_mesh_are_distinguished(lidar_scene, two_levels):
     flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
     lidar = find_lidar_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    region = Region.of_probe(Probe(lidar))
     assert [shape.id() for shape in solids_of_several_levels(lidar, region)] == ["levels"]
 
 

@@ -12,7 +12,7 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import fresnel
-from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
+from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 GROUP = 1.34
@@ -161,7 +161,7 @@ def test_records_end_where_the_sea_reflects_the_beam(build):
 def test_echoes_are_expected_when_geometry_says(build):
     scene = build(-3.0, 20.0, bottom=8.0)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    probe = probe_echoes(renderer.scene, renderer.sampler)
+    probe = renderer.probe.echoes
     assert probe.bottom_ns[0, 0] == pytest.approx(2e9 * GROUP * 5 / np.cos(np.radians(20)) / C0, rel=2e-3)
     assert np.isnan(probe.surface_ns).all()
     assert probe.missed_beam == 0

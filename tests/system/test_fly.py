@@ -23,7 +23,7 @@ from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.products import Flown, describe_points
 from mitransient_lidar.flights.renderer import FlightRenderer
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.rendering.echo_window import lines_of_sight
+from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: A short flight round a cube, over a level sea with the ripples of a wind and a bottom that slopes.

@@ -13,9 +13,8 @@ from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
-from mitransient_lidar.rendering.echo_window import probe_echoes
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 SMALL = {"surface_size": 60, "bin_width_ns": 4}
@@ -66,7 +65,7 @@ def beside(offset, film=None):
 )
 def test_echoes_of_rays_through_the_waves_are_within(params):
     lidar = prepared("table1", params)
-    probe = probe_echoes(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    probe = Probe(lidar).echoes
     first, last = np.nanmin(probe.surface_ns), np.nanmax(probe.bottom_ns)
     lead = 3 * lidar.transmitter.pulse.fwhm_ns
     assert lidar.axis.start_ns < first - lead

@@ -12,6 +12,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 #: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
@@ -121,27 +122,6 @@ class Solid:
         return float(lowest.min()), float(highest.max())
 
 
-@dataclass(frozen=True, eq=False)
-class ColumnDecay:
-    """Decay of the column signal: upper edges of the layers [m], the first one 0, and system attenuation [1/m]."""
-
-    tops: FloatArray
-    attenuation: FloatArray
-
-    def to(self, depth: float) -> float:
-        """Return the integral of the attenuation down to a depth [1]."""
-        thickness = np.clip(depth - self.tops, 0, np.diff(self.tops, append=np.inf))
-        return float(thickness @ self.attenuation)
-
-    def depth_of(self, decay: float) -> float:
-        """Return the depth [m] at which the integral of the attenuation reaches a value, else that of its end."""
-        edges = np.array([self.to(top) for top in self.tops])
-        layer = int(np.searchsorted(edges, decay, side="right")) - 1
-        if self.attenuation[layer] > 0:
-            return float(self.tops[layer] + (decay - edges[layer]) / self.attenuation[layer])
-        return float(self.tops[layer])
-
-
 @dataclass(frozen=True)
 class RecordLimits:
     """First and last arrival of light over all pixels, for an ideal pulse."""
@@ -153,31 +133,6 @@ class RecordLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
-    """Straight lines from an instrument to places x, y [m], shape (n, 2), at one height."""
-
-    origin: FloatArray
-    places: FloatArray
-    z: float
-
-    @cached_property
-    def length(self) -> FloatArray:
-        """Lengths [m], shape (n,)."""
-        offset = self.places - self.origin[:2]
-        return np.asarray(np.sqrt(np.sum(offset**2, axis=1) + (self.origin[2] - self.z) ** 2))
-
-    @property
-    def sine(self) -> FloatArray:
-        """Sine of the angle from the vertical."""
-        return np.asarray(np.hypot(*((self.places - self.origin[:2]) / self.length[:, None]).T))
-
-    def below(self, sea: LevelSea, z: float) -> FloatArray:
-        """Return where the lines, refracted by the sea level, meet another height [m], shape (n, 2)."""
-        directions = np.insert(self.places - self.origin[:2], 2, self.z - self.origin[2], axis=1)
-        return sea.at_height(self.origin, directions, z)
-
-
-@dataclass(frozen=True, eq=False)
 class LidarView:
     """Geometry of a lidar over a sea.
 
@@ -186,7 +141,7 @@ class LidarView:
     view, beam
         Field of view with its blur, and beam.
     sea, decay
-        Index layers of the water below z = 0, and its signal.
+        Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
     heights
         Lowest and highest point of the sea [m].
     reach
@@ -198,7 +153,7 @@ class LidarView:
     view: Cone
     beam: Cone
     sea: LevelSea
-    decay: ColumnDecay
+    decay: WaterColumn
     heights: tuple[float, float]
     reach: float
     column: float | None
@@ -217,10 +172,10 @@ class LidarView:
         (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
-        steepest = float(self._at_sea[1].sine.min()) / self.sea.refractive_index[0]
+        seen = self._at_sea[1]
         # Both ways, per vertical metre.
-        slant = 2 / np.sqrt(1 - steepest**2)
-        covered = np.zeros(len(self._at_sea[1].places), dtype=bool)
+        slant = 2 / np.sqrt(1 - (float(_sine(seen).min()) / self.sea.refractive_index[0]) ** 2)
+        covered = np.zeros(len(seen), dtype=bool)
         firsts, lasts = [], []
         for solid in solids:
             limits = self._heights_of(solid)
@@ -229,13 +184,13 @@ class LidarView:
             lowest, highest = limits
             if self.column is None or highest > self.heights[1]:
                 firsts.append(self._earliest(highest))
-            if np.exp(-slant * self.decay.to(-lowest)) >= SOLID_LEVEL:
+            if np.exp(-slant * self.decay.cumulative(max(-lowest, 0.0))) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
                 later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
                 later = 0.0 if direct else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
-                below = self._at_sea[1].below(self.sea, min(lowest, 0.0))
+                below = self.sea.at_height(self.view.pose.origin, seen, min(lowest, 0.0))
                 covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
         if self.column is not None or not firsts:
             firsts.append(surface[0])
@@ -248,9 +203,9 @@ class LidarView:
         return RecordLimits(min(firsts), last, surface, end)
 
     @cached_property
-    def _at_sea(self) -> tuple[Lines, Lines]:
-        """Lines of laser and receiver to the mean sea level."""
-        return self._lines(0.0)[:2]
+    def _at_sea(self) -> tuple[FloatArray, FloatArray]:
+        """Rays of laser and receiver to the mean sea level [m]."""
+        return self._rays(0.0)[:2]
 
     @cached_property
     def _crossing_ns(self) -> float:
@@ -263,29 +218,33 @@ class LidarView:
         index = self.sea.group_index or self.sea.refractive_index
         return float(_NS_PER_M * index[0] * min(away.max(), _FARTHEST))
 
-    def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
-        """Return the lines of laser and receiver to a height, and whether they meet in places lit and seen."""
+    def _rays(self, z: float) -> tuple[FloatArray, FloatArray, bool]:
+        """Return rays of laser and receiver to a height [m], shape (n, 3), and whether they meet, lit and seen."""
         of_view, of_beam = self.view.places(z, self.reach), self.beam.places(z, self.reach)
         common = np.concatenate([of_view[self.beam.holds(of_view, z)], of_beam[self.view.holds(of_beam, z)]])
         meet = len(common) > 0
-        laser, receiver = (common, common) if meet else (of_beam, of_view)
-        return Lines(self.beam.pose.origin, laser, z), Lines(self.view.pose.origin, receiver, z), meet
+        laser, receiver = (
+            np.insert(places, 2, z, axis=1) - cone.pose.origin
+            for cone, places in ((self.beam, common if meet else of_beam), (self.view, common if meet else of_view))
+        )
+        return laser, receiver, meet
 
     def _below_instruments(self, z: float) -> float:
         return float(min(z, _HIGHEST * min(self.view.pose.origin[2], self.beam.pose.origin[2])))
 
     def _earliest(self, z: float) -> float:
         """Return the time of the first light from a height in the air [ns]."""
-        laser, receiver, meet = self._lines(self._below_instruments(z))
-        length = np.min(laser.length + receiver.length) if meet else laser.length.min() + receiver.length.min()
-        return float(_NS_PER_M * length)
+        *rays, meet = self._rays(self._below_instruments(z))
+        laser, receiver = (np.linalg.norm(each, axis=1) for each in rays)
+        return float(_NS_PER_M * (np.min(laser + receiver) if meet else laser.min() + receiver.min()))
 
     def _latest(self, z: float) -> tuple[float, float]:
         """Return the times of the last direct light from a height, through the air and in the water [ns]."""
         total = in_water = 0.0
-        for lines in self._lines(self._below_instruments(max(z, self.heights[0])))[:2]:
-            optical, _ = self.sea.lengths(-z, lines.sine)
-            total, in_water = total + float((lines.length + optical).max()), in_water + float(optical.max())
+        for rays in self._rays(self._below_instruments(max(z, self.heights[0])))[:2]:
+            optical, _ = self.sea.lengths(-z, _sine(rays))
+            total += float((np.linalg.norm(rays, axis=1) + optical).max())
+            in_water += float(optical.max())
         return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
 
     def _heights_of(self, solid: Solid) -> tuple[float, float] | None:
@@ -295,8 +254,10 @@ class LidarView:
         for _ in range(_NARROWINGS):
             corners = []
             for z in heights:
-                lines = self._at_sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
-                places = np.concatenate([one.below(self.sea, min(z, one.z)) for one in lines])
+                top = max(self._below_instruments(z), 0.0)
+                rays = self._at_sea if z <= 0 else self._rays(top)[:2]
+                lines = zip((self.beam.pose.origin, self.view.pose.origin), rays, strict=True)
+                places = np.concatenate([self.sea.at_height(*one, min(z, top)) for one in lines])
                 margin = _REACH_PER_DEPTH * max(-z, 0.0)
                 corners += [places.min(axis=0) - margin, places.max(axis=0) + margin]
             narrower = solid.heights_in(np.min(corners, axis=0), np.max(corners, axis=0))
@@ -304,3 +265,8 @@ class LidarView:
                 return narrower
             heights = narrower
         return heights
+
+
+def _sine(rays: FloatArray) -> FloatArray:
+    """Return the sines of the angles of rays from the vertical, shape (n,)."""
+    return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) / np.linalg.norm(rays, axis=1))

@@ -116,6 +116,12 @@ class WaterColumn:
         layer = self.layer_at(z)
         return np.asarray(self.edge_optical_depth[layer] + self.attenuation[layer] * (z - self.layer_tops[layer]))
 
+    def depth_of(self, optical_depth: float) -> float:
+        """Return the depth [m] down to which the water has an optical depth; the last layer's edge if it never has."""
+        layer = int(np.searchsorted(self.edge_optical_depth, optical_depth, side="right")) - 1
+        edge, attenuation = self.edge_optical_depth[layer], self.attenuation[layer]
+        return float(self.layer_tops[layer] + ((optical_depth - edge) / attenuation if attenuation > 0 else 0.0))
+
     def optical_depth_of_scattering(self, depth: npt.ArrayLike) -> FloatArray:
         """Vertical optical depth of scattering from z = 0 to `depth` [m], not negative."""
         ends = np.clip(np.asarray(depth, dtype=np.float64)[..., np.newaxis], self.layer_tops, self._layer_ends)

@@ -71,9 +71,9 @@ class ShotScene:
         derivatives: Sequence[str] | str = (),
         check: bool = True,
     ) -> None:
+        from mitransient_lidar.rendering.accuracy import ErrorWindow
         from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
         from mitransient_lidar.rendering.describe import describe_scene
-        from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shots.batches import check_size
         from mitransient_lidar.transport.path_classes import check_solids
@@ -100,11 +100,10 @@ class ShotScene:
         self.companions = self._find_companions()
         bins = self.lidar.receiver.pixels.count, self.lidar.axis.bin_count
         check_size(len(places), *bins, renderer.classes.count if components else 0, len(self.parameters))
-        probe = probe_echoes(self.lidar, renderer.sampler)
-        self.window = error_window(self.lidar, probe)
+        self.window = ErrorWindow.of_probe(renderer.probe)
         if check:
-            check_scene(self.lidar, renderer.sampler, probe)
-        self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
+            check_scene(renderer.probe)
+        self._described = describe_scene(renderer.probe, self.window, self._renderer.focusing)
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""

@@ -172,7 +172,7 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     Places, slopes and depths as of `shots.series.render_shots`, and in scenes with water its coefficients
     (`water_means`).
     """
-    from mitransient_lidar.rendering.describe import axis_on_bottom
+    from mitransient_lidar.transport.probe import axis_on_bottom
 
     places = shots.places
     turns = np.zeros(len(places))
@@ -182,7 +182,10 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     rows = zip(places, turns, strict=True)
     along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y, turn) for (x, y), turn in rows]).T
     own = lidar.receiver.pose
-    found = -axis_on_bottom(lidar, places - own.in_scene(own.ground_point())[:2], shots.in_scene)[:, 2]
+    origins, axes = own.origin + np.pad(places - own.in_scene(own.ground_point())[:2], ((0, 0), (0, 1))), own.axis
+    if shots.in_scene is not None:
+        origins, axes = shots.in_scene.origin - lidar.frame_origin, shots.in_scene.axis
+    found = -axis_on_bottom(lidar, origins, axes)[:, 2]
     # Rays in single precision are known to a tenth of a millimetre.
     depth = np.round(found, 4)
     values = {
@@ -230,28 +233,18 @@ def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
     return {name: np.asarray(shares @ values) for name, values in layers.items()}
 
 
-def solids_below(
-    lidar: LidarScene, x: FloatArray, y: FloatArray, *, bottoms: bool = False
-) -> tuple[FloatArray, BoolArray]:
-    """Return the height of the highest solid, or bottom, at places [m], NaN without one, and whether it is a target.
+def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the height of the highest solid at places [m], NaN without one, and whether it is a target.
 
     Places in the scene have the shape (n,); targets are `WaterScene.targets`.
     """
-    import mitsuba as mi
+    from mitransient_lidar.transport.probe import first_along
 
-    from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque
-    from mitransient_lidar.transport.solids import met_shape, scene_of_shapes
-
-    shapes = lidar.bottoms if bottoms else lidar.solids
-    if not shapes:
-        return np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
-    solids = scene_of_shapes(shapes, lidar.groups)
-    top = opaque(float(solids.bbox().max.z) + 1.0)
-    at = zip((x, y), lidar.frame_origin[:2], strict=True)
-    place = mi.Point3f(*(aligned(mi.Float, (values - origin).astype(np.float32)) for values, origin in at), top)
-    si = solids.ray_intersect(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
-    valid, target = np.array(si.is_valid()), np.array(is_one_of(met_shape(si), lidar.targets) & mi.Bool(si.is_valid()))
-    return np.where(valid, np.array(si.p.z, dtype=np.float64), np.nan), target
+    heights = [float(z) for solid in lidar.solids for z in (solid.bbox().min.z, solid.bbox().max.z)]
+    places = np.stack([x, y], axis=1) - lidar.frame_origin[:2]
+    line = [np.insert(places, 2, z, axis=1) for z in (max(heights, default=0.0) + 1, min(heights, default=0.0) - 1)]
+    highest, target = (first_along(lidar, shapes, line)[:, 2] for shapes in (lidar.solids, lidar.targets))
+    return highest, highest == target
 
 
 def sea_of(scene: mi.Scene) -> SeaSurface | None:

@@ -16,8 +16,9 @@ from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries, reach_under_water
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings, cell_widths
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
+from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS
 
 #: Points from the surface to the bottom, or to the depth that the end of the record allows. In images, half as many
 #: points take a third less time and increase the water's variance by a half: more paths are better there.
@@ -168,12 +169,13 @@ class MergingLayout:
         return replace(self, cells=cells, patches=replace(self.patches, scene=scene, rings=rings, uneven=uneven))
 
     @classmethod
-    def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
-        """Choose points and cells for a scene."""
+    def of_probe(cls, probe: Probe, options: MergingOptions) -> MergingLayout:
+        """Choose points and cells for the scene of a probe."""
+        scene = probe.scene
         if scene.submerged:
-            region, reach, nearest = reach_under_water(scene, sampler)
+            region, reach, nearest = reach_under_water(probe)
         else:
-            region = Region.of_scene(scene, sampler)
+            region = Region.of_probe(probe)
             reach = region.track_length(scene)
         finest = options.point_spacing or reach / _POINTS_PER_PATH
         is_image = scene.receiver.pixels.count >= IMAGE_PIXELS

@@ -11,12 +11,13 @@ import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
-from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
+from mitransient_lidar.transport.merging.region import Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index, shape_number
+from mitransient_lidar.transport.probe import PROBE_RAYS
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import met_shape
+from mitransient_lidar.transport.solids import box_of, met_shape
 
 #: Logarithm to base 2 of the largest number of buckets of a shot along one side.
 MOST_SIDE_BITS = 9
@@ -260,7 +261,7 @@ class SolidPatches:
 
     def _near_others(self, solids: Sequence[mi.Shape]) -> BoolArray:
         """Return which solids others may cover closely: boxes about both are less than a level apart."""
-        boxes = np.array([[solid.bbox().min, solid.bbox().max] for solid in solids], np.float64).reshape(-1, 2, 3)
+        boxes = np.reshape([box_of(solid) for solid in solids], (-1, 2, 3))
         distance = 0.5 * _LEVEL_WIDTHS * max(self.width * self.widening, self.least)
         low, high = boxes[:, 0] - distance, boxes[:, 1] + distance
         meets = np.all((low[:, None] < high) & (low < high[:, None]), axis=-1)

@@ -11,14 +11,10 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point
-from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.rng import Lanes, pass_streams, starts, unit_points
+from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
+from mitransient_lidar.transport.rng import Lanes, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSample, SensorSampler
-
-#: Number of rays that find the region and the solids below it.
-PROBE_RAYS = 4096
 
 #: Number of rays that find where the beam of each shot meets the sea.
 _ENTRY_RAYS = 64
@@ -57,20 +53,16 @@ class Region:
     high: tuple[float, float]
 
     @classmethod
-    def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
+    def of_probe(cls, probe: Probe) -> Region:
         """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
-        seen, tangents = _view_and_beam(scene, sampler)
-        places = [
-            meet_sea(scene, scene.receiver.pose, seen.angles)[np.array(seen.weight) > 0],
-            meet_sea(scene, scene.transmitter.pose, tangents),
-        ]
+        places = [rays.sea_places for rays in (probe.view, probe.beam)]
         places = [place[np.isfinite(place[:, 0]), :2] for place in places]
         ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
         if not ends:
             raise UserError("laser and receiver look above the horizon: at least one must look down at the sea")
         low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
         if len(places[0]):
-            beside = _BESIDE_PER_VIEW * np.ptp(ends[0], axis=0) + _BESIDE_PER_LENGTH * _longest_way(scene)
+            beside = _BESIDE_PER_VIEW * np.ptp(ends[0], axis=0) + _BESIDE_PER_LENGTH * _longest_way(probe.scene)
             low, high = np.maximum(low, ends[0][0] - beside), np.minimum(high, ends[0][1] + beside)
         return cls.between(low, high, _REGION_MARGIN * (high - low))
 
@@ -123,33 +115,22 @@ class Region:
         )
 
 
-def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region, float, float]:
+def reach_under_water(probe: Probe) -> tuple[Region, float, float]:
     """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
 
     Rays end at the first surface, or where their light returns at the end of the record.
     """
-    seen, tangents = _view_and_beam(scene, sampler)
-    beam = scene.transmitter.pose.direction(*tangents)
-    longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
-    places, lengths = [], np.full(1, longest)
-    shortest = longest
-    for pose, direction in ((scene.receiver.pose, seen.direction), (scene.transmitter.pose, beam)):
-        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), direction))
-        length = dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), longest)
-        lengths = np.array(length, dtype=np.float64)
-        solid = si.is_valid() & ~scene.is_surface(si.shape)
-        shortest = min(shortest, float(np.min(np.where(np.array(solid), lengths, np.inf))))
-        places += [pose.origin[:2], np.array(opaque_point(pose.origin) + direction * length).T[:, :2]]
+    scene = probe.scene
+    shortest = longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
+    places = []
+    for rays in (probe.view, probe.beam):
+        lengths = np.minimum(rays.ranges, longest)
+        shortest = min(shortest, float(lengths[rays.on_solid].min(initial=longest)))
+        places += [rays.pose.origin[:2], (rays.pose.origin + rays.directions * lengths[:, None])[:, :2]]
     points = np.vstack(places)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = np.maximum(_REGION_MARGIN * (high - low), _LEAST_MARGIN)
     return Region.between(low, high, margin), float(lengths.mean()), shortest
-
-
-def _view_and_beam(scene: LidarScene, sampler: SensorSampler) -> tuple[SensorSample, mi.Point2f]:
-    """Return samples of the view, and tangent-plane angles of the beam."""
-    seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
-    return seen, mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
 
 
 def _longest_way(scene: LidarScene) -> float:
@@ -158,19 +139,6 @@ def _longest_way(scene: LidarScene) -> float:
     spot = transmitter.ground_point()
     air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
     return max((scene.axis.path_end - air) / (2 * scene.group_index), 0.1)
-
-
-def meet_sea(scene: LidarScene, pose: KernelPose, angles: mi.Point2f) -> FloatArray:
-    """Return where rays from a pose at tangent-plane angles meet the sea, or else its mean level [m], shape (n, 3).
-
-    NaN for rays that do not go down.
-    """
-    direction = pose.direction(*angles)
-    start, _ = scene.first_points(pose, angles, direction)
-    si = scene.ray_intersect(mi.Ray3f(start, direction))
-    level = start - direction * (start.z / direction.z)
-    point = dr.select(si.is_valid() & scene.is_surface(si.shape), si.p, level)
-    return np.where(np.array(direction.z)[:, None] < 0, np.array(point, np.float64).T, np.nan)
 
 
 def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
@@ -182,8 +150,8 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
     moved = lanes.pick(scene)
     pose = moved.transmitter_pose
     angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
-    direction = np.array(pose.direction(*angles), np.float64).T
-    height = meet_sea(moved, pose, angles)[:, 2]
+    rays = Rays(moved, pose, angles, pose.direction(*angles), mi.Bool(True))
+    height, direction = rays.sea_places[:, 2], rays.directions
     offset = np.where(np.isfinite(height), height / direction[:, 2], 0.0)[:, None] * direction
     found: FloatArray = offset.reshape(shots, -1, 3).mean(axis=1)
     if scene.transmitter_poses is None:
@@ -265,7 +233,8 @@ class SurfaceHeights:
         index, scene = lanes.number, lanes.pick(scene)
         x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
         y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
-        top = max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0
+        assert scene.sea_heights is not None
+        top = scene.sea_heights[1] + 1.0
         under_water = False
         if scene.parts:
             highest_solid, lowest_sea = scene.empty_heights

@@ -66,7 +66,7 @@ class MergingRenderer(PassRenderer):
         pixels = scene.receiver.pixels.count
         super().__init__(scene, classes, paths_of_pass(options, pixels))
         self.photons = options.photons_per_pass or (_PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else PHOTONS)
-        self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_scene(scene, self.sampler, options)
+        self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_probe(self.probe, options)
         self._connections = connections
         self._beam = BeamSampler(scene.transmitter, scene.receiver, self.layout.spread)
 

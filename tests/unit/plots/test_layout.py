@@ -16,13 +16,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plots.layout import axis_points, plot_layout
 from mitransient_lidar.rendering.describe import describe_layout
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 HALF = 15.0  # mrad
 
 
 def described(scene):
-    return describe_layout(find_lidar_scene(scene, scene.sensors()[0]))
+    return describe_layout(Probe(find_lidar_scene(scene, scene.sensors()[0])))
 
 
 def result(attributes, pixels=4, grid=None, energy=None, centres=None):

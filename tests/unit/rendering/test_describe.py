@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from oracles.refracted_path import refracted_path
 
-from mitransient_lidar.rendering.describe import axis_on_bottom, describe_layout
+from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
+from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.snell import refract
 
@@ -19,7 +20,7 @@ TRIANGLE = {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "20 0, 26 
 
 
 def described(scene):
-    return describe_layout(find_lidar_scene(scene, scene.sensors()[0]))
+    return describe_layout(Probe(find_lidar_scene(scene, scene.sensors()[0])))
 
 
 def lines(text):
@@ -152,7 +153,8 @@ def test_bottom_is_every_wide_solid_and_no_other(lidar_scene):
     assert sorted(solid.id() for solid in scene.bottoms) == ["far", "near"]
     assert sorted(solid.id() for solid in scene.targets) == ["mine", "pipe"]
     # Past mine and pipe, on either side of the step, and beside everything.
-    points = axis_on_bottom(scene, [(0.0, 0.0), (0.0, 3.0 - 1e-3), (-5.0, 0.0), (500.0, 0.0)])
+    shifts = np.array([(0.0, 0.0, 0.0), (0.0, 3.0 - 1e-3, 0.0), (-5.0, 0.0, 0.0), (500.0, 0.0, 0.0)])
+    points = axis_on_bottom(scene, scene.receiver.pose.origin + shifts, scene.receiver.pose.axis)
     np.testing.assert_allclose(points[:, 2], [-8, -8, -6, np.nan], atol=1e-3)
     np.testing.assert_allclose(points[0, :2], [2.1119, 0], atol=1e-3)
     wide = lidar_scene(bottom=None, extra={"mine": mine})

@@ -11,7 +11,6 @@ from oracles.echo_times import bottom_time_ns
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
-from mitransient_lidar.rendering.echo_window import probe_echoes
 from mitransient_lidar.rendering.scene_checks import check_scene
 
 THETA, N = np.radians(20), 1.34
@@ -24,7 +23,7 @@ def check(scene, caplog, integrator="lidar_merging"):
     """Return the warnings of the checks of a scene."""
     renderer = mi.load_dict({"type": integrator}).prepare(scene, scene.sensors()[0])
     with caplog.at_level(logging.WARNING):
-        check_scene(renderer.scene, renderer.sampler, probe_echoes(renderer.scene, renderer.sampler))
+        check_scene(renderer.probe)
     return [record.getMessage() for record in caplog.records]
 
 
@@ -61,7 +60,7 @@ def test_solid_in_the_air_is_told_as_that(lidar_scene, caplog, centre, told):
     (message,) = check(scene, caplog)
     assert told in message
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    assert probe_echoes(renderer.scene, renderer.sampler).missed_beam == 0
+    assert renderer.probe.echoes.missed_beam == 0
 
 
 @pytest.mark.slow

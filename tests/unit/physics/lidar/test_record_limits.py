@@ -10,8 +10,9 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.physics.lidar.record_limits import ColumnDecay, Cone, LidarView, Solid
+from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 NS = 1e9 / C0
 N, GROUP = 1.34, 1.364
@@ -28,7 +29,8 @@ def cone(off_nadir_deg=20.0, half_mrad=15.0, altitude=200.0, x=0.0, is_round=Tru
 
 def water(attenuation=0.1, boundaries=(), indices=(N,), group=(GROUP,), tops=(0.0,)):
     values = np.broadcast_to(attenuation, len(tops)).astype(np.float64)
-    return LevelSea(tuple(indices), tuple(boundaries), tuple(group)), ColumnDecay(np.array(tops), values)
+    column = WaterColumn(np.array(tops), values, 0 * values, 0 * values)
+    return LevelSea(tuple(indices), tuple(boundaries), tuple(group)), column
 
 
 def plane(depth, slope=0.0, size=5000.0, name="bottom"):
@@ -143,7 +145,7 @@ def test_the_column_falls_through_layers():
     _, layers = water((0.5, 0.3, 0.1), tops=(0.0, 4.0, 14.0))
     depth = 14 + (0.5 * math.log(1e6) - 5.0) / 0.1
     assert layers.depth_of(0.5 * math.log(1e6)) == pytest.approx(depth)
-    assert layers.to(depth) == pytest.approx(0.5 * math.log(1e6))
+    assert layers.cumulative(depth) == pytest.approx(0.5 * math.log(1e6))
     assert water((0.5, 0.0), tops=(0.0, 4.0))[1].depth_of(10.0) == 4.0
     assert water(0.0)[1].depth_of(10.0) == 0.0
 

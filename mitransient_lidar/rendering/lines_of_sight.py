@@ -1,10 +1,9 @@
-"""Expected arrival of the echoes of a scene, estimated with rays, and lines of sight of the pixels."""
+"""Lines of sight of the pixels over a level sea."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -13,185 +12,15 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.results.geometry import LinesOfSight
-from mitransient_lidar.transport.opaque import aligned, shape_number
-from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.snell import refract
-from mitransient_lidar.transport.solids import met_numbers
-
-#: Number of rays, and share of the beam excluded at either end of an echo.
-_RAYS = 2**16
-_TAIL = 0.05
-
-#: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
-_MOST_PIXELS = 1024
 
 #: Points of a lattice for lines of sight: the fewest, those per pixel, and the most.
 _POINTS, _POINTS_PER_PIXEL, _MOST_POINTS = 2**14, 8, 2**20
 
 #: Depth at which the scale of depth is taken, relative to the height of the lower instrument, and its limit [m].
 _RELATIVE_DEPTH, _DEEPEST = 0.05, 10.0
-
-
-@dataclass(frozen=True)
-class SolidEcho:
-    """Mean and latest arrival of the direct echo of a solid over all pixels [ns]."""
-
-    shape: mi.Shape
-    mean_ns: float
-    latest_ns: float
-
-
-@dataclass(frozen=True)
-class EchoProbe:
-    """Expected arrival of echoes, weighted by the laser's beam.
-
-    Attributes
-    ----------
-    surface_ns, bottom_ns
-        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo of the first solid under
-        water [ns], shape (pixels, 2) each; NaN without one.
-    missed_beam
-        Share of the beam inside the field of view that passes outside the surface mesh, without what solids in the air
-        intercept.
-    pierced
-        Solids visible in the air that reach below the crests of the sea; bottoms if also visible through the sea.
-    solids
-        Echoes of the solids that rays of beam and view meet, in the air and under water.
-    """
-
-    surface_ns: NDArray[np.float64]
-    bottom_ns: NDArray[np.float64]
-    missed_beam: float
-    pierced: list[mi.Shape]
-    solids: list[SolidEcho]
-
-
-def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
-    """Trace rays through the facets of the surface, without ripples and scattering."""
-    start = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
-    laser, receiver = (scene.relative(each.pose) for each in (scene.transmitter, scene.receiver))
-    ray = mi.Ray3f(scene.first_points(scene.receiver.pose, start.angles, start.direction)[0], start.direction)
-    first = scene.ray_intersect(ray, start.weight > 0)
-    at_sea = first.is_valid() & scene.is_surface(first.shape)
-    of_laser = scene.transmitter.pose.tangent(start.direction) if _at_one_place(scene) else laser.tangent(first.p)
-    beam = start.weight * scene.transmitter.intensity_at(*of_laser)
-    # Relative to the reference length, as all lengths here. Under water the first hit is the sea's or a solid's echo.
-    air = laser.distance(first.p) + receiver.distance(first.p)
-    if scene.submerged:
-        places = [mi.Point3f(each.pose.origin.tolist()) for each in (scene.transmitter, scene.receiver)]
-        air += (scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
-
-    # Refract at the facet.
-    down = -dr.normalize(refract(-start.direction, first.n, 1 / scene.refractive_index))
-    below = scene.ray_intersect(scene.spawn_ray(first, down), at_sea)
-    solid = at_sea & below.is_valid() & ~scene.is_surface(below.shape)
-    water = 2 * below.t * scene.group_index
-    if scene.submerged:
-        below, solid, water = first, first.is_valid() & ~at_sea, mi.Float(0)
-    # At once: each array that is read alone would trace all rays again.
-    dr.eval(start, beam, first, below, at_sea, solid, air, water)
-
-    pixel, weight = np.array(start.pixel), np.array(beam, dtype=np.float64)
-    surface, pixels = np.array(at_sea), scene.receiver.pixels.count
-    # Solids visible outside a small surface mesh lie lower.
-    in_air = first.is_valid() & ~at_sea & (first.p.z > min(_heights(scene, "min"), default=0.0))
-    count = pixels if pixels <= _MOST_PIXELS else 1
-    pixel = pixel if count > 1 else np.zeros_like(pixel)
-
-    def time_ns(length: mi.Float) -> FloatArray:
-        return np.asarray((np.array(length, dtype=np.float64) + scene.reference_length) * 1e9 / C0)
-
-    arrivals = (
-        _quantiles(time_ns(air), weight * surface, pixel, count, (_TAIL, None)),
-        _quantiles(time_ns(air + water), weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
-    )
-    outside = ~surface & ~np.array(in_air) if scene.surfaces and not scene.submerged else np.zeros_like(surface)
-    missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
-    surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
-    met = np.where(np.array(solid), met_numbers(below), met_numbers(first))
-    length = air + dr.select(solid, water, 0)
-    of_solid = solid | (first.is_valid() & ~at_sea)
-    solids = _solid_echoes(scene, met, time_ns(length), weight * np.array(of_solid))
-    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, in_air, solid), solids)
-
-
-def _solid_echoes(
-    scene: LidarScene, numbers: NDArray[np.integer], times_ns: NDArray[np.floating], weight: NDArray[np.float64]
-) -> list[SolidEcho]:
-    """Return the echoes of the solids, by their numbers, that rays of some weight meet."""
-    echoes, met = [], {*numbers[weight > 0].tolist()}
-    for solid in scene.solids:
-        if shape_number(solid) not in met:
-            continue
-        own = weight * (numbers == shape_number(solid))
-        mean, latest = _quantiles(times_ns, own, np.zeros(len(own), dtype=np.int64), 1, (None, 1 - _TAIL))[0]
-        if np.isfinite(mean):
-            echoes.append(SolidEcho(solid, float(mean), float(latest)))
-    return echoes
-
-
-def _pierced(
-    scene: LidarScene,
-    first: mi.SurfaceInteraction3f,
-    below: mi.SurfaceInteraction3f,
-    in_air: mi.Bool,
-    under_water: mi.Bool,
-) -> list[mi.Shape]:
-    """Return the solids that rise through the sea in the field of view."""
-    crest, bottoms = max(_heights(scene, "max"), default=-np.inf), scene.bottoms
-    above, lower = (
-        {*met_numbers(hit)[np.array(active)].tolist()} for hit, active in ((first, in_air), (below, under_water))
-    )
-    return [
-        solid
-        for solid in scene.solids
-        if float(solid.bbox().min.z) <= crest
-        and shape_number(solid) in above
-        # A receiver may look at the land alone.
-        and (shape_number(solid) in lower or not any(solid is bottom for bottom in bottoms))
-    ]
-
-
-def _heights(scene: LidarScene, end: str) -> list[float]:
-    """Return the lowest (``min``) or highest (``max``) points of the surfaces of a scene [m]."""
-    return [float(getattr(surface.bbox(), end).z) for surface in scene.surfaces]
-
-
-def _quantiles(
-    values: NDArray[np.floating],
-    weight: NDArray[np.float64],
-    pixel: NDArray[np.integer],
-    count: int,
-    wanted: tuple[float | None, float | None],
-) -> NDArray[np.float64]:
-    """Return weighted quantiles (None: the mean) for each pixel, shape (pixels, 2)."""
-    result = np.full((count, 2), np.nan)
-    seen = weight > 0
-    order = np.lexsort((values[seen], pixel[seen]))
-    values, weight, pixel = values[seen][order], weight[seen][order], pixel[seen][order]
-    edges = np.searchsorted(pixel, np.arange(count + 1))
-    for index in np.flatnonzero(np.diff(edges)):
-        part = slice(edges[index], edges[index + 1])
-        cumulative = np.cumsum(weight[part])
-        for column, share in enumerate(wanted):
-            if share is None:
-                result[index, column] = np.average(values[part], weights=weight[part])
-            else:
-                result[index, column] = values[part][np.searchsorted(cumulative, share * cumulative[-1])]
-    return result
-
-
-def error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
-    """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
-    time_ns = lidar.axis.centres_ns
-    start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns
-    # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
-    start = np.where(np.isnan(start), time_ns[0], start)
-    return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
 
 def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
@@ -313,11 +142,6 @@ def _lattice(count: int) -> mi.Point2f:
 def _choices(count: int) -> mi.Float:
     """Return evenly distributed numbers from 0 to 1, independent of the points of `_lattice`."""
     return aligned(mi.Float, (np.arange(count) * 0.4142135623730951) % 1)
-
-
-def _at_one_place(scene: LidarScene) -> bool:
-    """Return whether transmitter and receiver are at one place."""
-    return bool(np.all(scene.transmitter.pose.origin == scene.receiver.pose.origin))
 
 
 def _two_way(

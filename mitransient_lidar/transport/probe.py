@@ -1,0 +1,334 @@
+"""One look ahead: where the rays of a view and a beam meet the sea, the solids or a height, and when echoes come."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import BoolArray, FloatArray
+from mitransient_lidar.transport.opaque import aligned, shape_number
+from mitransient_lidar.transport.plugin_types import Transmitter
+from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.scene import LidarScene, WaterScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.snell import refract
+from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
+
+#: Rays of a view and of a beam; those of a Gaussian beam reach 4.2 standard deviations.
+PROBE_RAYS = 4096
+
+#: Distance outside view or beam within which waves and scattering still light a shape, over its depth.
+_REACH_PER_DEPTH = 0.3
+
+#: Number of rays that find echoes, and share of the beam excluded at either end of an echo.
+_ECHO_RAYS, _TAIL = 2**16, 0.05
+
+#: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
+_MOST_PIXELS = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays of a view or of a beam.
+
+    Attributes
+    ----------
+    scene, pose
+        Scene, and pose from which the rays start.
+    angles, direction
+        Tangent-plane angles and unit directions.
+    seen
+        Which rays count: of a view those that pixels see, of a beam all.
+    """
+
+    scene: WaterScene
+    pose: KernelPose
+    angles: mi.Point2f
+    direction: mi.Vector3f
+    seen: mi.Bool
+
+    @classmethod
+    def of_view(cls, scene: WaterScene, sampler: SensorSampler) -> Rays:
+        """Return rays of the field of view."""
+        start = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+        seen = start.weight > 0
+        dr.eval(start, seen)
+        return cls(scene, scene.receiver.pose, start.angles, start.direction, seen)
+
+    @classmethod
+    def of_beam(cls, scene: WaterScene, transmitter: Transmitter) -> Rays:
+        """Return rays of the laser, of equal energy."""
+        angles, pose = mi.Point2f(transmitter.sample_tangent(unit_points(PROBE_RAYS))), transmitter.pose
+        return cls(scene, pose, angles, pose.direction(*angles), mi.Bool(True))
+
+    @cached_property
+    def first(self) -> mi.SurfaceInteraction3f:
+        """What the rays meet first; nothing for those that do not count."""
+        start, _ = self.scene.first_points(self.pose, self.angles, self.direction)
+        return self.scene.ray_intersect(mi.Ray3f(start, self.direction), self.seen)
+
+    @cached_property
+    def on_sea(self) -> mi.Bool:
+        """Whether that is the sea."""
+        return self.first.is_valid() & self.scene.is_surface(self.first.shape)
+
+    @cached_property
+    def below(self) -> mi.SurfaceInteraction3f:
+        """What the rays meet after refraction by the facets of the sea, without ripples."""
+        down = -dr.normalize(refract(-self.direction, self.first.n, 1 / self.scene.refractive_index))
+        return self.scene.ray_intersect(self.scene.spawn_ray(self.first, down), self.on_sea)
+
+    @cached_property
+    def on_solid(self) -> BoolArray:
+        """Whether the rays that count meet a solid first, shape (n,)."""
+        return self._counted(self.first.is_valid() & ~self.on_sea) > 0
+
+    @cached_property
+    def ranges(self) -> FloatArray:
+        """Distances to what the rays that count meet first [m], infinite for those that meet nothing."""
+        return self._counted(dr.select(self.first.is_valid(), self.first.t, dr.inf))
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """Unit directions of the rays that count, shape (n, 3)."""
+        return self._counted(self.direction)
+
+    @cached_property
+    def sea_places(self) -> FloatArray:
+        """Where the rays that count meet the sea, or else its level [m], shape (n, 3); NaN if they do not go down."""
+        start, _ = self.scene.first_points(self.pose, self.angles, self.direction)
+        level = start - self.direction * (start.z / self.direction.z)
+        point = dr.select(self.on_sea, self.first.p, level)
+        return np.where(self.directions[:, 2:] < 0, self._counted(point), np.nan)
+
+    def _counted(self, values: mi.Float | mi.Vector3f) -> FloatArray:
+        """Return values of the rays that count, rays first."""
+        array = np.array(values, dtype=np.float64).T
+        return np.asarray(array[np.broadcast_to(np.array(self.seen), len(array))])
+
+    def at_height(self, z: float) -> FloatArray:
+        """Return where the rays meet a height after refraction by a level sea, x, y [m], without those that do not."""
+        places = self.scene.level_sea.at_height(self.pose.origin, self.directions, z)
+        return places[np.isfinite(places).all(axis=1)]
+
+    def axis_at_height(self, z: float | FloatArray) -> FloatArray:
+        """Return where the axis meets heights after refraction by a level sea, x, y [m]; NaN if it does not."""
+        axes = np.broadcast_to(self.pose.axis, (*np.shape(z), 3))
+        return self.scene.level_sea.at_height(self.pose.origin, axes, z)
+
+    def middle_height(self, shape: mi.Shape) -> float:
+        """Return the mean height of a shape's bounding box, at most half of that of the pose [m]."""
+        return float(min(0.5 * (shape.bbox().min.z + shape.bbox().max.z), 0.5 * self.pose.origin[2]))
+
+    def covered_by(self, shape: mi.Shape) -> bool:
+        """Return whether all rays meet the bounding box of a shape at its mean height."""
+        places = self.at_height(self.middle_height(shape))
+        return len(places) == len(self.directions) and not gaps(places, shape).any()
+
+    def meets(self, shape: mi.Shape) -> bool:
+        """Return whether rays, or light that waves or scattering deflect, may meet a shape's box at three heights."""
+        low, high = box_of(shape)
+        heights = np.minimum([low[2], 0.5 * (low[2] + high[2]), high[2]], 0.5 * self.pose.origin[2])
+        found = (gaps(places, shape) for z in heights if len(places := self.at_height(z)))
+        nearest = min((float(each.min()) for each in found), default=np.inf)
+        return nearest <= _REACH_PER_DEPTH * max(-float(low[2]), 0.0)
+
+
+def gaps(places: FloatArray, shape: mi.Shape) -> FloatArray:
+    """Return the horizontal distances of places (x, y), shape (n, 2), from the bounding box of a shape [m]."""
+    low, high = box_of(shape)
+    outside = np.maximum(np.maximum(low[:2] - places, places - high[:2]), 0)
+    return np.asarray(np.hypot(*outside.T))
+
+
+@dataclass(frozen=True)
+class SolidEcho:
+    """Mean and latest arrival of the direct echo of a solid over all pixels [ns]."""
+
+    shape: mi.Shape
+    mean_ns: float
+    latest_ns: float
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Expected arrival of echoes, weighted by the laser's beam.
+
+    Attributes
+    ----------
+    surface_ns, bottom_ns
+        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo of the first solid under
+        water [ns], shape (pixels, 2) each; NaN without one.
+    missed_beam
+        Share of the beam inside the field of view that passes outside the surface mesh, without what solids in the air
+        intercept.
+    pierced
+        Solids visible in the air that reach below the crests of the sea; bottoms if also visible through the sea.
+    solids
+        Echoes of the solids that rays of beam and view meet, in the air and under water.
+    """
+
+    surface_ns: FloatArray
+    bottom_ns: FloatArray
+    missed_beam: float
+    pierced: list[mi.Shape]
+    solids: list[SolidEcho]
+
+
+class Probe:
+    """Look ahead of a lidar, made once for a scene.
+
+    Attributes
+    ----------
+    scene
+        The scene; of several shots that of the first one.
+    sampler
+        Sampler of the rays of its view.
+    """
+
+    def __init__(self, scene: LidarScene) -> None:
+        self.scene, self.sampler = scene, SensorSampler(scene.receiver, scene.transmitter)
+
+    @cached_property
+    def view(self) -> Rays:
+        """Rays of the view."""
+        return Rays.of_view(self.scene, self.sampler)
+
+    @cached_property
+    def beam(self) -> Rays:
+        """Rays of the beam."""
+        return Rays.of_beam(self.scene, self.scene.transmitter)
+
+    @cached_property
+    def echoes(self) -> Echoes:
+        """Expected echoes, found with rays through the facets of the surface, without ripples and scattering."""
+        scene, transmitter = self.scene, self.scene.transmitter
+        start = self.sampler.sample(dr.arange(mi.UInt32, _ECHO_RAYS), _ECHO_RAYS, pass_streams(0, 0, _ECHO_RAYS))
+        rays = Rays(scene, scene.receiver.pose, start.angles, start.direction, start.weight > 0)
+        laser, receiver = (scene.relative(each.pose) for each in (transmitter, scene.receiver))
+        first, below, on_sea = rays.first, rays.below, rays.on_sea
+        at_one_place = bool(np.all(transmitter.pose.origin == scene.receiver.pose.origin))
+        of_laser = transmitter.pose.tangent(start.direction) if at_one_place else laser.tangent(first.p)
+        beam = start.weight * transmitter.intensity_at(*of_laser)
+        # Relative to the reference length, as all lengths here.
+        length = laser.distance(first.p) + receiver.distance(first.p)
+        solid = on_sea & below.is_valid() & ~scene.is_surface(below.shape)
+        water = 2 * below.t * scene.group_index
+        if scene.submerged:
+            # What rays meet first is the sea's or a solid's echo.
+            places = [mi.Point3f(each.pose.origin.tolist()) for each in (transmitter, scene.receiver)]
+            length += (scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
+            below, solid, water = first, first.is_valid() & ~on_sea, mi.Float(0)
+        # At once: each array that is read alone would trace all rays again.
+        dr.eval(start, beam, first, below, on_sea, solid, length, water)
+
+        def time_ns(length: mi.Float) -> FloatArray:
+            return np.asarray((np.array(length, dtype=np.float64) + scene.reference_length) * 1e9 / C0)
+
+        weight, pixels = np.array(beam, dtype=np.float64), scene.receiver.pixels.count
+        count = pixels if pixels <= _MOST_PIXELS else 1
+        pixel = np.array(start.pixel) if count > 1 else np.zeros(_ECHO_RAYS, dtype=np.int64)
+        surface, under_water = np.array(on_sea), np.array(solid)
+        times, later = time_ns(length), time_ns(length + water)
+        surface_ns = _quantiles(times, weight * surface, pixel, count, (_TAIL, None))
+        bottom_ns = _quantiles(later, weight * under_water, pixel, count, (None, 1 - _TAIL))
+        lowest, crest = scene.sea_heights or (0.0, -np.inf)
+        dry = np.array(first.is_valid() & ~on_sea)
+        # Solids visible outside a small surface mesh lie lower.
+        in_air = dry & np.array(first.p.z > lowest)
+        outside = ~surface & ~in_air if scene.surfaces and not scene.submerged else np.zeros_like(surface)
+        missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
+        numbers = [met_numbers(hit) for hit in (first, below)]
+        pierced, solids, bottoms = [], [], scene.bottoms
+        met_by_any = {*np.unique(numbers).tolist()}
+        for shape in scene.solids:
+            if (own := shape_number(shape)) not in met_by_any:
+                continue
+            is_first, is_below = (each == own for each in numbers)
+            met = np.where(under_water, is_below, dry & is_first)
+            arrivals = _quantiles(np.where(under_water, later, times), weight * met, 0 * pixel, 1, (None, 1 - _TAIL))
+            if np.isfinite(arrivals[0, 0]):
+                solids.append(SolidEcho(shape, *arrivals[0].tolist()))
+            # A receiver may look at the land alone.
+            is_seen = not any(shape is bottom for bottom in bottoms) or np.any(under_water & is_below)
+            if float(shape.bbox().min.z) <= crest and np.any(in_air & is_first) and is_seen:
+                pierced.append(shape)
+        surface_ns, bottom_ns = (np.broadcast_to(each, (pixels, 2)) for each in (surface_ns, bottom_ns))
+        return Echoes(surface_ns, bottom_ns, missed, pierced, solids)
+
+
+def _quantiles(
+    values: NDArray[np.floating],
+    weight: NDArray[np.float64],
+    pixel: NDArray[np.integer],
+    count: int,
+    wanted: tuple[float | None, float | None],
+) -> NDArray[np.float64]:
+    """Return weighted quantiles (None: the mean) for each pixel, shape (pixels, 2)."""
+    result = np.full((count, 2), np.nan)
+    seen = weight > 0
+    order = np.lexsort((values[seen], pixel[seen]))
+    values, weight, pixel = values[seen][order], weight[seen][order], pixel[seen][order]
+    edges = np.searchsorted(pixel, np.arange(count + 1))
+    for index in np.flatnonzero(np.diff(edges)):
+        part = slice(edges[index], edges[index + 1])
+        cumulative = np.cumsum(weight[part])
+        for column, share in enumerate(wanted):
+            if share is None:
+                result[index, column] = np.average(values[part], weights=weight[part])
+            else:
+                result[index, column] = values[part][np.searchsorted(cumulative, share * cumulative[-1])]
+    return result
+
+
+def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return where axes, refracted by a level sea, first meet a bottom (`WaterScene.bottoms`).
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    origins, axes
+        Points in its frame from which the axes start [m], and their directions, shape (n, 3), or (3,) of all axes.
+
+    Returns
+    -------
+    ndarray
+        Points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
+    """
+    sea, bottoms = scene.level_sea, scene.bottoms
+    if not bottoms or np.any(axes[..., 2] >= 0):
+        return np.full(origins.shape, np.nan)
+    # Corners: start, sea level, boundaries of the index layers, and a point below everything.
+    lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
+    heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
+    directions = np.broadcast_to(axes, origins.shape)
+    corners = [np.insert(sea.at_height(origins, directions, z), 2, z, axis=1) for z in heights]
+    return first_along(scene, bottoms, [origins, *corners]) + scene.frame_origin
+
+
+def first_along(scene: WaterScene, shapes: Sequence[mi.Shape], corners: Sequence[FloatArray]) -> FloatArray:
+    """Return where lines through corners in the frame [m], shape (n, 3) each, first meet one of some shapes, or NaN."""
+    found = np.full(corners[0].shape, np.nan)
+    if not shapes:
+        return found
+    active, some = aligned(mi.Bool, np.ones(len(found), dtype=bool)), scene_of_shapes(shapes, scene.groups)
+    for start, end in itertools.pairwise(corners):
+        origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
+        ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
+        ray.maxt = dr.norm(leg)
+        hit = some.ray_intersect(ray, active)
+        ends = active & hit.is_valid()
+        at_end = np.array(ends)
+        found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
+        active &= ~ends
+    return found
