@@ -128,22 +128,6 @@ WATERS = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", WATERS)
-def test_waters(name):
-    """a and Kd within 10 %, bb within 17 %; of c no more than bounds. The estimate of the column shares no code.
-
-    Petzold's phase functions hold the molecules that the retrieval adds: bb of the second is 15 % low.
-    """
-    kind, kept = name.split()
-    params = {kind: kept, "bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
-    found = retrieve.water(mitransient_lidar.render("fig09_1x1", params=params, passes=4, seed=4))
-    true = water_of(kind, kept)
-    for quantity, limit in (("absorption", 0.1), ("kd", 0.1), ("backscattering", 0.17)):
-        assert float(found[quantity]) == pytest.approx(getattr(true, quantity), rel=limit)
-    assert found["attenuation_low"] < true.attenuation < found["attenuation_high"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WATERS)
 def test_waters_in_closed_form(name):
