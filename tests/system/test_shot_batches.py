@@ -12,7 +12,6 @@ from significance import assert_same, largest_z
 
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.transport.pose import KernelPose
@@ -79,7 +78,9 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
 
 def stacked(given):
     """Return poses as one."""
-    return KernelPose(*(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left")))
+    return KernelPose(
+        *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
+    )
 
 
 def alone_at(scene, params, pose, record, integrator):
@@ -207,5 +208,3 @@ def test_requested_errors_are_reached_and_hold():
     known = shares.std(ddof=1) / np.sqrt(len(shares))
     assert known < 0.03
     assert abs(shares.mean() - expected) < largest_z(len(shares)) * known
-
-

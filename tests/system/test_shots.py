@@ -13,7 +13,6 @@ from significance import largest_z
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import scenes
-from mitransient_lidar.plots.studies.find_shots import plot_found_shots
 from mitransient_lidar.studies import find_shots as shots
 from mitransient_lidar.studies import shot_statistics
 

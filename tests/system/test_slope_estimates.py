@@ -16,7 +16,6 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarS
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
