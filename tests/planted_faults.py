@@ -5,6 +5,7 @@ Run by hand, in the environment that the package is developed in::
     .venv/bin/python tests/planted_faults.py --check              # whether all faults still apply
     .venv/bin/python tests/planted_faults.py --control            # the whole measurement, in hours
     .venv/bin/python tests/planted_faults.py one_bin_late --tier quick
+    .venv/bin/python tests/planted_faults.py --near --tier quick  # tests of the same room, in minutes
 
 Progress goes to stderr and a Markdown table to stdout. A fault counts as found when a test fails that passes without
 it. Tests that cannot be collected or fail anyway, crashes of pytest and stages that take too long are errors. The
@@ -46,13 +47,14 @@ _WHERE = (
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: a text in a file that is replaced by another one, and the number of its places."""
+    """A fault: a text in a file that is replaced by another one, the number of its places, and tests of its room."""
 
     name: str
     file: str
     old: str
     new: str
     count: int = 1
+    near: str = ""
 
     def planted(self, text: str) -> str:
         """Return the faulty text of the file; end the script where the fault does not apply."""
@@ -64,6 +66,9 @@ class Fault:
 
 _T, _P = "mitransient_lidar/transport", "mitransient_lidar/physics"
 _M = f"{_T}/merging"
+_A, _R, _G = (f"mitransient_lidar/{name}" for name in ("analysis", "results", "plots"))
+_UNIT = "tests/unit"
+_FIGURES = f"{_UNIT}/plots/test_figures.py"
 
 FAULTS = (
     # Radiance is connected to the laser through the surface without the square of the refractive index.
@@ -155,6 +160,158 @@ FAULTS = (
     ),
     # Light that survives a reflection by a solid is weakened by its reflectance, too.
     Fault("roulette_without_compensation", f"{_T}/random_walk.py", "factor / survival, bs", "factor, bs"),
+    Fault(
+        *("far_row_below", f"{_G}/drawing.py"),
+        'origin="upper"',
+        'origin="lower"',
+        near=_FIGURES,
+    ),
+    # The axis of depths has its zero at the wrong side.
+    Fault(
+        *("depth_below_the_laser", f"{_G}/waveforms.py"),
+        "ax, -zero * metres_per_ns",
+        "ax, zero * metres_per_ns",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("left_of_layouts_on_the_right", f"{_G}/layout.py"),
+        "xlim=(high[0], low[0])",
+        "xlim=(low[0], high[0])",
+        near=_FIGURES,
+    ),
+    # The band of a series reaches as far above the mean as below it.
+    Fault(
+        *("even_bands", f"{_G}/drawing.py"),
+        "lowest), y + above",
+        "lowest), y + below",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("black_for_blue", f"{_G}/drawing.py"),
+        '"#1f5fd6", "#111111")',
+        '"#111111", "#1f5fd6")',
+        near=_FIGURES,
+    ),
+    Fault(
+        *("share_of_lost_bottoms", f"{_G}/campaigns.py"),
+        "(flags & _NO_ECHO) == 0",
+        "(flags & _NO_ECHO) != 0",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("gates_of_one_pulse", f"{_A}/gates/cut.py"),
+        "= train.pulses * time.bin_width_ns",
+        "= time.bin_width_ns",
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("depths_of_gate_starts", f"{_R}/gate_stack.py"),
+        "depth_of_time(train.middles_ns)",
+        "depth_of_time(train.starts_ns)",
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("ranges_from_gate_starts", f"{_A}/gates/range_images.py"),
+        '    middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values',
+        '    middles = stack["gate_start"].values',
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("other_gps_time", "mitransient_lidar/flights/las.py"),
+        '(_time_system(points) == "gps")',
+        '(_time_system(points) == "adjusted_gps")',
+        near=f"{_UNIT}/flights",
+    ),
+    Fault(
+        *("scan_angle_to_the_other_side", "mitransient_lidar/flights/las.py"),
+        "np.round(angle / _SCAN",
+        "np.round(-angle / _SCAN",
+        near=f"{_UNIT}/flights",
+    ),
+    Fault(
+        *("five_digits_in_tables", f"{_A}/waveforms/csv_tables.py"),
+        "{value:.9g}",
+        "{value:.5g}",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("last_bin_first_in_exr", f"{_R}/exr.py"),
+        "enumerate(images):",
+        "enumerate(images[::-1]):",
+        near=f"{_UNIT}/results",
+    ),
+    Fault(
+        *("attenuation_of_one_way", f"{_A}/waveforms/echo_table.py"),
+        "per_metre = 0.5 / waveforms",
+        "per_metre = 1.0 / waveforms",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("correction_added", f"{_A}/waveforms/depth_correction.py"),
+        'found["depth_m"] - correction',
+        'found["depth_m"] + correction',
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("turned_to_the_other_side", f"{_A}/waveforms/depth_correction.py"),
+        "azimuth[:, np.newaxis] - turn_deg",
+        "azimuth[:, np.newaxis] + turn_deg",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("slope_away_from_the_lidar", f"{_A}/retrieval/slope_corrections.py"),
+        "(a * np.sin(off_nadir)",
+        "(-a * np.sin(off_nadir)",
+        near=f"{_UNIT}/analysis/retrieval",
+    ),
+    Fault(
+        *("crest_behind_the_sea_level", f"{_A}/waveforms/surface_times.py"),
+        "(-height * per_metre",
+        "(height * per_metre",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("variances_of_area_exchanged", f"{_A}/detection/roc.py"),
+        "ddof=1) / m + np.var(below, ddof=1) / n",
+        "ddof=1) / n + np.var(below, ddof=1) / m",
+        near=f"{_UNIT}/analysis/detection",
+    ),
+    Fault(
+        *("one_sided_limit", f"{_A}/comparison.py"),
+        "ndtri(-0.5 * np",
+        "ndtri(-np",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("first_minus_second", f"{_A}/comparison.py"),
+        "values[1] - values[0], np.nan",
+        "values[0] - values[1], np.nan",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("parabola_turned", f"{_A}/detection/matched_filter.py"),
+        "0.5 * (left - right)",
+        "0.5 * (right - left)",
+        near=f"{_UNIT}/analysis/detection",
+    ),
+    Fault(
+        *("uncertainty_without_height", f"{_A}/depth_uncertainty.py"),
+        "up**2 + trajectory.height_m**2",
+        "up**2",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("bins_alone_twice", f"{_R}/sum_errors.py"),
+        "(1 - np.diagonal",
+        "(1 + np.diagonal",
+        near=f"{_UNIT}/results",
+    ),
+    Fault(
+        *("area_without_the_spread_of_targets", f"{_A}/detection/statistics.py"),
+        "np.hypot(self.null_sd, self.target_sd)",
+        "self.null_sd",
+        near=f"{_UNIT}/analysis/detection",
+    ),
 )
 
 
@@ -211,7 +368,9 @@ def run(command: list[str], copy: Path, log: Path, limit: float) -> int | None:
                 process.wait()
 
 
-def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float) -> Outcome:
+def run_tier(
+    copy: Path, pristine: Path, tier: str, processes: int, limit: float, stages: tuple[tuple[str, ...], ...] = STAGES
+) -> Outcome:
     """Run a tier's stages up to the first failure."""
     start, ran = time.monotonic(), False
     log = copy.with_suffix(f".{tier}.log")
@@ -220,7 +379,7 @@ def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float
     places = log.read_text().split()
     assert all(Path(place).is_relative_to(copy) for place in places), places
     options = ["-q", "-x", "-p", "no:cacheprovider", "-n", str(processes), "-m", TIERS[tier]]
-    for stage in STAGES:
+    for stage in stages:
         status = run(["-m", "pytest", *options, *stage], copy, log, limit)
         if status == _INTERNAL_ERROR:
             # Rarely, pytest-xdist loses a test.
@@ -240,19 +399,20 @@ def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float
 
 
 def measure(
-    fault: Fault | None, pristine: Path, tiers: list[str], processes: int, limit: float, keep: bool
+    fault: Fault | None, pristine: Path, tiers: list[str], processes: int, limit: float, keep: bool, near: bool = False
 ) -> dict[str, Outcome]:
-    """Return the outcome of each tier that ran with a fault, or without one."""
+    """Return the outcome of each tier that ran with a fault, or without one; `near` runs tests of its room alone."""
     name = "control" if fault is None else fault.name
     copy = pristine.with_name(name)
     shutil.copytree(pristine, copy, symlinks=True)
     if fault is not None:
         path = copy / fault.file
         path.write_text(fault.planted(path.read_text("utf-8")), "utf-8")
+    stages = ((fault.near,),) if fault is not None and near else STAGES
     outcomes: dict[str, Outcome] = {}
     for tier in tiers:
         print(f"{name}: {tier} ...", end=" ", file=sys.stderr, flush=True)
-        outcomes[tier] = outcome = run_tier(copy, pristine, tier, processes, limit)
+        outcomes[tier] = outcome = run_tier(copy, pristine, tier, processes, limit, stages)
         print(outcome, outcome.cause, file=sys.stderr, flush=True)
         if outcome.result != "not found":
             break
@@ -267,6 +427,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="faults to plant; default: all")
     parser.add_argument("--check", action="store_true", help="check that all faults apply, and run no tests")
     parser.add_argument("--control", action="store_true", help="run the tests without a fault first: they must pass")
+    parser.add_argument("--near", action="store_true", help="only faults with tests of their room, and these alone")
     parser.add_argument("--tier", choices=[*TIERS, "both"], default="both", help="tests to run; default: both")
     parser.add_argument("--keep", action="store_true", help="keep the copies and the output of pytest")
     parser.add_argument("-n", "--processes", type=int, default=2, help="processes of pytest; default: 2")
@@ -281,6 +442,7 @@ def main() -> None:
         print(f"All {len(FAULTS)} faults apply.")
         return
     chosen = [fault for fault in FAULTS if not given.names or fault.name in given.names]
+    chosen = [fault for fault in chosen if fault.near or not given.near]
     tiers = list(TIERS) if given.tier == "both" else [given.tier]
     folder = Path(tempfile.mkdtemp(prefix="planted_faults_")).resolve()
     rows, found = [], []
@@ -291,7 +453,7 @@ def main() -> None:
                 if outcome.result != "not found":
                     sys.exit(f"without a fault the {tier} tier does not pass: {outcome.cause}")
         for fault in chosen:
-            outcomes = measure(fault, *settings)
+            outcomes = measure(fault, *settings, near=given.near)
             last = list(outcomes.values())[-1]
             found += [tier for tier, outcome in outcomes.items() if outcome.result == "found"]
             cells = [str(outcomes.get(tier, "")) for tier in TIERS]
