@@ -186,8 +186,6 @@ def test_ripples_of_a_series_return_its_light(deg, azimuth_deg):
 
 
 def test_ripples_of_a_series_are_refused():
-    with pytest.raises(Exception, match=r"slope_distribution = 'skewed' must be one of gaussian, gram_charlier"):
-        surface(**STEEP | {"slope_distribution": "skewed"})
     with pytest.raises(Exception, match=r"needs the slope_variance 'cox_munk', not '0\.02'"):
         surface(**STEEP, slope_variance="0.02")
     with pytest.raises(Exception, match="is one of ripples, which a nested bsdf replaces"):

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import xarray as xr
+from figure_inputs import LIDAR, stack
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
 
 from mitransient_lidar.analysis.gates.range_images import depth_image, range_from_gates
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.results.geometry import LinesOfSight
 
 MID = 0.5 + 0.25 * np.arange(64)
 
@@ -104,6 +106,15 @@ def test_an_echo_behind_a_single_gate_of_the_column_is_found():
     energy[0, 5] = 1.0
     found = range_from_gates(energy, 0.01 * energy, np.arange(12.0), reach=4)
     assert found.depth[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_depths_are_those_of_echoes_in_the_lines_of_sight():
+    """Echoes at times in gates whose middles are 2.5 ns or 0.27 m behind their starts."""
+    truth = np.linspace(3, 4, 20).reshape(4, 5)
+    made = stack(truth, gates=60).assign_attrs(LIDAR).isel(gate=slice(16, None))
+    lines = LinesOfSight.from_dataset(made)
+    expected = (LIDAR["surface_time_ns"] + 10 * truth.ravel() - lines.surface_time) * lines.depth_per_ns
+    np.testing.assert_allclose(depth_image(made).depth.ravel(), expected, atol=0.06)
 
 
 def test_gates_with_gaps_give_no_depths():
