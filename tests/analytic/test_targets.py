@@ -8,7 +8,7 @@ import pytest
 import significance
 from oracles.beam_average import echo_energies
 from oracles.refracted_path import refracted_path
-from significance import largest_z
+from significance import largest_z, mean_and_error
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.scenes import open_scene
@@ -39,10 +39,6 @@ def diffuse(value):
 def plate(x, y, z, half, bsdf, tilt=0.0):
     to_world = mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], tilt).scale(half)
     return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
-
-
-def mean_and_error(samples):
-    return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 # Closed forms.
@@ -201,12 +197,9 @@ def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
     peak = reflectance / (2 * np.pi * np.radians(width / 2) ** 2)
     expected = np.sum(irradiance * received * peak * towards[..., 2]) * step**2
     bsdf = {"type": "retroreflector", "reflectance": reflectance, "width_deg": width}
-    mean, error = mean_and_error(
-        render_one(lidar_scene, passes, integrator, plate(1.4, 0.0, -5.0, 0.5, bsdf)).sum(axis=1)
-    )
-    assert error < 0.03 * mean
+    energy = render_one(lidar_scene, passes, integrator, plate(1.4, 0.0, -5.0, 0.5, bsdf)).sum(axis=1)
     # Slopes of 0.003 turn light and view 0.001 rad apart, 0.1 % off the peak.
-    assert abs(mean - expected) < largest_z(16) * error + 3e-3 * expected
+    significance.assert_equal(energy, expected, error=0.03, bias=3e-3)
 
 
 @pytest.mark.slow
