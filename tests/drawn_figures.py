@@ -1,17 +1,7 @@
-"""What figures contain, as numbers and texts, against a reference file: lines, bands, images, axes and labels.
-
-After a change of a figure that is meant, look at the figure and write the reference anew by
-``python tests/drawn_figures.py``.
-"""
-
-import json
-import sys
-from pathlib import Path
+"""What figures contain, as numbers and texts: lines, bands, images, axes and labels."""
 
 import numpy as np
 from matplotlib.colors import to_hex
-
-REFERENCE = Path(__file__).parent / "unit" / "plots" / "figures.json"
 
 
 def numbers(values):
@@ -96,19 +86,3 @@ def differences(found, expected, place=""):
     if isinstance(expected, float) and isinstance(found, (int, float)):
         return [] if abs(found - expected) <= 1e-4 * abs(expected) + 1e-12 else [f"{place}: {found}, not {expected}"]
     return [] if found == expected else [f"{place}: {found!r}, not {expected!r}"]
-
-
-def main():
-    """Write the reference, the parts of each figure line by line."""
-    sys.path.insert(0, str(Path(__file__).parent))
-    from figure_inputs import FIGURES
-
-    figures = []
-    for name, draw in FIGURES.items():
-        parts = ",\n".join(json.dumps(part, ensure_ascii=False) for part in described(draw()))
-        figures.append(f"{json.dumps(name)}: [\n{parts}\n]")
-    REFERENCE.write_text("{\n" + ",\n".join(figures) + "\n}\n", "utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -3,10 +3,11 @@
 import json
 
 import pytest
-from drawn_figures import REFERENCE, described, differences
+import references
+from drawn_figures import described, differences
 from figure_inputs import FIGURES
 
-EXPECTED = json.loads(REFERENCE.read_text("utf-8"))
+EXPECTED = references.read(references.FIGURES)
 
 
 @pytest.mark.parametrize("name", FIGURES)
