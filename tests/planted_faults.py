@@ -54,7 +54,7 @@ class Fault:
     old: str
     new: str
     count: int = 1
-    near: str = ""
+    near: str = "tests/analytic/test_closed_forms.py"
 
     def planted(self, text: str) -> str:
         """Return the faulty text of the file; end the script where the fault does not apply."""
@@ -106,12 +106,14 @@ FAULTS = (
         f"{_T}/laser/beam_sampler.py",
         "opaque(count // 2 / count)",
         "opaque(0.97 * (count // 2) / count)",
+        near="tests/sampling",
     ),
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
     Fault(
         *("left_and_right_exchanged", f"{_T}/sensor/pixels.py"),
         "across = (opaque(0.5 * width) - angle_y)",
         "across = (angle_y + opaque(0.5 * width))",
+        near="tests/sampling",
     ),
     Fault(
         "efficiency_squared", f"{_T}/sensor/receiver.py", "self.optical_efficiency *", "self.optical_efficiency**2 *"
@@ -119,12 +121,25 @@ FAULTS = (
     Fault("half_of_the_group_delay", f"{_M}/segments.py", "length + along * group", "length + 0.5 * along * group"),
     Fault("obscuration_squared", f"{_T}/sensor/receiver.py", "(1 - self.obscuration)", "(1 - self.obscuration**2)"),
     # Probes of the covered share of a patch do not reach the lower half of its level.
-    Fault("short_probe_of_patches", f"{_M}/patches.py", "ray.maxt = patch.height", "ray.maxt = 0.5 * patch.height"),
-    Fault("index_without_square_in_layers", f"{_T}/path.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
+    Fault(
+        "short_probe_of_patches",
+        f"{_M}/patches.py",
+        "ray.maxt = patch.height",
+        "ray.maxt = 0.5 * patch.height",
+        near="tests/analytic/test_merging.py",
+    ),
+    Fault(
+        "index_without_square_in_layers",
+        f"{_T}/path.py",
+        "& passes, ratio * ratio, 1)",
+        "& passes, ratio, 1)",
+        near="tests/analytic/test_strata.py",
+    ),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),
         "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)\n",
         "",
+        near="tests/analytic/test_agreement.py",
     ),
     Fault("connections_absorb_3_percent_more", f"{_T}/volpath.py", "dr.exp(-crossed)", "dr.exp(-1.03 * crossed)"),
     # Beckmann's alpha is the square root of twice the slope variance.
@@ -136,12 +151,14 @@ FAULTS = (
         *("balance_without_transmittance", f"{_T}/volpath.py"),
         "transmittance / (transmittance + path.emitter_ratio)",
         "1 / (1 + path.emitter_ratio)",
+        near="tests/analytic/test_estimator.py",
     ),
     # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
     Fault(
         *("too_many_bubbles", f"{_T}/medium/water.py"),
         "() * (bubbles + flight.coefficient(layer)) <",
         "() * flight.coefficient(layer) <",
+        near="tests/sampling",
     ),
     # Sampled phase functions have other values than evaluated ones.
     Fault(
@@ -149,24 +166,37 @@ FAULTS = (
         f"{_T}/medium/tabulated_phase.py",
         "value * dr.select(even",
         "1.01 * value * dr.select(even",
+        near="tests/sampling",
     ),
     # The response of pulse and receiver is reversed in time, which only an uneven one shows.
-    Fault("reversed_response_of_gates", f"{_P}/lidar/gate_train.py", "(gate, kernel[::-1])", "(gate, kernel)"),
+    Fault(
+        "reversed_response_of_gates",
+        f"{_P}/lidar/gate_train.py",
+        "(gate, kernel[::-1])",
+        "(gate, kernel)",
+        near=f"{_UNIT}/physics/lidar",
+    ),
     # The sky that the sea reflects counts twice.
     Fault(
         *("reflected_sky_twice", f"{_T}/daylight/renderer.py"),
         "dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))",
         "scene.sky_radiance(path.direction)",
+        near="tests/analytic/test_passive.py",
     ),
     # Light that survives a reflection by a solid is weakened by its reflectance, too.
-    Fault("roulette_without_compensation", f"{_T}/random_walk.py", "factor / survival, bs", "factor, bs"),
+    Fault(
+        "roulette_without_compensation",
+        f"{_T}/random_walk.py",
+        "factor / survival, bs",
+        "factor, bs",
+        near="tests/analytic/test_agreement.py",
+    ),
     Fault(
         *("far_row_below", f"{_G}/drawing.py"),
         'origin="upper"',
         'origin="lower"',
         near=_FIGURES,
     ),
-    # The axis of depths has its zero at the wrong side.
     Fault(
         *("depth_below_the_laser", f"{_G}/waveforms.py"),
         "ax, -zero * metres_per_ns",
@@ -179,7 +209,6 @@ FAULTS = (
         "xlim=(low[0], high[0])",
         near=_FIGURES,
     ),
-    # The band of a series reaches as far above the mean as below it.
     Fault(
         *("even_bands", f"{_G}/drawing.py"),
         "lowest), y + above",
@@ -427,7 +456,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="faults to plant; default: all")
     parser.add_argument("--check", action="store_true", help="check that all faults apply, and run no tests")
     parser.add_argument("--control", action="store_true", help="run the tests without a fault first: they must pass")
-    parser.add_argument("--near", action="store_true", help="only faults with tests of their room, and these alone")
+    parser.add_argument("--near", action="store_true", help="run the tests of the fault's room alone")
     parser.add_argument("--tier", choices=[*TIERS, "both"], default="both", help="tests to run; default: both")
     parser.add_argument("--keep", action="store_true", help="keep the copies and the output of pytest")
     parser.add_argument("-n", "--processes", type=int, default=2, help="processes of pytest; default: 2")
@@ -442,7 +471,6 @@ def main() -> None:
         print(f"All {len(FAULTS)} faults apply.")
         return
     chosen = [fault for fault in FAULTS if not given.names or fault.name in given.names]
-    chosen = [fault for fault in chosen if fault.near or not given.near]
     tiers = list(TIERS) if given.tier == "both" else [given.tier]
     folder = Path(tempfile.mkdtemp(prefix="planted_faults_")).resolve()
     rows, found = [], []
