@@ -33,17 +33,6 @@ def test_single_scattering_falls_with_c(field_of_view):
     assert abs(k - 0.3) < largest_z(16) * error
 
 
-def test_narrow_view_of_a_narrow_beam_falls_with_c():
-    """Where little of the scattering is forward, a spot of 0.2 m keeps next to nothing of what has been scattered."""
-    water = {"attenuation": 0.3, "scattering": 0.03, "backscattering": 0.003, "phase_function": "hg", "phase_g": 0.5}
-    found = fov_sweep("table1", [2], {**VERTICAL, **water, "divergence_mrad": 1}, passes=24, seed=2)
-    k, error = (float(found[name][0]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
-    assert error < 0.001
-    # Light scattered forward that stays in the spot: 60 passes give 0.2997 with an error of 0.0001.
-    assert abs(k - 0.3) < largest_z(24) * error + 5e-4
-    assert found["scaled_radius"][0] == pytest.approx(0.06)
-
-
 @pytest.fixture(scope="module")
 def ocean():
     """The default water, whose forward peak holds most of the scattering, seen by a narrow beam."""

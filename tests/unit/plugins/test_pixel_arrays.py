@@ -70,18 +70,6 @@ def test_pixels_share_the_light_of_their_area_without_loss(receiver, lidar_scene
 
 
 @pytest.mark.long
-def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
-    """With gaps, away from the centre: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
-    layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
-    centre, half = (2.5, -20 / 3), (2.0, 0.4 * 20 / 3)
-    corners = [(centre[0] + i * half[0], centre[1] + j * half[1]) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    alone = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
-    pixels = layout.sensors()[0].receiver.pixels
-    np.testing.assert_allclose(1e3 * pixels.centres()[5], centre, atol=1e-9)
-    assert_same(passes(layout, 12)[:, 5], passes(alone, 12, 50)[:, 0], error=0.03)
-
-
-@pytest.mark.long
 def test_a_nested_pixel_sees_the_same_alone_and_among_others(lidar_scene, passes):
     """Others overlap it, contain it, or are far away."""
     ring = {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 16.0, "inner_mrad": 8.0, "pixel_name": "ring"}

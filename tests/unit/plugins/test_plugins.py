@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import scenes, variants
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -295,15 +294,6 @@ def test_other_integrators_see_the_layers():
     np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
     np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
     np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
-
-
-@pytest.mark.long
-def test_a_pixel_alone_is_a_receiver():
-    alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
-    energy = np.array(mi.render(alone, seed=1, spp=2**14))
-    assert energy.shape[0] == 1
-    assert energy.sum() > 0
-    assert mitransient_lidar.render(alone, passes=2).pixel.values.tolist() == ["pixel"]
 
 
 @pytest.mark.parametrize("scattering", [0.004, "0.004, 0.1", 0.0])
