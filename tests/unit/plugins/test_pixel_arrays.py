@@ -13,7 +13,6 @@ from mitransient_lidar.transport.sensor.hex_pixels import hexagon_count
 BRIGHT = {"sea": {"slope_variance": "0.02"}, "film": {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 7}}
 BRIGHT |= {"integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14}}
 MERGING = {**BRIGHT, "integrator": {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}}
-SQUARE = {"field_of_view_mrad": 20.0, "field_of_view_shape": "square"}
 
 
 def polygon(corners, **more):
