@@ -5,6 +5,7 @@ Run by hand, in the environment that the package is developed in::
     .venv/bin/python tests/planted_faults.py --check              # whether all faults still apply
     .venv/bin/python tests/planted_faults.py --control            # the whole measurement, in hours
     .venv/bin/python tests/planted_faults.py one_bin_late --tier quick
+    .venv/bin/python tests/planted_faults.py --near --tier quick  # tests of the same room, in minutes
 
 Progress goes to stderr and a Markdown table to stdout. A fault counts as found when a test fails that passes without
 it. Tests that cannot be collected or fail anyway, crashes of pytest and stages that take too long are errors. The
@@ -46,13 +47,14 @@ _WHERE = (
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: a text in a file that is replaced by another one, and the number of its places."""
+    """A fault: a text in a file that is replaced by another one, the number of its places, and tests of its room."""
 
     name: str
     file: str
     old: str
     new: str
     count: int = 1
+    near: str = "tests/analytic/test_closed_forms.py"
 
     def planted(self, text: str) -> str:
         """Return the faulty text of the file; end the script where the fault does not apply."""
@@ -64,6 +66,9 @@ class Fault:
 
 _T, _P = "mitransient_lidar/transport", "mitransient_lidar/physics"
 _M = f"{_T}/merging"
+_A, _R, _G = (f"mitransient_lidar/{name}" for name in ("analysis", "results", "plots"))
+_UNIT = "tests/unit"
+_FIGURES = f"{_UNIT}/plots/test_figures.py"
 
 FAULTS = (
     # Radiance is connected to the laser through the surface without the square of the refractive index.
@@ -101,12 +106,14 @@ FAULTS = (
         f"{_T}/laser/beam_sampler.py",
         "opaque(count // 2 / count)",
         "opaque(0.97 * (count // 2) / count)",
+        near="tests/sampling",
     ),
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
     Fault(
         *("left_and_right_exchanged", f"{_T}/sensor/pixels.py"),
         "across = (opaque(0.5 * width) - angle_y)",
         "across = (angle_y + opaque(0.5 * width))",
+        near="tests/sampling",
     ),
     Fault(
         "efficiency_squared", f"{_T}/sensor/receiver.py", "self.optical_efficiency *", "self.optical_efficiency**2 *"
@@ -114,12 +121,25 @@ FAULTS = (
     Fault("half_of_the_group_delay", f"{_M}/segments.py", "length + along * group", "length + 0.5 * along * group"),
     Fault("obscuration_squared", f"{_T}/sensor/receiver.py", "(1 - self.obscuration)", "(1 - self.obscuration**2)"),
     # Probes of the covered share of a patch do not reach the lower half of its level.
-    Fault("short_probe_of_patches", f"{_M}/patches.py", "ray.maxt = patch.height", "ray.maxt = 0.5 * patch.height"),
-    Fault("index_without_square_in_layers", f"{_T}/path.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
+    Fault(
+        "short_probe_of_patches",
+        f"{_M}/patches.py",
+        "ray.maxt = patch.height",
+        "ray.maxt = 0.5 * patch.height",
+        near="tests/analytic/test_merging.py",
+    ),
+    Fault(
+        "index_without_square_in_layers",
+        f"{_T}/path.py",
+        "& passes, ratio * ratio, 1)",
+        "& passes, ratio, 1)",
+        near="tests/analytic/test_strata.py",
+    ),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),
         "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)\n",
         "",
+        near="tests/analytic/test_agreement.py",
     ),
     Fault("connections_absorb_3_percent_more", f"{_T}/volpath.py", "dr.exp(-crossed)", "dr.exp(-1.03 * crossed)"),
     # Beckmann's alpha is the square root of twice the slope variance.
@@ -131,12 +151,14 @@ FAULTS = (
         *("balance_without_transmittance", f"{_T}/volpath.py"),
         "transmittance / (transmittance + path.emitter_ratio)",
         "1 / (1 + path.emitter_ratio)",
+        near="tests/analytic/test_estimator.py",
     ),
     # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
     Fault(
         *("too_many_bubbles", f"{_T}/medium/water.py"),
         "() * (bubbles + flight.coefficient(layer)) <",
         "() * flight.coefficient(layer) <",
+        near="tests/sampling",
     ),
     # Sampled phase functions have other values than evaluated ones.
     Fault(
@@ -144,17 +166,181 @@ FAULTS = (
         f"{_T}/medium/tabulated_phase.py",
         "value * dr.select(even",
         "1.01 * value * dr.select(even",
+        near="tests/sampling",
     ),
     # The response of pulse and receiver is reversed in time, which only an uneven one shows.
-    Fault("reversed_response_of_gates", f"{_P}/lidar/gate_train.py", "(gate, kernel[::-1])", "(gate, kernel)"),
+    Fault(
+        "reversed_response_of_gates",
+        f"{_P}/lidar/gate_train.py",
+        "(gate, kernel[::-1])",
+        "(gate, kernel)",
+        near=f"{_UNIT}/physics/lidar",
+    ),
     # The sky that the sea reflects counts twice.
     Fault(
         *("reflected_sky_twice", f"{_T}/daylight/renderer.py"),
         "dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))",
         "scene.sky_radiance(path.direction)",
+        near="tests/analytic/test_passive.py",
     ),
     # Light that survives a reflection by a solid is weakened by its reflectance, too.
-    Fault("roulette_without_compensation", f"{_T}/random_walk.py", "factor / survival, bs", "factor, bs"),
+    Fault(
+        "roulette_without_compensation",
+        f"{_T}/random_walk.py",
+        "factor / survival, bs",
+        "factor, bs",
+        near="tests/analytic/test_agreement.py",
+    ),
+    Fault(
+        *("far_row_below", f"{_G}/drawing.py"),
+        'origin="upper"',
+        'origin="lower"',
+        near=_FIGURES,
+    ),
+    Fault(
+        *("depth_below_the_laser", f"{_G}/waveforms.py"),
+        "ax, -zero * metres_per_ns",
+        "ax, zero * metres_per_ns",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("left_of_layouts_on_the_right", f"{_G}/layout.py"),
+        "xlim=(high[0], low[0])",
+        "xlim=(low[0], high[0])",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("even_bands", f"{_G}/drawing.py"),
+        "lowest), y + above",
+        "lowest), y + below",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("black_for_blue", f"{_G}/drawing.py"),
+        '"#1f5fd6", "#111111")',
+        '"#111111", "#1f5fd6")',
+        near=_FIGURES,
+    ),
+    Fault(
+        *("share_of_lost_bottoms", f"{_G}/campaigns.py"),
+        "(flags & _NO_ECHO) == 0",
+        "(flags & _NO_ECHO) != 0",
+        near=_FIGURES,
+    ),
+    Fault(
+        *("gates_of_one_pulse", f"{_A}/gates/cut.py"),
+        "= train.pulses * time.bin_width_ns",
+        "= time.bin_width_ns",
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("depths_of_gate_starts", f"{_R}/gate_stack.py"),
+        "depth_of_time(train.middles_ns)",
+        "depth_of_time(train.starts_ns)",
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("ranges_from_gate_starts", f"{_A}/gates/range_images.py"),
+        '    middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values',
+        '    middles = stack["gate_start"].values',
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        *("other_gps_time", "mitransient_lidar/flights/las.py"),
+        '(_time_system(points) == "gps")',
+        '(_time_system(points) == "adjusted_gps")',
+        near=f"{_UNIT}/flights",
+    ),
+    Fault(
+        *("scan_angle_to_the_other_side", "mitransient_lidar/flights/las.py"),
+        "np.round(angle / _SCAN",
+        "np.round(-angle / _SCAN",
+        near=f"{_UNIT}/flights",
+    ),
+    Fault(
+        *("five_digits_in_tables", f"{_A}/waveforms/csv_tables.py"),
+        "{value:.9g}",
+        "{value:.5g}",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("last_bin_first_in_exr", f"{_R}/exr.py"),
+        "enumerate(images):",
+        "enumerate(images[::-1]):",
+        near=f"{_UNIT}/results",
+    ),
+    Fault(
+        *("attenuation_of_one_way", f"{_A}/waveforms/echo_table.py"),
+        "per_metre = 0.5 / waveforms",
+        "per_metre = 1.0 / waveforms",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("correction_added", f"{_A}/waveforms/depth_correction.py"),
+        'found["depth_m"] - correction',
+        'found["depth_m"] + correction',
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("turned_to_the_other_side", f"{_A}/waveforms/depth_correction.py"),
+        "azimuth[:, np.newaxis] - turn_deg",
+        "azimuth[:, np.newaxis] + turn_deg",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("slope_away_from_the_lidar", f"{_A}/retrieval/slope_corrections.py"),
+        "(a * np.sin(off_nadir)",
+        "(-a * np.sin(off_nadir)",
+        near=f"{_UNIT}/analysis/retrieval",
+    ),
+    Fault(
+        *("crest_behind_the_sea_level", f"{_A}/waveforms/surface_times.py"),
+        "(-height * per_metre",
+        "(height * per_metre",
+        near=f"{_UNIT}/analysis/waveforms",
+    ),
+    Fault(
+        *("variances_of_area_exchanged", f"{_A}/detection/roc.py"),
+        "ddof=1) / m + np.var(below, ddof=1) / n",
+        "ddof=1) / n + np.var(below, ddof=1) / m",
+        near=f"{_UNIT}/analysis/detection",
+    ),
+    Fault(
+        *("one_sided_limit", f"{_A}/comparison.py"),
+        "ndtri(-0.5 * np",
+        "ndtri(-np",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("first_minus_second", f"{_A}/comparison.py"),
+        "values[1] - values[0], np.nan",
+        "values[0] - values[1], np.nan",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("parabola_turned", f"{_A}/detection/matched_filter.py"),
+        "0.5 * (left - right)",
+        "0.5 * (right - left)",
+        near=f"{_UNIT}/analysis/detection",
+    ),
+    Fault(
+        *("uncertainty_without_height", f"{_A}/depth_uncertainty.py"),
+        "up**2 + trajectory.height_m**2",
+        "up**2",
+        near=f"{_UNIT}/analysis",
+    ),
+    Fault(
+        *("bins_alone_twice", f"{_R}/sum_errors.py"),
+        "(1 - np.diagonal",
+        "(1 + np.diagonal",
+        near=f"{_UNIT}/results",
+    ),
+    Fault(
+        *("area_without_the_spread_of_targets", f"{_A}/detection/statistics.py"),
+        "np.hypot(self.null_sd, self.target_sd)",
+        "self.null_sd",
+        near=f"{_UNIT}/analysis/detection",
+    ),
 )
 
 
@@ -211,7 +397,9 @@ def run(command: list[str], copy: Path, log: Path, limit: float) -> int | None:
                 process.wait()
 
 
-def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float) -> Outcome:
+def run_tier(
+    copy: Path, pristine: Path, tier: str, processes: int, limit: float, stages: tuple[tuple[str, ...], ...] = STAGES
+) -> Outcome:
     """Run a tier's stages up to the first failure."""
     start, ran = time.monotonic(), False
     log = copy.with_suffix(f".{tier}.log")
@@ -220,7 +408,7 @@ def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float
     places = log.read_text().split()
     assert all(Path(place).is_relative_to(copy) for place in places), places
     options = ["-q", "-x", "-p", "no:cacheprovider", "-n", str(processes), "-m", TIERS[tier]]
-    for stage in STAGES:
+    for stage in stages:
         status = run(["-m", "pytest", *options, *stage], copy, log, limit)
         if status == _INTERNAL_ERROR:
             # Rarely, pytest-xdist loses a test.
@@ -240,19 +428,20 @@ def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float
 
 
 def measure(
-    fault: Fault | None, pristine: Path, tiers: list[str], processes: int, limit: float, keep: bool
+    fault: Fault | None, pristine: Path, tiers: list[str], processes: int, limit: float, keep: bool, near: bool = False
 ) -> dict[str, Outcome]:
-    """Return the outcome of each tier that ran with a fault, or without one."""
+    """Return the outcome of each tier that ran with a fault, or without one; `near` runs tests of its room alone."""
     name = "control" if fault is None else fault.name
     copy = pristine.with_name(name)
     shutil.copytree(pristine, copy, symlinks=True)
     if fault is not None:
         path = copy / fault.file
         path.write_text(fault.planted(path.read_text("utf-8")), "utf-8")
+    stages = ((fault.near,),) if fault is not None and near else STAGES
     outcomes: dict[str, Outcome] = {}
     for tier in tiers:
         print(f"{name}: {tier} ...", end=" ", file=sys.stderr, flush=True)
-        outcomes[tier] = outcome = run_tier(copy, pristine, tier, processes, limit)
+        outcomes[tier] = outcome = run_tier(copy, pristine, tier, processes, limit, stages)
         print(outcome, outcome.cause, file=sys.stderr, flush=True)
         if outcome.result != "not found":
             break
@@ -267,6 +456,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="faults to plant; default: all")
     parser.add_argument("--check", action="store_true", help="check that all faults apply, and run no tests")
     parser.add_argument("--control", action="store_true", help="run the tests without a fault first: they must pass")
+    parser.add_argument("--near", action="store_true", help="run the tests of the fault's room alone")
     parser.add_argument("--tier", choices=[*TIERS, "both"], default="both", help="tests to run; default: both")
     parser.add_argument("--keep", action="store_true", help="keep the copies and the output of pytest")
     parser.add_argument("-n", "--processes", type=int, default=2, help="processes of pytest; default: 2")
@@ -291,7 +481,7 @@ def main() -> None:
                 if outcome.result != "not found":
                     sys.exit(f"without a fault the {tier} tier does not pass: {outcome.cause}")
         for fault in chosen:
-            outcomes = measure(fault, *settings)
+            outcomes = measure(fault, *settings, near=given.near)
             last = list(outcomes.values())[-1]
             found += [tier for tier, outcome in outcomes.items() if outcome.result == "found"]
             cells = [str(outcomes.get(tier, "")) for tier in TIERS]

@@ -29,22 +29,6 @@ def centroid_ns(energy, start_ns):
     return times.mean(), times.std(ddof=1) / np.sqrt(len(times))
 
 
-def shoot(lidar_scene, passes, start_ns, *, altitude, angle, water, bottom, slope_variance="1e-4", scatterings=0):
-    """Time a beam of 1 cm radius on the surface, seen by a field of view of 0.2 m radius."""
-    pose = {"altitude": altitude, "off_nadir_deg": angle}
-    distance = altitude / np.cos(np.radians(angle))
-    scene = lidar_scene(
-        integrator={"max_scatterings": scatterings, "paths_per_pass": 2**14},
-        tx={**pose, "divergence_mrad": 1e3 * 0.02 / distance},
-        rx={**pose, "field_of_view_mrad": 1e3 * 0.4 / distance, "layout": "1x1"},
-        film={"time_start_ns": start_ns, "bin_width_ns": BIN_NS, "bin_count": 64},
-        sea={"slope_variance": slope_variance},
-        water=water,
-        bottom=bottom,
-    )
-    return centroid_ns(passes(scene, 8), start_ns)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 def test_bottom_arrives_to_a_tenth_of_a_millimetre(lidar_scene, passes, integrator):
@@ -66,44 +50,6 @@ def test_bottom_arrives_to_a_tenth_of_a_millimetre(lidar_scene, passes, integrat
     mean = bin_ns * (np.arange(bins) + 0.5 - bins / 2) @ energy / energy.sum()
     # Lengths of single precision: 0.1 mm one way.
     assert abs(mean) < 2 * 1e-4 * 1.364 / C0 * 1e9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("altitude", "angle", "group_index"), [(10.0, 40.0, 1.364), (200.0, 0.0, 1.34), (3000.0, 20.0, 1.364)]
-)
-def test_bottom_arrives_when_geometry_says(lidar_scene, passes, altitude, angle, group_index):
-    expected = float(bottom_time_ns(altitude, 8.0, np.radians(angle), 1.34, group_index))
-    water = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0, "group_index": group_index}
-    start = BIN_NS * round((expected - 8) / BIN_NS)
-    mean, error = shoot(lidar_scene, passes, start, altitude=altitude, angle=angle, water=water, bottom=8.0)
-    assert error < BIN_NS / 10
-    assert abs(mean - expected) < BIN_NS / 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("altitude", "angle"), [(10.0, 20.0), (200.0, 40.0), (3000.0, 0.0)])
-def test_surface_arrives_when_geometry_says(lidar_scene, passes, altitude, angle):
-    expected = float(surface_time_ns(altitude, np.radians(angle)))
-    water = {"attenuation": 100.0, "scattering": 0.0, "backscattering": 0.0}
-    start = BIN_NS * round((expected - 8) / BIN_NS)
-    mean, error = shoot(
-        *(lidar_scene, passes, start), altitude=altitude, angle=angle, water=water, bottom=None, slope_variance="0.1"
-    )
-    assert error < BIN_NS / 10
-    assert abs(mean - expected) < BIN_NS / 2
-
-
-@pytest.mark.slow
-def test_bottom_under_layers_arrives_at_the_same_time(lidar_scene, passes):
-    """Layers of one index differ in attenuation, not in time."""
-    expected = float(bottom_time_ns(200.0, 8.0, np.radians(20.0), 1.34, 1.364))
-    water = {"layer_tops": "0, 1.5, 4", "attenuation": "0.5, 0.05, 0.3", "scattering": "0", "backscattering": "0"}
-    start = BIN_NS * round((expected - 8) / BIN_NS)
-    water["group_index"] = 1.364
-    mean, error = shoot(lidar_scene, passes, start, altitude=200.0, angle=20.0, water=water, bottom=8.0)
-    assert error < BIN_NS / 10
-    assert abs(mean - expected) < BIN_NS / 2
 
 
 @pytest.mark.slow

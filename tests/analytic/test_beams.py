@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from oracles.lidar_equation import bottom_energy
-from significance import FALSE_ALARM, assert_equal, assert_same, largest_z
+from significance import assert_equal, assert_same, largest_z
 
 import mitransient_lidar
-from mitransient_lidar.analysis import comparison
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -143,29 +142,6 @@ def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator,
     # The surface's light is in the first bins.
     begin = int(2 * (height + index * depth) / C0 * 1e9 - 74.0)
     assert_equal(found[:, begin - 1 : begin + 2].sum(axis=1), expected, error=0.02, bias=8e-3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["ellipse", "image"])
-def test_integrators_agree(kind, lidar_scene, tmp_path):
-    shape = {"divergence_mrad": 2.0, "divergence_across_mrad": 15.0}
-    if kind == "image":
-        shape = image_parameters(tmp_path)
-    results = {}
-    for plugin, count in (("lidar_merging", 12), ("lidar_volpath", 8)):
-        scene = lidar_scene(
-            integrator={"type": plugin, "paths_per_pass": 2**17 if plugin == "lidar_volpath" else 2**15},
-            tx=shape,
-            rx={"field_of_view_mrad": 20.0},
-            film={"bin_count": 120},
-            sea={"slope_variance": "0.01"},
-        )
-        results[plugin] = mitransient_lidar.render(scene, passes=count, seed=count)
-    outcome = comparison.compare(results["lidar_volpath"], results["lidar_merging"])
-    assert outcome.bin_count >= 200
-    assert outcome.largest < comparison.sidak_limit(outcome.bin_count, FALSE_ALARM), (outcome.largest, outcome.limit)
-    assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < 0.01
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Slope of the column signal against c, a and Kd, and against itself with beam and view exchanged.
+"""Slope of the column signal against c, a and Kd.
 
 Gordon (1982), Appl. Opt. 21, 2996: K is c where the receiver sees a spot far smaller than the attenuation length, and
 comes down to the diffuse attenuation where it sees 5 to 6 of them across its radius. Phillips and Koerber (1984), Aust.
@@ -33,17 +33,6 @@ def test_single_scattering_falls_with_c(field_of_view):
     assert abs(k - 0.3) < largest_z(16) * error
 
 
-def test_narrow_view_of_a_narrow_beam_falls_with_c():
-    """Where little of the scattering is forward, a spot of 0.2 m keeps next to nothing of what has been scattered."""
-    water = {"attenuation": 0.3, "scattering": 0.03, "backscattering": 0.003, "phase_function": "hg", "phase_g": 0.5}
-    found = fov_sweep("table1", [2], {**VERTICAL, **water, "divergence_mrad": 1}, passes=24, seed=2)
-    k, error = (float(found[name][0]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
-    assert error < 0.001
-    # Light scattered forward that stays in the spot: 60 passes give 0.2997 with an error of 0.0001.
-    assert abs(k - 0.3) < largest_z(24) * error + 5e-4
-    assert found["scaled_radius"][0] == pytest.approx(0.06)
-
-
 @pytest.fixture(scope="module")
 def ocean():
     """The default water, whose forward peak holds most of the scattering, seen by a narrow beam."""
@@ -63,38 +52,3 @@ def test_slope_falls_from_c_to_absorption(ocean):
     # c R = 4.5: absorption, not the larger Kd.
     assert abs(k[-1] - absorption) < largest_z(12) * error[-1]
     assert k[-1] < kd - 5 * error[-1]
-
-
-def test_fit_has_its_limits_but_falls_too_late(ocean):
-    """The customary fit is for no water in particular; in this one half of the fall is at a third of its radius."""
-    k, fit, scaled = (ocean[name].values for name in ("effective_attenuation", "system_attenuation", "scaled_radius"))
-    assert fit[-1] == pytest.approx(ocean.attrs["kd"], rel=0.01)
-    assert np.all(k < fit)
-    half = 0.5 * (ocean.attrs["attenuation"] + ocean.attrs["absorption"])
-    radius_of = np.exp(np.interp(half, k[::-1], np.log(scaled[::-1])))
-    assert 0.1 < radius_of < 0.25
-
-
-def test_beam_and_view_may_be_exchanged(lidar_scene):
-    """A wide beam in a narrow view falls as a narrow beam in a wide view: what counts is the wider of both."""
-    wide, narrow = 20.0, 1.0
-
-    def slope(beam, view, seed):
-        pose = {"off_nadir_deg": 0.0}
-        scene = lidar_scene(
-            integrator={"type": "lidar_merging", "paths_per_pass": 2**14},
-            tx={**pose, "beam_profile": "top_hat", "divergence_mrad": beam},
-            rx={**pose, "layout": "1x1", "field_of_view_mrad": view},
-            film={"time_start_ns": 1330.0, "bin_count": 80},
-            sea={"slope_variance": "2e-5"},
-            bottom=None,
-        )
-        result = fov_sweep(scene, [narrow, view] if view > narrow else [view], passes=24, seed=seed)
-        return (float(result[name][-1]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
-
-    (first, first_error), (second, second_error) = slope(wide, narrow, 5), slope(narrow, wide, 6)
-    both_narrow, _ = slope(narrow, narrow, 7)
-    error = np.hypot(first_error, second_error)
-    assert error < 0.007
-    assert abs(first - second) < largest_z(24) * error
-    assert both_narrow > first + 0.05

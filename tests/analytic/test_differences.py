@@ -61,31 +61,6 @@ def in_bins(samples, bins=8):
     return samples[..., : count * bins].reshape(*samples.shape[:-1], count, bins).sum(axis=-1)
 
 
-@pytest.mark.long
-def test_bottom_reflectance_against_the_scene_without_its_light():
-    """Light that meets a dark bottom is in proportion to its reflectance."""
-    dark = 0.02
-    found, session = slopes("bottom_reflectance", {"bottom_reflectance": dark})
-    bare = open_scene("table1", {**LEVEL, "bottom_reflectance": 0})
-    wanted = (energies(session) - energies(bare, OTHERS + 1, axis_of(session))) / dark
-    echo = slice(*np.flatnonzero(found.mean(axis=0) > 0.01 * found.mean(axis=0).max())[[0, -1]])
-    significance.assert_same(in_bins(found[:, echo]), in_bins(wanted[:, echo]), error=0.02, bias=0.002)
-
-
-@pytest.mark.long
-def test_attenuation_of_water_that_only_absorbs():
-    """Light that reaches the bottom at nadir and returns loses exp(-2 c d); all ways are longer by at most 0.1 %."""
-    depth, view = 8.0, {"off_nadir_deg": 0, "field_of_view_mrad": 30, "slope_variance": 2e-5}
-    water = {"scattering": 0, "backscattering": 0, "bottom_depth": depth}
-    found, session = slopes("attenuation", {**water, **view})
-    surface = 2 * 200.0 / (C0 * 1e-9)
-    bottom = axis_of(session).centres_ns > surface + depth * 2 / (C0 * 1e-9)
-    wanted = -2 * depth * energies(session)[:, bottom].sum(axis=1)
-    significance.assert_same(-found[:, bottom].sum(axis=1)[:, None], -wanted[:, None], error=0.02, bias=0.002)
-    # No echo of the surface depends on the water.
-    assert not found[:, ~bottom].any()
-
-
 def test_bottom_depth_moves_its_echo_in_time():
     """The mean time of the echo grows by 2 n / (c cos(angle in water)); the sum over all ways changes it by 0.5 %."""
     water = {"scattering": 0, "backscattering": 0}

@@ -40,24 +40,6 @@ def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
         np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
 
 
-@pytest.mark.long
-def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
-    """Quadrants as sectors of a circle, drawn pixel by pixel, against the layout that cuts the circle."""
-    quadrants = {"red": 0.0, "green": 270.0, "blue": 90.0, "black": 180.0}
-    nested = {
-        name: {"type": "pixel_fov", "shape": "sector", "start_deg": start, "extent_deg": 90.0, "pixel_name": name}
-        for name, start in quadrants.items()
-    }
-    nested_scene = lidar_scene(rx=nested, sea=ROUGH)
-    names = nested_scene.sensors()[0].receiver.pixels.names
-    # +angle_x is far, +angle_y left: red is far and left, the azimuths 0 to 90 degrees; blue near and left, 90 to 180.
-    order = [names.index(name) for name in ("red", "green", "blue", "black")]
-    first = passes(nested_scene, 32)[:, order]
-    second = passes(lidar_scene(sea=ROUGH), 32, 1000)
-    for pixel in range(4):
-        compare(echoes(first[:, [pixel]]), echoes(second[:, [pixel]]), 0.016)
-
-
 def with_total(energy):
     """Append the sum over the bins as a last column."""
     return np.concatenate([energy, energy.sum(axis=1, keepdims=True)], axis=1)
@@ -68,17 +50,6 @@ def sampled(scene, emitter):
     integrator = scene.integrator()
     integrator.options = replace(integrator.options, samples_emitter=emitter)
     return scene
-
-
-def connected(lidar_scene, passes, sea, count, emitter=True, **integrator):
-    """Return energies of a single pixel in gates of 20 ns: 1 to 4 the water, 5 the bottom, then light that lags."""
-    scene = lidar_scene(
-        integrator={"paths_per_pass": 2**15, **integrator},
-        rx={"layout": "1x1"},
-        sea=sea,
-        film={"bin_width_ns": 20.0, "bin_count": 8},
-    )
-    return passes(sampled(scene, emitter), count)[:, 0]
 
 
 @pytest.mark.slow
@@ -107,26 +78,6 @@ def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
     assert_same(combined, walk, error=0.02)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("sea", [ROUGH, WAVY])
-def test_connections_have_the_mean_of_the_walk_alone(lidar_scene, passes, sea):
-    """The walk is complete; weights that do not sum to one would lose or double what both samplings can find."""
-    combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:6])
-    alone = with_total(connected(lidar_scene, passes, sea, 40, emitter=False)[:, 1:6])
-    compare(combined, alone, 0.032)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sea", [ROUGH, WAVY])
-def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
-    """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
-    combined = connected(lidar_scene, passes, sea, 24)
-    walk = connected(lidar_scene, passes, sea, 48, emitter=False, guiding_probability=0.0)
-    assert walk.sum(axis=1).var(ddof=1) > 50 * combined.sum(axis=1).var(ddof=1)
-    # The gate of the bottom echo, where every walk has turned.
-    assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)
-
-
 @pytest.mark.parametrize(
     "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
 )
@@ -146,26 +97,6 @@ def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
         )
         signals.append(with_total(passes(scene, 16)[:, 0] / view**2))
     compare(*signals, 0.035)
-
-
-@pytest.mark.long
-def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
-    """One metre apart across the axis, looking at one point, exchanged: equal beams and views see the same signal."""
-    energies = []
-    places = [np.array([-72.8, -0.5, 200.0]), np.array([-72.8, 0.5, 200.0])]
-    for source, receiver in (places, places[::-1]):
-        pose = [
-            mi.ScalarTransform4f().look_at(origin=p.tolist(), target=[0.3, 0.4, 0], up=[0, 0, 1])
-            for p in (source, receiver)
-        ]
-        scene = lidar_scene(
-            tx={"beam_profile": "top_hat", "divergence_mrad": 12.0, "to_world": pose[0]},
-            rx={"field_of_view_mrad": 12.0, "layout": "1x1", "to_world": pose[1]},
-            sea=WAVY,
-            film={"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 5},
-        )
-        energies.append(with_total(passes(scene, 32)[:, 0]))
-    compare(*energies, 0.011)
 
 
 @pytest.mark.slow

@@ -150,40 +150,6 @@ def test_parameters_of_gates_out_of_range(film, words):
         mi.load_dict({"type": "time_gated_film", **GATES, **film})
 
 
-def image(lidar_scene, layout, film=None, **integrator):
-    """Return an imager of a square field of view over a wavy sea, with eight gates from the surface to the bottom."""
-    # Automatic waves would be shorter for more pixels: another sea.
-    cells = {"cell_size": 0.125, "shortest_wave": 1.0, "refined_size": 32.0}
-    gates = {"gate_start_ns": 1410.0, "gate_width_ns": 10.0, "gate_count": 8, "bin_width_ns": 8.0, "bin_count": 20}
-    return lidar_scene(
-        integrator={"type": "lidar_merging", "paths_per_pass": 2**16, **integrator},
-        film={**gates, **(film or {})},
-        rx={"layout": layout, "field_of_view_mrad": 20.0, "field_of_view_shape": "square"},
-        sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "surface_seed": 4, **cells},
-    )
-
-
-@pytest.mark.long
-def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
-    """256 x 256 pixels binned to 2 x 2, and all of them, against receivers of so many pixels with other seeds."""
-    sums = {}
-    for first_seed, (layout, count) in enumerate((("256x256", 6), ("2x2", 12), ("1x1", 12))):
-        scene = image(lidar_scene, layout)
-        energy = passes(scene, count, 1000 * first_seed)
-        if layout == "256x256":
-            energy = energy.reshape(count, 2, 128, 2, 128, -1).sum(axis=(2, 4)).reshape(count, 4, -1)
-        sums[layout] = energy[..., 2:14].reshape(*energy.shape[:2], 4, 3).sum(axis=-1)
-    pairs = [
-        (sums["256x256"], sums["2x2"]),
-        *((sums[name].sum(axis=1), sums["1x1"][:, 0]) for name in ("256x256", "2x2")),
-    ]
-    for first, second in pairs:
-        error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (first, second)))
-        z = (first.mean(axis=0) - second.mean(axis=0)) / error
-        assert np.all(np.abs(z) < largest_z(6, z.size)), z
-        assert np.all(error < 0.02 * second.mean(axis=0))
-
-
 @pytest.mark.long
 def test_images_do_not_show_the_cells_of_the_sea(lidar_scene, passes):
     """The pattern of light on a bottom at 2 m, in automatic cells, is that in cells of half the size.
@@ -232,38 +198,3 @@ def test_paths_go_with_the_pixels(lidar_scene):
         assert scene.integrator().prepare(scene, sensor).paths == 2**16
         default = mi.load_dict({"type": "lidar_merging"}).prepare(scene, sensor)
         assert (default.paths, default.photons) == (paths, photons)
-
-
-@pytest.mark.long
-def test_contrast_of_the_mine_is_greatest_where_geometry_says():
-    """The sphere's energy, and its Weber contrast against the water around it, by gate.
-
-    A Lambertian sphere that is lit and seen along the same ray returns its energy as the square of the cosine: from its
-    middle third, 41 degrees about the ray, from 0.887 of the radius before its centre. From the centre it would come
-    4 ns later.
-    """
-    params = {"layout": "64x64", "gate_start_depth": 4.6, "gate_step_ns": 1, "gate_count": 14, "spectrum": "flat"}
-    params |= {"surface_refined_size": "auto", "surface_cell_size": "auto"}
-    quick = {"type": "lidar_merging", "paths_per_pass": 2**16}
-    stack = mitransient_lidar.render("gated_mine", params=params, passes=10, seed=2, integrator=quick)
-    cosine = np.array([np.cos(np.arcsin(0.33 / 0.5)), 1.0])
-    share = np.diff(cosine**4)[0] / 4 / (np.diff(cosine**3)[0] / 3)
-    slant = 6.0 / np.cos(np.arcsin(np.sin(np.radians(20.0)) / 1.34)) - 0.5 * share
-    expected = stack.attrs["surface_time_ns"] + 2e9 * 1.34 * slant / C0
-    # The sphere is seen on the axis, 0.5 m to the side at an apparent range of 212.8 m + 6.2 m / 1.34.
-    per_metre = 1e3 / 217.4
-    away = np.hypot(stack["angle_x"], stack["angle_y"] + 0.5 * per_metre)
-    energy = stack["gate_energy"]
-    target = energy.where(away < 0.33 * per_metre).mean(("row", "column")).values
-    around = energy.where((away > 7) & (away < 9)).mean(("row", "column")).values
-    middles = (stack["gate_start"] + 0.5 * stack["gate_width"]).values
-    assert abs(middles[np.argmax(target)] - expected) < 0.8
-    # Light of the sphere that the water scatters comes late to the pixels around it: contrast is greatest a bit early.
-    contrast = target / around - 1
-    assert -2.0 < middles[np.argmax(contrast)] - expected < 0.8
-    assert contrast.max() > 20
-    # Radiance falls as the cosine: brighter than half of its middle is 0.866 of the diameter.
-    image = energy.sum("gate").values
-    bright = image > 0.5 * image[(away < 0.15 * per_metre).values].mean()
-    width = np.sqrt(bright.sum() * (20.0 / 64) ** 2 * 4 / np.pi)
-    assert width == pytest.approx(np.sqrt(0.75) * per_metre, rel=0.1)

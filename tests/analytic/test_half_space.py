@@ -26,22 +26,6 @@ def single_scattering(degrees, albedo):
     return ENERGY * albedo / (8 * np.pi) * (np.cos(np.radians(degrees)) / HEIGHT) ** 2
 
 
-def orders_of_scattering(mu, count):
-    """Return coefficients s_k of H(mu)^2 = sum of omega^k s_k: light scattered k + 1 times over light scattered once.
-
-    From Chandrasekhar's integral equation, H = 1 + omega mu/2 H(mu) int_0^1 H(m)/(mu + m) dm, power by power.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(60)
-    # m = u^3 takes the logarithm at m = 0 out of the quadrature's way.
-    u = (1 + nodes) / 2
-    m, dm = np.append(u**3, mu), np.append(1.5 * u**2 * weights, 0)
-    kernel = m[:, None] / 2 * dm / (m[:, None] + m)
-    h = [np.ones_like(m)]
-    for n in range(1, count):
-        h.append(sum(h[j] * (kernel @ h[n - 1 - j]) for j in range(n)))
-    return np.array([sum(h[j][-1] * h[n - j][-1] for j in range(n + 1)) for n in range(count)])
-
-
 def half_space(lidar_scene, degrees, albedo, view, beam, integrator):
     """Return the scene of a half-space, for a view and a beam of these radii [m] at the surface."""
     slant = HEIGHT / np.cos(np.radians(degrees))
@@ -115,32 +99,6 @@ def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees
     assert relative < largest_error(count, error)
     # The blur over cells adds 2e-3.
     assert abs(energy.mean() / expected - 1) < largest_z(count) * relative + 2e-3
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("degrees", [0.0, 60.0])
-def test_every_order_of_scattering_returns_its_share(lidar_scene, passes, z_score, degrees):
-    """Light scattered once, twice, three and four times, each alone: a share given to another order would show."""
-    albedo, orders = 0.9, 4
-    expected = single_scattering(degrees, albedo)
-    expected *= albedo ** np.arange(orders) * orders_of_scattering(np.cos(np.radians(degrees)), orders)
-    # The same seeds: paths are only cut shorter, so a difference is the light of one order.
-    up_to = [
-        returned(lidar_scene, passes, 32, degrees, albedo, 0.1, 40.0, {"paths_per_pass": 2**15, "max_scatterings": n})
-        for n in range(1, orders + 1)
-    ]
-    z, relative = z_score(np.diff(up_to, axis=0, prepend=0).T, expected)
-    assert np.all(relative < [1e-3, 2e-3, 3e-3, 4e-3])
-    assert np.all(np.abs(z) < largest_z(32, orders) + NOT_MATCHED / relative), z
-
-
-@pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0, 60.0])
-def test_orders_of_scattering_sum_to_h_squared(degrees):
-    """The series by the integral equation against the closed form of H; 40 orders leave 1e-12 at albedo 0.5."""
-    mu = np.cos(np.radians(degrees))
-    series = orders_of_scattering(mu, 40)
-    assert series[1] == pytest.approx(mu * np.log((1 + mu) / mu), rel=1e-8)
-    assert np.sum(0.5 ** np.arange(40) * series) == pytest.approx(chandrasekhar_h(mu, 0.5) ** 2, rel=1e-8)
 
 
 @pytest.mark.parametrize(

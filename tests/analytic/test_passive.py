@@ -5,12 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.half_space import phase_moments, water_leaving_reflectance
-from oracles.wave_spectra import realise
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering import passive
 from mitransient_lidar.transport.path import ConnectedPath
@@ -137,31 +135,6 @@ def crossing(bsdf, side, off_normal_deg):
     sample, weight = bsdf.sample(context, si, rng.next_float32(), pairs[1])
     energy, reflected = np.array(weight).ravel(), np.array(sample.wo.z * side > 0)
     return energy[reflected].sum() / energy.size, energy[~reflected].sum() / energy.size
-
-
-@pytest.mark.parametrize(
-    "layers",
-    [
-        pytest.param({}, marks=pytest.mark.long),
-        pytest.param({"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}, marks=pytest.mark.slow),
-    ],
-)
-@pytest.mark.long
-def test_sampling_does_not_change_the_image(layers):
-    """Guided directions and roulette change only the noise."""
-    water = {"attenuation": 0.2, "scattering": 0.12, "backscattering": 0.006}
-    if layers:
-        water = {name: f"{value}, {1.5 * value}" for name, value in water.items()} | layers
-    sea = {"wind_speed": 4.0, "cell_size": 0.25}
-    plain = {"guiding_probability": 0.1, "solid_guiding_probability": 0.0, "roulette_threshold": 0.0}
-    found = [
-        passes(build(sun={"zenith_deg": 40.0}, water=water, sea=sea, depth=4.0, integrator=options), 12)[:, 0]
-        for options in ({}, plain)
-    ]
-    for other in found[1:]:
-        error = np.hypot(*(samples.std(ddof=1) / np.sqrt(len(samples)) for samples in (found[0], other)))
-        assert abs(other.mean() - found[0].mean()) < largest_z(12, 4) * error, (other.mean(), found[0].mean(), error)
-        assert error < largest_error(12, 0.016) * found[0].mean()
 
 
 # (c) sun glint
@@ -447,58 +420,3 @@ def ray_contrast(depth, amplitude, k, sun, ripple, resolved):
     landed += rng.normal(0, (1 - 1 / N) * np.sqrt(ripple) * depth, count)
     light, _ = np.histogram(np.mod(landed, 2 * np.pi / k), 24, weights=lit)
     return light.std() / light.mean()
-
-
-@pytest.mark.long
-def test_a_wind_sea_focuses_the_sun_most_some_metres_down(tmp_path):
-    """Contrast of light on plates below a sea at 5 m/s, lit through its waves and seen through still water.
-
-    Hieronymi (2011, thesis, Kiel) computed the strongest fluctuations at 0.5 to 10 m, made by waves of 20 cm to 5 m.
-    Shallower the light has not met yet; deeper, the patterns of many waves lie over one another. Measured here:
-    0.10 at 0.25 m, 0.35 at 0.4, 0.75 at 0.8, 1.05 at 1.2, 0.92 at 2, 0.65 at 3, 0.50 at 5, 0.29 at 7 m.
-    """
-    cells, period, ripple = 1024, 20.48, 1e-4
-    heights = realise(ElfouhailySpectrum(5.0), period, cells, 3)
-    x = (np.arange(cells) - cells // 2) * period / cells
-    # Without waves above 2 m the sea is so low that it can end, level, where the receiver looks.
-    number = np.fft.fftfreq(cells, period / cells)
-    heights = np.fft.ifft2(np.fft.fft2(heights) * (np.hypot(number[:, None], number) > 0.5)).real
-    heights *= np.clip((x - 0.05) / 0.2, 0, 1)
-    np.save(tmp_path / "sea.npy", heights)
-    resolved = float(np.mean(np.diff(heights, axis=0) ** 2)) / (period / cells) ** 2
-    depths, side, columns = [0.4, 1.5, 7.0], 12.0, 1200
-    places = np.array([-4.0, 0.0, 4.0])
-    labels = np.zeros((columns, columns), dtype=np.uint16)
-    y = (np.arange(columns) + 0.5) / columns * side - side / 2
-    plate_of = np.argmin(np.abs(y[:, None] - places), axis=1)
-    inside = np.abs(y - places[plate_of]) < 1.5
-    labels[columns // 2 - 2 : columns // 2 + 2, inside] = 1 + np.flatnonzero(inside)
-    np.save(tmp_path / "columns.npy", labels)
-    picture = passive.render_passive(
-        build(
-            sun={"zenith_deg": 50.0},
-            sea={
-                "spectrum": "height_map",
-                "filename": str(tmp_path / "sea.npy"),
-                "map_size": period,
-                "slope_variance": str(2 * (resolved + ripple)),
-                "size": 200.0,
-            },
-            rx={
-                "pixel_map": str(tmp_path / "columns.npy"),
-                "altitude": 200.0,
-                "field_of_view_mrad": 1e3 * side / 200.0,
-                "aim_x": -0.1,
-            },
-            integrator={"paths_per_pass": 2**18, "max_scatterings": 0},
-            extra={f"plate{i}": plate(d, 0.05, 1.9, p) for i, (d, p) in enumerate(zip(depths, places, strict=True))},
-        ),
-        passes=4,
-    )
-    contrast = []
-    for number in range(len(depths)):
-        chosen = plate_of[inside] == number
-        light, noise = picture["radiance"].values[chosen], picture["radiance_stderr"].values[chosen]
-        contrast.append(np.sqrt(light.var(ddof=1) - np.mean(noise**2)) / light.mean())
-    assert contrast[1] > 1.2 * contrast[0], contrast
-    assert contrast[1] > 1.2 * contrast[2], contrast

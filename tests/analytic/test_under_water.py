@@ -91,45 +91,6 @@ def test_surface_above_a_diver(build, passes, z_score, integrator):
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
 
 
-#: Scattering by a smooth phase function: the reference connects forward peaks to the laser with few large values.
-TURBID = {"attenuation": 0.4, "scattering": 0.3, "backscattering": 0.006, "phase_function": "hg", "phase_g": 0.6}
-WAVES = {"spectrum": "elfouhaily", "wind_speed": 4.0, "slope_variance": "cox_munk"}
-BALL = {"type": "sphere", "center": [0.1, 0.05, -4.0], "radius": 0.2, "bsdf": {"type": "diffuse"}}
-CASES = {
-    "down": (-1.0, 0.0, {}),
-    "slanted": (-1.0, 50.0, {"bottom": 6.0}),
-    "at a target": (-1.0, 0.0, {"extra": {"ball": BALL}}),
-    "up": (-5.0, 180.0, {}),
-    # The sea reflects the beam after the record.
-    "up beyond the critical angle": (-10.0, 125.0, {}),
-    "beside": (-1.0, 0.0, {"rx": {"aim_x": 0.5, "field_of_view_mrad": 400.0}}),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("case", CASES)
-def test_both_integrators_agree_under_water(build, passes, case):
-    """Gates of 8 ns with scattering of all orders, under waves; the blur of cells is allowed 0.5 %."""
-    altitude, angle, options = CASES[case]
-    options = {**options, "tx": {"divergence_mrad": 60.0}, "rx": {"field_of_view_mrad": 150.0, **options.get("rx", {})}}
-    scenes = [
-        build(altitude, angle, integrator, water=TURBID, sea=WAVES, paths=paths, **options)
-        for integrator, paths in zip(INTEGRATORS, (2**16, 2**16), strict=True)
-    ]
-    merged, reference = (
-        passes(scene, count, seed)[:, 0].reshape(count, -1, 8).sum(axis=2)
-        for scene, count, seed in zip(scenes, (10, 24), (0, 1000), strict=True)
-    )
-    means = [samples.mean(axis=0) for samples in (merged, reference)]
-    errors = [samples.std(axis=0, ddof=1) / np.sqrt(len(samples)) for samples in (merged, reference)]
-    used = (errors[0] < 0.05 * means[0]) & (errors[1] < 0.05 * means[1])
-    z = (np.maximum(np.abs(means[0] - means[1]) - 0.005 * means[1], 0) / np.hypot(*errors))[used]
-    # Beyond the critical angle the reference knows no light after the third gate.
-    assert used.sum() >= (3 if "critical" in case else 4)
-    assert z.max() < largest_z(10, z.size), z
-    assert errors[1][used].min() < 0.01 * means[1][used].max()
-
-
 @pytest.mark.parametrize(("angle", "beside"), [(0.0, 0.0), (40.0, 0.0), (180.0, 0.0), (0.0, 0.5)])
 def test_lines_of_sight_give_depths_below_the_mean_sea_level(build, angle, beside):
     """A point at 8 m below a lidar at 3 m, or the surface above it; a receiver aside meets it at its own distance."""

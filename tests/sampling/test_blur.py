@@ -10,7 +10,7 @@ from scipy.special import erf
 from significance import assert_same, largest_z
 
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread
+from mitransient_lidar.transport.sensor.point_spread import MeasuredPointSpread
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MRAD = 1e-3
@@ -146,29 +146,6 @@ def test_displacements_follow_the_measured_image():
     lit = expected > 50
     assert fine[expected == 0].sum() <= 1e-4 * COUNT  # edges to rounding
     assert_counts(fine[lit], expected[lit])
-
-
-def test_a_measured_gaussian_blurs_as_the_formula_does(tmp_path):
-    ticks = np.linspace(-6, 6, 121)
-    np.save(tmp_path / "psf.npy", 7e3 * np.exp(-(ticks[:, None] ** 2 + ticks**2) / 2 / 1.2**2))
-    beam = {"divergence_mrad": 2.0, "aim_y": 0.4}
-    blur = {"blur_file": str(tmp_path / "psf.npy"), "blur_file_mrad": 12.1}
-    measured, error, _ = energies({**SQUARE, **blur}, beam)
-    formula, other, _ = energies({**SQUARE, "blur_mrad": 1.2}, beam)
-    known = formula > 1e-3
-    # Cells of a twelfth of sigma add their own spread, 0.1^2 / 12 of 1.44 mrad^2.
-    limit = largest_z(COUNT, 16) * np.hypot(error, other) + 2e-3 * formula
-    assert np.all(np.abs(measured - formula)[known] < limit[known])
-    assert np.all(limit[formula > 0.1] < 0.05 * formula[formula > 0.1])
-
-
-def test_gaussian_displacements_have_the_given_width_along_each_axis():
-    rng = mi.PCG32(COUNT, initstate=2 + significance.seed_shift)
-    for g in GaussianPointSpread(2 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32())):
-        values = np.array(g, dtype=np.float64)
-        limit = largest_z(COUNT, 2) / np.sqrt(COUNT)
-        assert values.std() == pytest.approx(2e-3, rel=limit / np.sqrt(2))
-        assert abs(values.mean()) < limit * 2e-3
 
 
 def test_sharp_optics_are_blur_0_to_the_bit():

@@ -167,29 +167,6 @@ def test_value_is_the_closed_form(name, reference):
     np.testing.assert_allclose(value, reference(theta), rtol=1e-2 if name == "petzold" else 2e-3)
 
 
-def test_petzold_has_the_tabulated_values():
-    """Mobley et al. (1993), table 2, over the 0.9929 that the table integrates to under log-log interpolation."""
-    value = closed_form.petzold_average_particle()
-    for degrees, tabulated in (
-        (0.1, 1766.61),
-        (1.0, 71.6082),
-        (10.0, 1.15257),
-        (90.0, 4.29232e-3),
-        (180.0, 3.15366e-3),
-    ):
-        assert float(value(np.radians(degrees))) == pytest.approx(tabulated / 0.9929, rel=2e-4)
-
-
-def test_forward_peak_below_a_tenth_of_a_degree_is_sampled():
-    """Fournier-Forand with bb/b = 0.0183 holds 6.83 % there (closed form); a cosine in float32 would lose it."""
-    _, theta, _, _ = sample_angles("fournier_forand_forward")
-    parameters = closed_form.fournier_forand_parameters(0.0183)
-    for limit in (0.01, 0.1, 1.0):
-        share = float(closed_form.fournier_forand_cdf(np.radians(limit), *parameters))
-        error = np.sqrt(share * (1 - share) / theta.size)
-        assert abs(np.mean(theta < np.radians(limit)) - share) < largest_z(theta.size, 3) * error
-
-
 def test_segments_of_tiny_probability_are_not_drawn_too_often():
     """With bb/b = 0.3 only 1.2e-4 is scattered below 0.1 degree; the bits of one number alone would double it."""
     plugin = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": 0.3})

@@ -114,7 +114,6 @@ def test_mitsubas_path_tracer_sees_a_plate_in_sun_and_sky():
 @pytest.mark.parametrize(
     ("plugin", "message"),
     [
-        ({"type": "sky", "distribution": "starry"}, "distribution = 'starry' must be one of clear, overcast, uniform"),
         ({"type": "sky", "distribution": "overcast"}, "irradiance is missing"),
         ({"type": "sky", "distribution": "uniform", "irradiance": 1.0, "sun_zenith_deg": 3.0}, "leave it out"),
     ],

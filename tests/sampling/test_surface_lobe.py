@@ -125,7 +125,7 @@ def test_ripples_turn_with_the_wind(wind, wi):
 
 
 @pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], [0.2, -0.15, -0.95]])
-def test_anisotropic_ripples_sample_their_density(wi):
+def test_ripples_sample_their_density_and_keep_the_energy(wi):
     si, bsdf = ripples(spectrum="flat", wind_speed=10.0, wind_direction_deg=30.0)
     si.wi = si.to_local(mi.Vector3f(unit(wi).tolist()))
     context = mi.BSDFContext()
@@ -141,3 +141,8 @@ def test_anisotropic_ripples_sample_their_density(wi):
     test = ChiSquareTest(SphericalDomain(), sample, density, 3, sample_count=1_000_000, res=151, ires=8, seed=2)
     assert_distribution(test)
     assert test.pdf_sum > 0.99  # not the agreement of nothing with nothing
+    # In importance mode, where little but masking is lost.
+    context.mode = mi.TransportMode.Importance
+    rng = mi.PCG32(2**18, initstate=1 + significance.seed_shift)
+    first, pair = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    assert 0.99 < np.array(bsdf.sample(context, si, first, pair)[1]).mean() <= 1

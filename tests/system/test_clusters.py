@@ -41,6 +41,13 @@ def scheduler(tmp_path, request):
         process.kill()
 
 
+def worker_command(file, folder, code="pass"):
+    """Return the command of a worker that runs some code first."""
+    code = f"{code}; from distributed.cli.dask_worker import main; main()"
+    options = ["--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    return [sys.executable, "-c", code, *options, "--local-directory", str(folder)]
+
+
 #: A scheduler that soon takes a worker that does not answer for lost.
 IMPATIENT = "import sys, dask; dask.config.set({'distributed.scheduler.worker-ttl': '5s'})"
 
@@ -52,9 +59,7 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler, end):
     """A scheduler and two workers as on a cluster; one is killed, or hangs, while it renders."""
     _, file = scheduler
     path = tmp_path / "cluster.zarr"
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
-    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
-    nodes = [subprocess.Popen(command, **SILENT) for _ in range(2)]
+    nodes = [subprocess.Popen(worker_command(file, tmp_path), **SILENT) for _ in range(2)]
     try:
         seen = []
 
@@ -142,8 +147,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
     """The campaign once waited for ever."""
     path = planned_copy(quick, tmp_path / "unreachable.zarr")
     nowhere = "tcp://127.0.0.1:9"
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
-    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    command = worker_command(scheduler[1], tmp_path)
     with subprocess.Popen(
         [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
     ) as worker:
@@ -229,9 +233,7 @@ OTHERS = {
 def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind):
     """Half of a store once had the numbers of another version."""
     path = planned_copy(quick, tmp_path / "other.zarr")
-    code = f"{OTHERS[kind][0]}; from distributed.cli.dask_worker import main; main()"
-    command = [sys.executable, "-c", code, "--scheduler-file", str(scheduler[1]), "--nthreads", "1", "--no-nanny"]
-    with subprocess.Popen([*command, "--no-dashboard", "--local-directory", str(tmp_path)], **SILENT) as worker:
+    with subprocess.Popen(worker_command(scheduler[1], tmp_path, OTHERS[kind][0]), **SILENT) as worker:
         text = rf"the worker at tcp://127\.0\.0\.1:\d+ has {re.escape(OTHERS[kind][1])}: all that"
         try:
             with pytest.raises(UserError, match=text):
@@ -255,8 +257,7 @@ def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
 @pytest.mark.parametrize("scheduler", ["import sys; sys.modules['mitransient_lidar'] = None"], indirect=True)
 def test_a_scheduler_without_the_package(quick, tmp_path, scheduler):
     path = planned_copy(quick, tmp_path / "other.zarr")
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
-    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    command = worker_command(scheduler[1], tmp_path)
     with subprocess.Popen(command, **SILENT) as worker:
         try:
             with pytest.raises(UserError, match="the scheduler has no mitransient-lidar, or another version: it must"):

@@ -34,8 +34,9 @@ def test_plugins_are_refused_and_ignored_as_the_page_states():
         assert verdict == "ignored" or told.count(". ") == 0
 
 
-#: In the long tier, half a minute each: other tests have the common shapes and materials, and one call holds all kinds.
-LONG = (mitsuba_plugins.shapes, mitsuba_plugins.bsdfs)
+#: In the long tier, half a minute each: other tests have the common shapes, materials and phase functions, and one call
+#: holds all kinds.
+LONG = (mitsuba_plugins.shapes, mitsuba_plugins.bsdfs, mitsuba_plugins.phase_functions)
 
 
 @pytest.mark.parametrize(

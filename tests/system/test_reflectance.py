@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis.retrieval import retrieve
@@ -78,15 +79,17 @@ def test_reflectance_within_its_error(tx, rx, shot):
 @pytest.mark.slow
 @pytest.mark.parametrize("jerlov", [pytest.param("1C", marks=pytest.mark.long), "5C"])
 def test_forward_scattering_leaves_no_bias(jerlov, shot):
-    """If the light of the bottom decayed as that of the column does, 5C would have 0.11 +- 0.03."""
+    """Limits are biases, and chance by the spreads from seed to seed, both measured in eight shots of 5C.
+
+    If the light of the bottom decayed as that of the column does, 5C would have 0.11, 27 % less.
+    """
     seen = shot(water={"jerlov": jerlov})
-    found, water = retrieve.bottom(seen, LEVEL), retrieve.water(seen)
-    np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.12)
-    assert (np.abs(found["reflectance"] - RHO) < 2 * found["reflectance_stderr"]).all()
+    found, water, true = retrieve.bottom(seen, LEVEL), retrieve.water(seen), water_of("jerlov", jerlov)
+    z = largest_z(10**6, 5)
+    np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.01 + 0.042 * z)
     assert (found["reflectance_stderr"] < 0.2 * found["reflectance"]).all()
-    true = water_of("jerlov", jerlov)
-    for name in ("absorption", "backscattering"):
-        assert float(water[name]) == pytest.approx(getattr(true, name), rel=0.08)
+    assert float(water["absorption"]) == pytest.approx(true.absorption, rel=0.01 + 0.0145 * z)
+    assert float(water["backscattering"]) == pytest.approx(true.backscattering, rel=0.035 + 0.02 * z)
 
 
 @pytest.mark.slow

@@ -207,33 +207,6 @@ def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite()
     assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("integrator", "count", "fastest"), [("lidar_volpath", 8, 8), ("lidar_merging", 3, 64)])
-def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, count, fastest):
-    """Logarithm of the ratio of variances, averaged over gates of late light, with its jackknife error.
-
-    Merging counts pairs of a photon and a point, of which there are 64 times as many: where pairs are rare, its
-    variance falls faster than that of paths.
-    """
-    groups, variances = 32, []
-    for paths in (2**11, 2**14):
-        photons = {"photons_per_pass": paths} if integrator == "lidar_merging" else {}
-        engine = mi.load_dict({"type": integrator, "paths_per_pass": paths, **photons})
-        scene = loading.open_scene("table1", {"spectrum": "flat"}).scene
-        renderer = engine.prepare(scene, scene.sensors()[0])
-        # Late light only: surface echo and early column are stratified and fall faster.
-        energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(count * groups)])
-        gates = energy.reshape(groups, count, 8, 40).sum(axis=-1)
-        left_out = [np.delete(gates, group, axis=0).reshape(-1, 8) for group in range(groups)]
-        variances.append([sample.var(axis=0, ddof=1) for sample in left_out])
-    ratios = np.log(np.divide(*variances)).mean(axis=1)
-    error = np.sqrt((groups - 1) * ratios.var())
-    # Four draws gave 0.06 to 0.11.
-    assert error < 0.15
-    limit = largest_z(groups) * error
-    assert np.log(8) - limit < ratios.mean() < np.log(fastest) + limit
-
-
 INVALID_INPUT = [
     ({"params": {"wind_sped": 3}}, "wind_sped.*did you mean wind_speed"),
     ({"params": {"surface_cell_size": 4}}, "cell_size = 4 m is coarser than the beam's footprint on the sea, 2.13 m"),

@@ -12,7 +12,6 @@ from significance import assert_same, largest_z
 
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.transport.pose import KernelPose
@@ -26,39 +25,6 @@ def prepared(scene, params, integrator):
     session = open_scene(scene, params)
     chosen = choose_integrator(session.scene, integrator)
     return chosen.prepare(session.scene, session.sensor)
-
-
-# In the slow tier the next test does, with places and poses.
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("scene", "integrator"),
-    [("docs/guide/survey_lidar.xml", "lidar_merging"), ("table1", "lidar_merging"), ("table1", "lidar_volpath")],
-)
-def test_batches_give_what_single_shots_do(scene, integrator):
-    """Places of a sea of 6 m/s, one of them 280 m away, over a slope with sand waves and over a level bottom.
-
-    A sea or a bottom that is not displaced with the lidar has echoes at other times.
-    """
-    params, passes = {"wind_speed": 6}, 24
-    if scene == "table1":
-        params |= RECORD
-    renderer = prepared(scene, params, integrator)
-    share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
-    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [])
-    several = batches.at(ShotPoses(PLACES))(passes)
-    seeds = [pass_seed(number, each) for number in range(len(PLACES)) for each in range(passes)]
-    bins = renderer.scene.axis.bin_count
-    together = several.render_pass(seeds).histogram.energy().reshape(len(PLACES), passes, -1, bins)
-    for place, found in zip(PLACES, together, strict=True):
-        alone = prepared(scene, {**params, "aim_x": place[0], "aim_y": place[1]}, integrator).scaled(share)
-        axis = alone.scene.axis
-        shift = round((axis.start_ns - renderer.scene.axis.start_ns) / axis.bin_width_ns)
-        energy = np.array([alone.render_pass(1000 + seed).histogram.energy() for seed in range(passes)])
-        first, last = max(shift, 0), min(bins, shift + axis.bin_count)
-        pair = [found[..., first:last], energy[..., first - shift : last - shift]]
-        edges = np.linspace(0, last - first, 12).astype(int)[:-1]
-        # Cells of so few photons are up to twice as wide: 0.3 % of the water's signal.
-        assert_same(*(np.add.reduceat(each, edges, axis=-1) for each in pair), error=0.05, bias=0.01)
 
 
 def looking(place, azimuth_deg, off_nadir_deg, height, roll_deg):
@@ -93,11 +59,8 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [])
-    stacked = KernelPose(
-        *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
-    )
     lengths = np.array([0.11, 0.07])
-    poses = ShotPoses.of_receiver(renderer.scene, stacked).delayed(lengths)
+    poses = ShotPoses.of_receiver(renderer.scene, stacked(given)).delayed(lengths)
     np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)
     seeds = [pass_seed(number, each) for number in range(len(shots)) for each in range(passes)]
     axis = renderer.scene.axis
@@ -111,6 +74,13 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
         edges = np.linspace(0, axis.bin_count, 14).astype(int)[:-1]
         pair = [np.add.reduceat(each, edges, axis=-1) for each in (found, energy)]
         assert_same(*pair, error=0.06, bias=0.01)
+
+
+def stacked(given):
+    """Return poses as one."""
+    return KernelPose(
+        *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
+    )
 
 
 def alone_at(scene, params, pose, record, integrator):
@@ -137,10 +107,7 @@ def test_poses_over_a_plume_give_what_single_shots_do():
     share = 2**12 / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [])
     assert batches.size == 1
-    stacked = KernelPose(
-        *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
-    )
-    poses, axis = ShotPoses.of_receiver(renderer.scene, stacked), renderer.scene.axis
+    poses, axis = ShotPoses.of_receiver(renderer.scene, stacked(given)), renderer.scene.axis
     later = poses.extra_range(renderer.scene) / 0.299792458
     for number, (pose, delay) in enumerate(zip(given, later, strict=True)):
         alone = alone_at("ship_wake", params, pose, replace(axis, start_ns=axis.start_ns + delay), None).scaled(share)
@@ -200,18 +167,6 @@ def test_a_level_scene_is_the_same_everywhere(integrator):
     np.testing.assert_allclose(total, total[0], rtol=1e-3)
 
 
-@pytest.mark.long
-def test_pixels_of_a_batch_add_up_to_one_pixel():
-    sums = []
-    for layout in ("2x2", "1x1"):
-        series = render_shots(
-            "table1", {"layout": layout, "wind_speed": 6}, positions=PLACES, passes=2, pass_share=0.02
-        )
-        sums.append(series["impulse_response"].sum("pixel").values)
-    np.testing.assert_allclose(sums[0], sums[1], rtol=1e-12)
-    assert sums[0].max() > 0
-
-
 @pytest.mark.slow
 def test_target_goes_with_the_shots():
     """On a level sea all shots are the same, those with a target that goes with them too, by the origin of the light.
@@ -253,27 +208,3 @@ def test_requested_errors_are_reached_and_hold():
     known = shares.std(ddof=1) / np.sqrt(len(shares))
     assert known < 0.03
     assert abs(shares.mean() - expected) < largest_z(len(shares)) * known
-
-
-@pytest.mark.long
-def test_light_of_shots_by_origin():
-    """The sum of the parts is the whole to the bit, and each part that of single shots."""
-    params = {"wind_speed": 6, "layout": "2x2", **RECORD}
-    x, y = PLACES[1]
-    options = {"positions": [(x, y)] * 8, "passes": 8, "pass_share": 0.05, "move_target": True}
-    series = render_shots("fig13_2x2", params, components=True, **options)
-    assert list(series["origin"].values) == ["surface", "water", "target", "bottom"]
-    assert series["waveform_by_origin"].dims == ("shot", "origin", "pixel", "time")
-    for name in ("impulse_response", "waveform"):
-        np.testing.assert_array_equal(series[f"{name}_by_origin"].sum("origin"), series[name])
-    whole = render_shots("fig13_2x2", params, **options)
-    # The same paths, added in another order.
-    np.testing.assert_allclose(series["waveform"], whole["waveform"], rtol=1e-9, atol=1e-30)
-    there = {"aim_x": x, "aim_y": y, "target_x": x, "target_y": y}
-    alone = render("fig13_2x2", params={**params, **there}, passes=16, seed=77, components=True)
-    assert list(alone["origin"].values) == list(series["origin"].values)
-    mean, each = (one["impulse_response_by_origin"].sum(["pixel", "time"]) for one in (alone, series))
-    # 8 shots of 8 passes have a fifth of the paths of 16 full ones.
-    error = each.std("shot", ddof=1) / np.sqrt(8) * np.sqrt(1.2)
-    assert (error / mean).max() < 0.1
-    assert (np.abs(each.mean("shot") - mean) / error).max() < largest_z(8, 4)

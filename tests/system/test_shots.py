@@ -13,7 +13,6 @@ from significance import largest_z
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import scenes
-from mitransient_lidar.plots.studies.find_shots import plot_found_shots
 from mitransient_lidar.studies import find_shots as shots
 from mitransient_lidar.studies import shot_statistics
 
@@ -53,42 +52,6 @@ def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
     for first, second in pairwise(found):
         if first.kind == second.kind:
             assert math.hypot(first.x - second.x, first.y - second.y) > 4
-
-
-@pytest.mark.long
-def test_faces_towards_the_lidar_have_the_strongest_surface_echoes():
-    """The published effect, as the geometric mean over four places: at single ones it may be the other way round.
-
-    Over six places the factors are 7 and 2.4, with errors of 40 %.
-    """
-    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=4)
-    found = [shot for shot in found if shot.kind in ("towards", "level", "away")]
-    results = shots.render_found_shots("fig09_2x2", found, WAVES).results
-    peaks = np.array([float(shot.waveform.sel(time=slice(1405, 1435)).max("time").sum()) for shot in results])
-    towards, level, away = np.exp(np.log(peaks).reshape(3, 4).mean(axis=1))
-    assert towards > 2.5 * level
-    assert level > 1.3 * away
-
-
-@pytest.mark.long
-def test_found_shots_are_drawn_on_their_sea(tmp_path):
-    scene = few_paths("fig09_2x2", tmp_path)
-    found = shots.find_shots(scene, WAVES, slope_sigmas=1.5)
-    rendered = shots.render_found_shots(scene, found, WAVES)
-    # Quarters of a circle of 15 mrad full angle on a level sea 212.8 m away: 1.596 m across, and along the azimuth
-    # 200 m (tan(20 deg + 7.5 mrad) - tan(20 deg)) on the far side.
-    mapped = [np.argwhere(rendered.pixel_map == pixel) for pixel in range(rendered.pixel_count)]
-    pitch = rendered.pixel_lines[1] - rendered.pixel_lines[0]
-    extents = [pitch * np.ptp(nodes, axis=0) for nodes in mapped]
-    np.testing.assert_allclose(extents, [(1.596, x) for x in (1.703, 1.703, 1.694, 1.694)], atol=2 * pitch, rtol=0)
-    middles = [rendered.pixel_lines[0] + pitch * nodes.mean(axis=0) for nodes in mapped]
-    # Far pixels, red and green, lie at +x, and green and black at +y.
-    assert [(x > 0, y > 0) for y, x in middles] == [(True, False), (True, True), (False, False), (False, True)]
-    assert (rendered.azimuth, rendered.scene) == (0.0, "small")
-    assert rendered.beam_spread == pytest.approx((1.064 / math.cos(math.radians(20)), 1.064), rel=1e-3)
-    panels = [ax for ax in plot_found_shots(rendered).axes if ax.get_ylabel() == "power (mW)"]
-    assert [ax.get_title().split()[0] for ax in panels] == list(shots.SLOPE_KINDS)
-    np.testing.assert_allclose(panels[0].lines[2].get_ydata(), 1e3 * rendered.results[0].waveform[2])
 
 
 @pytest.mark.slow

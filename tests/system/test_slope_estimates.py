@@ -16,7 +16,6 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarS
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
@@ -128,22 +127,6 @@ WATERS = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", WATERS)
-def test_waters(name):
-    """a and Kd within 10 %, bb within 17 %; of c no more than bounds. The estimate of the column shares no code.
-
-    Petzold's phase functions hold the molecules that the retrieval adds: bb of the second is 15 % low.
-    """
-    kind, kept = name.split()
-    params = {kind: kept, "bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
-    found = retrieve.water(mitransient_lidar.render("fig09_1x1", params=params, passes=4, seed=4))
-    true = water_of(kind, kept)
-    for quantity, limit in (("absorption", 0.1), ("kd", 0.1), ("backscattering", 0.17)):
-        assert float(found[quantity]) == pytest.approx(getattr(true, quantity), rel=limit)
-    assert found["attenuation_low"] < true.attenuation < found["attenuation_high"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WATERS)
 def test_waters_in_closed_form(name):
@@ -153,7 +136,9 @@ def test_waters_in_closed_form(name):
     scattering by bb and decays with a + bb. Light that is scattered more often adds to the column with depth: the
     retrieval must return a between a and a + bb, and less than bb. For the sun at the zenith, Kirk (1984), Limnol.
     Oceanogr. 29, 350, doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold:
-    7 to 12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses.
+    3 to 12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses.
+
+    Without noise, limits are of size.
     """
     absorption, scattering, backscattering = WATERS[name]
     angle, index, group = math.radians(20), 1.34, 1.364
@@ -174,7 +159,8 @@ def test_waters_in_closed_form(name):
     arrays = [pulsed * 0.5e-9, 0 * pulsed, pulsed, 1e-4 * pulsed + 1e-12]
     options = {"time": time, "pixel_names": ["all"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": attributes}
     found = retrieve.water(results.build(*arrays, **options), efficiency=0.81 * 0.9)
-    assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=0.01)
+    assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=1e-3)
     assert absorption < float(found["absorption"]) < absorption + backscattering
-    assert 0.7 * backscattering < float(found["backscattering"]) < backscattering
-    assert float(found["kd"]) == pytest.approx(math.sqrt(absorption**2 + 0.235 * absorption * scattering), rel=0.15)
+    assert 0.75 * backscattering < float(found["backscattering"]) < 0.97 * backscattering
+    kirk = math.sqrt(absorption**2 + 0.235 * absorption * scattering)
+    assert 0.87 * kirk < float(found["kd"]) < 0.98 * kirk

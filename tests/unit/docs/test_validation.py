@@ -1,6 +1,8 @@
 """The page of the validation has the rows of its table, and these are consistent."""
 
 import csv
+import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -27,3 +29,13 @@ def test_ratio_and_z_are_those_of_the_values():
             assert float(row["z"]) == pytest.approx(z, rel=0.12, abs=0.06 + 1e-4 * abs(theirs) / error)
         else:
             assert row["z"] == ""
+
+
+def test_the_script_finds_what_it_takes_from_tests(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "analytic")
+    text = (FOLDER / "validate.py").read_text("utf-8")
+    modules = re.findall(r"^import (test_\w+) as (\w+)", text, re.MULTILINE)
+    assert len(modules) == 3
+    for module, alias in modules:
+        found = importlib.import_module(module)
+        assert [name for name in re.findall(rf"\b{alias}\.(\w+)", text) if not hasattr(found, name)] == []

@@ -118,6 +118,15 @@ def test_every_number_outside_its_range_is_refused(plugin, tmp_path, monkeypatch
             assert f"{value:g}" in str(caught.value) or str(value) in str(caught.value)
 
 
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_text_that_is_no_choice_is_refused(plugin):
+    for each in DECLARED[plugin]:
+        if each.choices:
+            message = f"{each.name} = 'nonsense' must be one of {', '.join(each.choices)}"
+            with pytest.raises(UserError, match=message), as_user_error():
+                mi.load_dict({"type": plugin, each.name: "nonsense"})
+
+
 def test_manual_pages_have_the_table_of_the_declared_parameters():
     pages = {
         match[1]: part.__doc__

@@ -13,7 +13,6 @@ from mitransient_lidar.transport.sensor.hex_pixels import hexagon_count
 BRIGHT = {"sea": {"slope_variance": "0.02"}, "film": {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 7}}
 BRIGHT |= {"integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14}}
 MERGING = {**BRIGHT, "integrator": {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}}
-SQUARE = {"field_of_view_mrad": 20.0, "field_of_view_shape": "square"}
 
 
 def polygon(corners, **more):
@@ -49,9 +48,15 @@ class OnePixel:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("receiver", [{"layout": "hex7", "fill_factor": 0.5}, {"layout": "3x5", "fill_factor": 0.5}])
-def test_pixels_of_a_layout_share_its_light_without_loss(receiver, lidar_scene, passes):
+@pytest.mark.parametrize(
+    "receiver",
+    [{"layout": "hex7", "fill_factor": 0.5}, {"layout": "3x5", "fill_factor": 0.5}, {"pixel_map": "map.png"}],
+    ids=["hexagons", "cells", "map"],
+)
+def test_pixels_share_the_light_of_their_area_without_loss(receiver, lidar_scene, passes, png):
     """The sum over pixels has the same bits as a single pixel of the same paths."""
+    if "pixel_map" in receiver:
+        receiver = {"pixel_map": png(np.random.default_rng(2).integers(0, 6, (9, 12)).astype(np.uint8))}
     scene = lidar_scene(rx={**receiver, "blur_mrad": 1.0}, **BRIGHT)
     apart = passes(scene, 2)
     sensor = scene.sensors()[0]
@@ -61,53 +66,6 @@ def test_pixels_of_a_layout_share_its_light_without_loss(receiver, lidar_scene, 
     assert together.shape[1] == 1
     np.testing.assert_allclose(apart.sum(axis=1), together[:, 0], rtol=1e-12)
     assert np.count_nonzero(together) == together.size
-
-
-@pytest.mark.slow
-def test_cells_sum_to_the_whole_square(lidar_scene, passes):
-    whole = passes(lidar_scene(rx={**SQUARE, "layout": "1x1"}, **BRIGHT), 2)
-    for layout in ("4x1", "8x8"):
-        parts = passes(lidar_scene(rx={**SQUARE, "layout": layout, "imager": False}, **BRIGHT), 2)
-        np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_labels_sum_to_the_map_with_one_label(png, lidar_scene, passes):
-    labels = np.random.default_rng(2).integers(0, 6, (9, 12)).astype(np.uint8)
-    maps = [png(labels, "parts.png"), png((labels > 0).astype(np.uint8), "whole.png")]
-    parts, whole = (passes(lidar_scene(rx={"pixel_map": path}, **BRIGHT), 2) for path in maps)
-    assert parts.shape[1] == 5
-    np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
-    """Seven hexagons of side s: 18 corners."""
-    side = 10.0 / np.sqrt(7)
-    angles = np.radians(60 * np.arange(6))
-    corners = []
-    for a in angles + np.radians(30):
-        # The outer hexagon in this direction has its corners 3 to 5 away from the centre, one of them shared.
-        centre = np.sqrt(3) * side * np.array([np.cos(a), np.sin(a)])
-        for turn in (-90, -30, 30):
-            corners.append(centre + side * np.array([np.cos(a + np.radians(turn)), np.sin(a + np.radians(turn))]))
-    hexagons = lidar_scene(rx={"layout": "hex7", "field_of_view_mrad": 20.0}, **BRIGHT)
-    outline = lidar_scene(rx={"a": polygon(corners)}, **BRIGHT)
-    pixels = [scene.sensors()[0].receiver.pixels for scene in (hexagons, outline)]
-    assert pixels[0].area == pytest.approx(pixels[1].area, rel=1e-6)
-    assert_same(passes(hexagons, 12).sum(axis=1), passes(outline, 12, 50).sum(axis=1), error=0.04)
-
-
-@pytest.mark.long
-def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
-    """With gaps, away from the centre: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
-    layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
-    centre, half = (2.5, -20 / 3), (2.0, 0.4 * 20 / 3)
-    corners = [(centre[0] + i * half[0], centre[1] + j * half[1]) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    alone = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
-    pixels = layout.sensors()[0].receiver.pixels
-    np.testing.assert_allclose(1e3 * pixels.centres()[5], centre, atol=1e-9)
-    assert_same(passes(layout, 12)[:, 5], passes(alone, 12, 50)[:, 0], error=0.03)
 
 
 @pytest.mark.long

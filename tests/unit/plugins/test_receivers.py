@@ -91,26 +91,6 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_view_counts_every_overlapping_pixel_in_full():
-    """Two concentric circles: light shared between them would halve the small one."""
-    fields = {"wide": 30.0, "narrow": 10.0}
-    nested = {
-        name: {"type": "pixel_fov", "field_of_view_mrad": width, "pixel_name": name} for name, width in fields.items()
-    }
-    receiver = mi.load_dict({"type": "multipixel_receiver", **nested}).receiver
-    view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
-    assert view.use_footprint
-    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(9, 0, COUNT))
-    weight, pixel = np.array(start.weight, dtype=np.float64), np.array(start.pixel)
-    for index, name in enumerate(receiver.pixels.names):
-        samples = COUNT * weight * (pixel == index)
-        expected = COLLECTION * 2 * np.pi * (1 - 1 / np.hypot(1, 0.5e-3 * fields[name]))
-        error = samples.std() / np.sqrt(COUNT)
-        assert error < 5e-3 * expected
-        assert abs(samples.mean() - expected) < largest_z(COUNT, 2) * error
-
-
 def test_view_leaves_a_footprint_alone_that_it_does_not_see():
     receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 10.0}).receiver
     uses = [
@@ -179,37 +159,6 @@ def test_film_keeps_the_last_pass(lidar_scene):
 def test_foreign_integrators_are_refused():
     with pytest.raises(UserError, match="use the integrator lidar_merging or lidar_volpath"):
         mi.load_dict({"type": "time_gated_film"}).create_block()
-
-
-@pytest.mark.parametrize("profile", ["gaussian", "top_hat"])
-def test_light_on_a_plane_across_the_beam_is_the_pulse(profile):
-    """Energy per area over a plate at 200 m adds up to 5 mJ x 0.9: a wrong inverse square or cosine would not."""
-    laser = mi.load_dict({"type": "lidar_transmitter", "beam_profile": profile, "divergence_mrad": 10.0})
-    pose = laser.pose
-    ticks = (np.arange(800) + 0.5) / 800 * 14 - 7
-    x, y = (g.ravel() for g in np.meshgrid(ticks, ticks))
-    points = pose.origin[:, None] + 200 * pose.axis[:, None] + np.outer(pose.far, x) + np.outer(pose.left, y)
-    it = dr.zeros(mi.SurfaceInteraction3f, x.size)
-    it.p = mi.Point3f(points)
-    ds, weight = laser.sample_direction(it, mi.Point2f(0.5))
-    np.testing.assert_array_equal(np.array(weight).ravel(), np.array(laser.eval_direction(it, ds)).ravel())
-    cosine = -np.array(dr.dot(ds.d, mi.Vector3f(pose.axis.tolist())))
-    np.testing.assert_allclose(cosine, 200 / np.sqrt(200**2 + x**2 + y**2), rtol=1e-5)
-    energy = np.sum(np.array(weight).ravel().astype(np.float64) * cosine) * (ticks[1] - ticks[0]) ** 2
-    assert energy == pytest.approx(4.5e-3, rel=2e-3 if profile == "top_hat" else 1e-4)
-
-
-def test_rays_of_the_laser_leave_its_point_with_all_its_energy():
-    laser = mi.load_dict({"type": "lidar_transmitter", "aim_x": 4.0})
-    ray, weight = laser.sample_ray(0.0, mi.Float(0.5), mi.Point2f(0.5), uniform_pair(4096))
-    assert np.all(np.array(weight) == np.float32(4.5e-3))
-    np.testing.assert_allclose(np.array(ray.o)[:, 0], laser.pose.origin, atol=1e-4)
-    # Rays are where the intensity is: 5 mrad standard deviation along each axis.
-    angle_x, angle_y, cosine = laser.pose.tangent(ray.d)
-    for g in (np.array(angle_x), np.array(angle_y)):
-        assert abs(np.mean(g**2) / 25e-6 - 1) < largest_z(4096, 2) * np.sqrt(2 / 4096)
-    assert np.all(np.array(cosine) > 0.99)
-    assert float(laser.intensity(mi.Vector3f((-laser.pose.axis).tolist()))[0]) == 0
 
 
 def test_nested_pixels_load_without_warnings(capfd):

@@ -171,12 +171,6 @@ def test_a_long_record_needs_no_more_segments_at_first():
     assert renderer.layout.light_segments == renderer.layout.sensor_segments == 64
 
 
-@pytest.mark.long
-def test_a_long_record_is_rendered_in_little_memory(tmp_path):
-    _, peak = limited('ml.render("table1", params={"bin_width_ns": 1e6, "aim_x": -1e6}, passes=2)', tmp_path)
-    assert peak < 5e8
-
-
 RENDER = 'ml.render("table1", params={{**small, {}}}, passes=2, {})'
 MERGING = 'integrator={{"type": "lidar_merging", "{}_per_pass": 2**19}}'
 SHOTS = 'ml.render_shots("table1", params={{**small, "bin_count": {}}}, count={}, passes=2)'

@@ -131,19 +131,6 @@ def test_no_other_weights_do_better():
 
 
 @pytest.mark.slow
-def test_common_clutter_is_subtracted():
-    """Clutter c in both samples, the target in one: s C^-1 s = (1 + c^2)/(1 + 2 c^2), and 1/(1 + c^2) of one alone."""
-    random = np.random.default_rng(2)
-    clutter = np.repeat(random.normal(0, 3, (400, 1)), 2, axis=1)
-    noise = np.repeat(np.eye(2)[None], 400, axis=0)
-    cases = Cases(clutter, noise, clutter + np.array([1, 0]), noise)
-    both, alone = cases.statistic().deflection, cases.combined(np.array([[1.0, 0.0]])).statistic().deflection
-    # 400 seas know the clutter's spread, and so the deflection, to 3.5 %; little of it is left in the best weighting.
-    assert both == pytest.approx(np.sqrt(10 / 19), rel=0.02)
-    assert alone == pytest.approx(np.sqrt(1 / 10), rel=5 * 0.035)
-
-
-@pytest.mark.slow
 def test_no_sea_is_judged_by_weights_that_have_seen_it():
     """Weights of 8 seas in 10 samples fit them: their own spread is below that on new seas."""
     random = np.random.default_rng(3)

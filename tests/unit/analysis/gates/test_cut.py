@@ -131,32 +131,6 @@ def test_error_is_inflated_as_measured_in_the_render():
     assert error(2.0, dataset=exaggerated) == pytest.approx(4)
 
 
-@pytest.mark.slow
-def test_error_of_correlated_passes():
-    """The stated errors of gates are those of passes whose bins share light, once the inflation has been measured."""
-    rng = np.random.default_rng(11)
-    passes, kernel = 4000, np.exp(-0.5 * (np.arange(-12, 13) / 4.25) ** 2)
-    noise = rng.standard_normal((passes, BINS + kernel.size - 1))
-    samples = np.apply_along_axis(np.convolve, 1, noise, kernel / kernel.sum(), "valid")
-    sizes = [1, 2, 4, 8, 16, 32]
-    total = np.cumsum(samples, axis=1)
-    inflation = []
-    for n in sizes:
-        sums = total[:, n:] - total[:, :-n]
-        inflation.append(float(np.sqrt(np.mean(sums.var(axis=0)) / (n * np.mean(samples.var(axis=0))))))
-    attributes = GEOMETRY | {"error_inflation_bins": sizes, "error_inflation": inflation}
-    # Each pixel of this record is a pass; the error of one is the spread over all.
-    dataset = record(values=samples, relative=0.0, attributes=attributes)
-    dataset["waveform_stderr"][:] = samples.std(axis=0)
-    train = GateTrain(1430.0, 10.0, 10.0, 4, 2.0, 3.0)
-    stack = gating.cut_gates(dataset, train)
-    seen, stated = stack["gate_energy"].std("pixel", ddof=1), stack["gate_energy_stderr"][0]
-    # A spread of 4000 is known to 1.1 %; soft edges and the interpolation are an approximation of some per cent.
-    np.testing.assert_allclose(seen / stated, 1, atol=0.10)
-    # Without the inflation the errors would be off by a factor: 0.4 as quadrature, 1.3 and more as the bound.
-    assert inflation[4] > 2.2
-
-
 def test_stack_is_labelled():
     train = GateTrain(1418.0, 6.0, 3.0, 5, 1.0, 2.0, pulses=3)
     dataset = record(scale=np.ones(6), grid=(2, 3))

@@ -10,7 +10,7 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
 ELECTRON = 1.602176634e-19
 T = np.arange(60.0)
@@ -75,14 +75,6 @@ def test_time_offset_is_the_difference_of_bins():
     information = np.sum((0.5 * (later - earlier)) ** 2 / shape)
     assert float(found["bound"].sel(parameter="time_offset")) == pytest.approx(information**-0.5, rel=1e-4)
     assert found["parameter_units"].values.tolist() == ["1/m", "ns"]
-
-
-def test_time_of_a_pulse_in_white_noise():
-    """Height A in noise s: sqrt(2 sigma dt/sqrt(pi)) s/A, the width over the signal-to-noise ratio."""
-    shape, slope = pulse(500.0)
-    found = fisher_information(result(PHOTON * shape, {"time": PHOTON * slope}), WHITE)
-    expected = np.sqrt(2 * 4.0 / np.sqrt(np.pi)) * DEVIATION / (500 * VOLTS)
-    assert float(found["bound"][0]) == pytest.approx(expected, rel=1e-3)
 
 
 def test_samples_correlated_by_a_single_pole():
@@ -164,44 +156,6 @@ def test_fits_of_counts_scatter_as_the_bound(record_property):
     assert squares < largest_chi2(800)
     # The scatter is no smaller, either: sums of 800 squares have the standard error sqrt(2 / 800).
     assert squares > 800 * (1 - largest_z(800) * np.sqrt(2 / 800))
-
-
-@pytest.mark.slow
-def test_fits_of_an_avalanche_photodiode_scatter_as_the_bound(record_property):
-    """Fits of 400 records with shot noise and amplifier noise, correlated by the bandwidth and rounded.
-
-    Least squares under the covariance of the noise, which leave out the information in the variance; the steady light
-    makes that small. A bound by the variances alone, without the correlation, would be 24 % too low.
-    """
-    chain, data, sky = RECEIVERS["apd"], decay(), 400 * PHOTON
-    found = fisher_information(data, chain, sky)
-    samples, other = (
-        detect_waveforms(data, chain, count, seed, sky)["signal"].values[:, 0].astype(float)
-        for count, seed in ((400, 6), (20_000, 7))
-    )
-
-    def mean(height, rate):
-        light = PHOTON * height * np.exp(-rate * T)[None]
-        return detect_waveforms(result(light, {"none": light}), chain, 1, 0, sky)["signal_mean"].values[0]
-
-    # Covariance and derivatives from the simulation itself: from other records, and nearby light.
-    weights = np.linalg.inv(np.cov(other.T))
-    truth, step = np.array([HEIGHT, RATE]), np.array([1.0, 1e-4])
-    slopes = np.stack(
-        [(mean(*(truth + step * one)) - mean(*(truth - step * one))) / (2 * step @ one) for one in np.eye(2)]
-    )
-    # One step of least squares from the truth: the light is linear within the error.
-    error = np.linalg.solve(slopes @ weights @ slopes.T, slopes @ weights @ (samples - mean(*truth)).T).T
-    squares = np.einsum("ia,ab,ib->", error, found["information"].values, error)
-    record_property("chi2_per_freedom", float(squares / 800))
-    share = float(found["variance_share"].max())
-    assert share < 0.015
-    # 20 000 records and 60 samples leave the weights 0.3 % short of the best.
-    assert abs(squares / 800 - 1) < largest_z(800) * np.sqrt(2 / 800) + share + 0.003
-    diagonal = slopes / np.var(other, axis=0) @ slopes.T
-    ratio = np.sqrt(np.diagonal(np.linalg.inv(diagonal)) / np.diagonal(np.linalg.inv(found["information"].values)))
-    record_property("bound_without_correlation", np.ravel(ratio).tolist())
-    assert np.all((ratio > 0.7) & (ratio < 0.8))
 
 
 def test_noise_of_one_render_is_reported():

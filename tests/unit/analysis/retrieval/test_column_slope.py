@@ -4,7 +4,6 @@ import logging
 
 import numpy as np
 import pytest
-from command_line import run
 from few_paths import few_paths
 from oracles.column_slope import effective_attenuation
 from significance import largest_z
@@ -144,60 +143,6 @@ def test_the_time_leaves_out_the_widest_fields_of_view(caplog, tmp_path):
     assert "fields of view of 15, 20 mrad are left out" in caplog.text
     whole = fov_sweep(scene, [10], {**SCENE, "bin_count": 110}, **options)
     assert whole.attrs["left_out_mrad"] == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--fov-mrad", "2,wide"], "--fov-mrad = '2,wide' must hold numbers only"),
-        (["--fov-mrad", "0,5"], "each greater than 0"),
-        (["--min-depth", "5", "--max-depth", "1"], "max_depth = 1 m must be greater than min_depth = 5 m"),
-        # The far edge, 15 mrad out, meets the surface 7.956 ns late: 0.845 m at the group index 1.364.
-        (["--min-depth", "0.1"], "min_depth = 0.1 m must be at least 0.845 m"),
-        (["--passes", "3"], "passes = 3 must lie between 4 and 10000"),
-        (["--seed", "-1"], "seed = -1 must lie between"),
-    ],
-)
-def test_command_says_one_sentence(tmp_path, arguments, message):
-    done = run("fov-sweep", "table1", "-q", "-o", tmp_path / "sweep.png", *arguments)
-    assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.output
-    assert message in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_command_writes_table_plot_and_file(tmp_path):
-    target = tmp_path / "new" / "views.svg"
-    define = [part for name, value in SCENE.items() for part in ("-D", f"{name}={value}")]
-    command = [
-        "fov-sweep",
-        few_paths("table1", tmp_path),
-        *define,
-        "--fov-mrad",
-        "20,5",
-        "--passes",
-        "16",
-        "--max-depth",
-        "4",
-        "-q",
-        "-o",
-        str(target),
-    ]
-    done = run(*command)
-    assert done.exit_code == 0, done.output
-    lines = done.stdout.splitlines()
-    assert lines[:2] == [str(target), str(target.with_suffix(".nc"))]
-    # 5 mrad from 200 m: a radius of 0.5 m, 0.15 attenuation lengths.
-    assert lines[4].split()[:3] == ["5", "0.5", "0.150"]
-    assert lines[5].split()[:3] == ["20", "2", "0.600"]
-    assert lines[6].startswith("c = 0.3000, Kd = 0.1688")
-    import xarray as xr
-
-    with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
-        assert found["impulse_response"].shape == (2, 80)
-        assert found.attrs["scene.field_of_view_mrad"] == "20.0"
-    assert "<!-- field of view (mrad) -->" in target.read_text()  # matplotlib adds texts as comments
 
 
 @pytest.mark.slow

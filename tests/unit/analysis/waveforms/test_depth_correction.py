@@ -263,36 +263,6 @@ def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     assert abs(squares.mean() - 1) < 4 * error
 
 
-@pytest.mark.slow
-def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
-    """Rates of left-out nodes over those of differences of the same nodes, along depths and waters of eight tables."""
-    names = (
-        "leica_chiroptera4x",
-        "leica_hawkeye4x_deep",
-        "published_airborne",
-        "riegl_vq840g",
-        "riegl_vq840gl",
-        "riegl_vq880g2",
-        "teledyne_czmil",
-        "usgs_eaarl_b",
-    )
-    ratios = []
-    for name in names:
-        calm = depth_correction._learnt(corrections_for(name, "auto").sel(estimator=["gaussian"])).isel(wind_speed=0)
-        bias = calm["bias"].where(calm["found"] >= 0.5)
-        for axis, nodes in (("depth", calm["depth"]), ("water", calm["attenuation"])):
-            if nodes.size < 3:
-                continue
-            whole = bias.where((bias.notnull() & nodes.notnull()).all(axis))
-            if whole.isnull().all():
-                continue
-            differences = whole.diff(axis) ** 2 / np.abs(nodes.diff(axis))
-            ratios.append(float(depth_correction._rate(whole, nodes, axis).mean() / differences.mean()))
-    # Of one table it is from 0.01 to 1.7.
-    assert len(ratios) > 10
-    assert abs(np.mean(ratios) - depth_correction._OF_TWO) < 2 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)) < 0.3
-
-
 def test_unknown_cells_take_the_nearest_known_one():
     made = table()
     made["bias"][{"depth": 2}] = np.nan

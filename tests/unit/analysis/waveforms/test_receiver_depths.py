@@ -5,52 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.stats import exponnorm, norm
+from lake_waveforms import PER_NS, SURFACE, column, echo, result
 from significance import largest_z
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
-WIDTH, START, BINS = 0.5, 1380.0, 320
-SURFACE = 2e9 * 212.84 / 299792458
-DECAY = 20.0  # ns
-PER_NS = 0.299792458 / (2 * 1.34)
 CHAIN = ReceiverChain(LinearDetector(0.5), Amplifier(1e5, 3.0))
 
 
-def lake(bottom_ns, column=0.0):
-    """A surface echo and a bottom echo of a level lake at nadir, and the energy [J] of an infinite column of water."""
-    edges = START + WIDTH * np.arange(BINS + 1)
-    sigma = 5.0 / FWHM_PER_SIGMA
-    energy = 3e-13 * np.diff(norm.cdf(edges, SURFACE, sigma)) + 6e-13 * np.diff(
-        norm.cdf(edges, SURFACE + bottom_ns, sigma)
-    )
-    for start, share in ((SURFACE, column), (SURFACE + bottom_ns, -column * np.exp(-bottom_ns / DECAY))):
-        energy += share * np.diff(exponnorm.cdf(edges, DECAY / sigma, start, sigma))
-    energy = np.maximum(energy, 0)
-    power = energy[np.newaxis] / (WIDTH * 1e-9)
-    return results.build(
-        energy[np.newaxis],
-        0 * power,
-        power,
-        0 * power,
-        time=TimeAxis(START, WIDTH, BINS),
-        pixel_names=["single"],
-        pixel_centres_mrad=np.zeros((1, 2)),
-        attributes={
-            **{"altitude": 212.84, "off_nadir_deg": 0.0, "refractive_index": 1.34, "group_index": 1.34},
-            **{"pulse_fwhm_ns": 5.0, "response_time_ns": 0.0, "surface_time_ns": SURFACE, "layout": "1x1"},
-        },
-    )
+def lake(bottom_ns, level=0.0):
+    """A surface echo and a bottom echo of a level lake at nadir, and a column of a power [W] at the surface."""
+    power = echo(SURFACE, 3e-13) + column(SURFACE, SURFACE + bottom_ns, level) + echo(SURFACE + bottom_ns, 6e-13)
+    return result(np.maximum(power, 0)[np.newaxis])
 
 
 def depths(chain, depth_from):
@@ -80,7 +53,7 @@ def test_blocks_and_series_have_the_errors_of_whole_records(name, density, share
     About half of the samples are missing, behind the echoes and in the dark.
     """
     chain = RECEIVERS[name]
-    places = xr.concat([lake(60.0, 3e-13)] * 2, "shot", combine_attrs="override").assign_coords(shot=[0, 1])
+    places = xr.concat([lake(60.0, 1.5e-5)] * 2, "shot", combine_attrs="override").assign_coords(shot=[0, 1])
     light = {"shots": 200, "seed": 3, "optical_density": density}
     whole = detect_waveforms(places, chain, **light)
     mean = whole["signal_mean"]

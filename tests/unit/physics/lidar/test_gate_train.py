@@ -79,14 +79,7 @@ def test_open_time_is_the_integral_of_the_transmission(shape):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"width_ns": 0}, "width_ns = 0 must be greater than 0"),
-        ({"step_ns": -1}, "step_ns = -1 must be greater than 0"),
-        ({"count": 0}, "count = 0 must lie between 1"),
-        ({"count": 2.5}, "count = 2.5 must be an integer"),
-        ({"rise_ns": -1}, "rise_ns = -1 must not be negative"),
         ({"rise_ns": 6, "fall_ns": 6.1}, "must add up to at most 11.8"),
-        ({"pulses": 0}, "pulses = 0 must lie between 1"),
-        ({"start_ns": np.nan}, "start_ns = nan must be finite"),
         ({"profile": PROFILE}, "must be those of the profile"),
     ],
 )
@@ -178,14 +171,6 @@ def test_response_of_a_gate_with_edges_agrees_with_quadrature():
         assert float(table.at(t)) == pytest.approx(expected, abs=2e-5)
     # Its area is the open time, whatever the pulse.
     assert table.step_ns * table.values.sum() == pytest.approx(8.0, rel=1e-9)
-
-
-def test_response_of_a_sampled_pulse():
-    # A triangle of base 2 ns in a sharp gate of 10 ns: half of it passes at the edges.
-    table = GateTrain(50.0, 10.0, 10.0, 1).response_weights(Pulse.sampled([-1, 0, 1], [0, 1, 0]))
-    np.testing.assert_allclose(
-        table.at([48.9, 49.5, 50, 50.5, 55, 60, 61.1]), [0, 0.125, 0.5, 0.875, 1, 0.5, 0], atol=2e-5
-    )
 
 
 def test_response_takes_a_step_but_not_too_many():

@@ -42,20 +42,11 @@ def test_rays_above_the_horizon_meet_nothing():
 def test_crossing_closes_over_all_scales():
     """With the tangents of Snell's angles on both sides of the crossing, and with that of bisection."""
     rng = np.random.default_rng(3)
-    for rho, height, depth in 10 ** rng.uniform(-6, 4, (500, 3)):
+    for rho, height, depth in 10 ** rng.uniform(-6, 4, (100, 3)):
         x, y = LevelSea((N,)).crossing(np.array([0, 0, height]), [rho, 0, -depth])
         theta = np.arctan2(x, height)
         assert height * np.tan(theta) + depth * np.tan(snell(theta, N)) == pytest.approx(rho, rel=1e-6)
         assert (theta, y) == (pytest.approx(refracted_path(rho, height, depth, N)[0], abs=1e-12), 0)
-
-
-def test_crossing_of_the_reference_geometry():
-    theta = np.radians(20)
-    rho = HEIGHT * np.tan(theta) + 2.1119
-    x, _ = LevelSea((N,)).crossing(np.array([0, 0, HEIGHT]), [rho, 0, -8.0])
-    assert np.arctan(x / HEIGHT) == pytest.approx(theta, abs=2e-7)
-    # An index of 1 is a straight line.
-    assert LevelSea((1.0,)).crossing(np.array([0.0, 0, 4]), [3.0, 0, -5])[0] == pytest.approx(3 * 4 / 9)
 
 
 def test_lengths_are_those_of_the_legs():
@@ -67,15 +58,6 @@ def test_lengths_are_those_of_the_legs():
     np.testing.assert_allclose(optical, sum(one[1] * np.array(d) / np.cos(angles[one]) for one, d in legs.items()))
     expected = sum(np.array(d) * np.tan(angles[one]) for one, d in legs.items())
     np.testing.assert_allclose(sine * horizontal, expected, rtol=1e-12)
-
-
-def test_lines_obey_snell_at_the_sea_level():
-    rng = np.random.default_rng(1)
-    points = np.column_stack([rng.uniform(-500, 500, (50, 2)), -rng.uniform(0, 40, 50)])
-    crossing = np.column_stack([LevelSea((N,)).crossing(ORIGIN, points), np.zeros(50)])
-    air, water = crossing - ORIGIN, points - crossing
-    before, after = (leg[:, :2] / np.linalg.norm(leg, axis=1, keepdims=True) for leg in (air, water))
-    np.testing.assert_allclose(before, N * after, rtol=0, atol=1e-9)
 
 
 def test_crossing_inverts_points_at_a_height():

@@ -22,27 +22,3 @@ def test_depth_and_time():
     np.testing.assert_allclose(geometry.depth_of_time(geometry.time_of_depth(depths)), depths, atol=1e-9)
     with pytest.raises(ValueError, match="time_ns holds nan"):
         geometry.depth_of_time([1.0, np.nan])
-
-
-VALID = {
-    "height": 200,
-    "off_nadir": 0.3,
-    "refractive_index": 1.34,
-    "group_index": 1.364,
-    "energy": 1,
-    "aperture_area": 1,
-}
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"height": 0}, "height = 0 must be greater than 0"),
-        ({"off_nadir": 1.6}, "off_nadir = 1.6 must be at least 0 and below pi/2"),
-        ({"refractive_index": 0.9}, "refractive_index = 0.9 must be at least 1"),
-        ({"group_index": 0.9}, "group_index = 0.9 must be at least 1"),
-    ],
-)
-def test_invalid_systems_are_rejected(parameters, message):
-    with pytest.raises(ValueError, match=message):
-        LidarSystem(**(VALID | parameters))

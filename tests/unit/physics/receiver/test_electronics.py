@@ -169,31 +169,8 @@ def test_samples_fall_on_bins():
         Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
 
 
-def test_blocks_need_a_threshold():
-    with pytest.raises(UserError, match="block_threshold_v = 0 must be greater than 0"):
-        Digitiser(8, 1.0, block_threshold_v=0.0)
+def test_stages_that_lack_another_are_refused():
     with pytest.raises(UserError, match="block_after = 5 needs block_threshold_v"):
         Digitiser(8, 1.0, block_after=5)
-    with pytest.raises(UserError, match="block_before = -1 must lie between 0 and 100000"):
-        Digitiser(8, 1.0, block_threshold_v=0.1, block_before=-1)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: Amplifier(0.0), "transimpedance_ohm = 0"),
-        (lambda: Amplifier(1.0, noise_pa_per_rthz=-1), "noise_pa_per_rthz = -1"),
-        (lambda: Amplifier(1.0, bandwidth_mhz=0.0), "bandwidth_mhz = 0"),
-        (lambda: Amplifier(1.0, limit_v=float("nan")), "limit_v = nan"),
-        (lambda: Amplifier(1.0, response="boxcar"), "response = 'boxcar'"),
-        (lambda: Amplifier(1.0, coupling_ns=0.0), "coupling_ns = 0"),
-        (lambda: Amplifier(1.0, limit_v=1.0, recovery_ns=-2.0), "recovery_ns = -2"),
-        (lambda: LogAmplifier(0.3, 0.0), "knee_v = 0"),
-        (lambda: Digitiser(0, 1.0), "bits = 0"),
-        (lambda: Digitiser(8, -1.0), "full_scale_v = -1"),
-        (lambda: Digitiser(8, 1.0, sampling_ghz=0.0), "sampling_ghz = 0"),
-    ],
-)
-def test_invalid_values_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+    with pytest.raises(UserError, match="response = 'boxcar'"):
+        Amplifier(1.0, response="boxcar")

@@ -167,17 +167,6 @@ def test_positions_may_be_rounded(tmp_path):
     assert read_height_map(path).x[2] == 0.6665
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".nc"])
-def test_a_size_with_positions_is_rejected(tmp_path, suffix):
-    path = tmp_path / f"map{suffix}"
-    if suffix == ".nc":
-        write_netcdf(path, HEIGHTS, coords={"x": X, "y": Y})
-    else:
-        write_npz(path, heights=HEIGHTS, x=X, y=Y)
-    with pytest.raises(ValueError, match=r"size = 6 must not be given: .*map.* has positions of its own"):
-        read_height_map(path, 6)
-
-
 def test_files_without_one_map_are_rejected(tmp_path):
     path = write_npz(tmp_path / "map.npz", depths=HEIGHTS)
     with pytest.raises(ValueError, match=r"map.npz must have an array heights, and may have x and y"):
@@ -267,11 +256,6 @@ def test_origin_moves_positions_of_other_formats(tmp_path, caplog):
     caplog.clear()
     assert_is_the_map(read_height_map(path), x=X + 5e5)
     assert "x from 499997 to 500003 and y from 5 to 6 m do not contain x = y = 0" in caplog.messages[0]
-
-
-def test_depths_are_positive_down(tmp_path):
-    path = write_ascii_grid(tmp_path / "map.asc")
-    np.testing.assert_array_equal(read_height_map(path, values="depths").heights, -HEIGHTS)
 
 
 def test_holes_have_the_value_of_the_nearest_cell(tmp_path, caplog):
@@ -371,15 +355,6 @@ def test_geotiff_equals_the_ascii_grid(tmp_path):
         np.testing.assert_array_equal(read.x, expected.x)
         np.testing.assert_array_equal(read.y, expected.y)
         assert read.origin == expected.origin
-
-
-def test_geotiff_without_value(tmp_path):
-    heights = HEIGHTS[::-1].copy()
-    heights[2, 1] = -32768
-    path = write_geotiff(tmp_path / "map.tif", heights, nodata=-32768)
-    with pytest.raises(UserError, match="has holes, 1 of 12 heights, the first in row 0 and column 1"):
-        read_height_map(path)
-    assert read_height_map(path, holes="fill").heights[0, 1] in (0, 2, 11)
 
 
 @pytest.mark.parametrize(

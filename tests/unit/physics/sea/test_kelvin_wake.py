@@ -1,10 +1,7 @@
-"""Kelvin wake against stationary phase, direct quadrature, the wave equation and Michell's resistance."""
-
-import math
+"""Kelvin wake against stationary phase and direct quadrature of Havelock's sources."""
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
@@ -30,21 +27,6 @@ def source_amplitude(theta, speed, length, beam, draught):
     return -2 * k0 / np.pi * sec**3 * np.einsum("tz,tz->t", along @ sources, down)
 
 
-def michell_resistance(density, speed, length, beam, draught):
-    """Wave resistance [N] of a parabolic hull by Michell's integral over lambda = cosh(u)."""
-    k0 = GRAVITY / speed**2
-
-    def integrand(u):
-        wave = k0 * math.cosh(u)
-        # dY/dx is odd along the hull: of exp(i wave x), the sine remains.
-        along = quad(lambda x: -4 * beam * x / length**2 * math.sin(wave * x), -length / 2, length / 2)[0]
-        down = quad(lambda z: (1 - (z / draught) ** 2) * math.exp(wave**2 / k0 * z), -draught, 0)[0]
-        return (along * down * math.cosh(u)) ** 2
-
-    integral = quad(integrand, 0, 3, epsrel=1e-4, limit=100)[0]
-    return 4 * density * GRAVITY**2 / (np.pi * speed**2) * integral
-
-
 def test_track_shows_transverse_waves_of_closed_form():
     speed, length, beam, draught = 10.0, 2.0, 0.3, 0.05
     k0 = GRAVITY / speed**2
@@ -62,41 +44,6 @@ def test_track_shows_transverse_waves_of_closed_form():
     assert np.diff(crossings).mean() == pytest.approx(wavelength, rel=2e-3)
 
 
-def test_cusp_line_has_waves_of_closed_form():
-    # At this length dA/dtheta = sqrt(9/8) A at the cusp, for which the next term of the expansion vanishes.
-    speed, length, beam, draught = 5.0, 11.976, 1.0, 0.5
-    k0 = GRAVITY / speed**2
-    r = np.linspace(100, 1600, 60) * 2 * np.pi / k0
-    # Kelvin's angle, asin(1/3), where both stationary phases meet at tan(theta)^2 = 1/2.
-    x, y = -r * math.sqrt(8) / 3, r / 3
-    amplitude = source_amplitude(np.array([math.atan(math.sqrt(0.5))]), speed, length, beam, draught)[0]
-    # Phase k0 r (-sqrt(3/4) + sqrt(3/2)/2 (theta - theta_c)^3): its integral decays with r^(-1/3).
-    spread = 2 * math.gamma(4 / 3) * math.cos(math.pi / 6) * (math.sqrt(1.5) / 2 * k0 * r) ** (-1 / 3)
-    closed = (amplitude * np.exp(-1j * math.sqrt(0.75) * k0 * r)).real * spread
-    heights = at_points(x, y, speed, 0.0, length, beam, draught, smallest_wavelength=2.0)
-    envelope = abs(amplitude) * spread
-    # From the near to the far end, a decay with r^(-1/2) would lose another 37 %.
-    assert np.all(np.abs(heights - closed) < 0.005 * envelope)
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_energy_lies_within_kelvins_angle_and_is_densest_at_its_edge(side):
-    speed, length = 5.0, 10.0
-    wavelength = 2 * np.pi * speed**2 / GRAVITY
-    behind = 60.5 * wavelength
-    x = np.linspace(-61, -60, 41) * wavelength
-    y = np.linspace(0, 0.6 * behind, 1500)
-    heights = kelvin_wake(x, y if side > 0 else -y[::-1], speed, 0.0, length, smallest_wavelength=wavelength / 8)
-    energy = (heights**2).sum(axis=1)[::side]
-    angle = np.degrees(np.arctan(y / behind))
-    kelvin = math.degrees(math.asin(1 / 3))
-    assert kelvin == pytest.approx(19.47, abs=0.005)
-    assert kelvin - 1 < angle[energy.argmax()] < kelvin
-    assert energy[angle < kelvin].sum() > 0.9 * energy.sum()
-    # The cusp wave of width (k0 r)^(-2/3) = 0.9 degrees reaches a little further.
-    assert energy[angle > kelvin + 1].sum() < 1e-3 * energy.sum()
-
-
 def test_heights_agree_with_direct_quadrature():
     speed, length, beam, draught = 4.0, 12.0, 1.5, 0.6
     k0 = GRAVITY / speed**2
@@ -112,42 +59,6 @@ def test_heights_agree_with_direct_quadrature():
     phase = k * (np.outer(x, np.cos(theta)) + np.outer(y, np.sin(theta)))
     direct = (amplitude * np.exp(1j * phase)).real.sum(axis=1) * np.pi / theta.size
     assert at_points(x, y, speed, 0.0, length, beam, draught) == pytest.approx(direct * share, abs=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("froude", [0.3, 0.45])
-def test_wave_resistance_is_michells(froude):
-    length, density = 16.0, 1025.0
-    beam, draught = 0.1 * length, 0.0625 * length
-    speed = froude * math.sqrt(GRAVITY * length)
-    k0 = GRAVITY / speed**2
-    # Transverse cuts through the wake, as in a towing tank: they hold exp(i ky y) (c cos(kx x) + s sin(kx x)).
-    x, y = np.linspace(-70, -30, 401), np.arange(-512, 512) * 0.1
-    heights = kelvin_wake(x, y, speed, 0.0, length, beam, draught)
-    ky = 2 * np.pi * np.fft.fftfreq(y.size, 0.1)
-    cuts = np.fft.fft(heights, axis=0) * 0.1 / (2 * np.pi)
-    k = (k0 + np.sqrt(k0**2 + 4 * ky**2)) / 2
-    density_of_ky = np.empty(ky.size)
-    for n, kx in enumerate(np.sqrt(k0 * k)):
-        waves = np.stack([np.cos(kx * x), np.sin(kx * x)], axis=1)
-        c, s = np.linalg.lstsq(waves, cuts[n], rcond=None)[0]
-        density_of_ky[n] = abs(c) ** 2 + abs(s) ** 2
-    # A dtheta = density dky, and cos^3 dky/dtheta = k0 (1 + sin^2) = k0 (2 - k0/k).
-    resistance = math.pi / 2 * density * speed**2 * np.sum(density_of_ky * k0 * (2 - k0 / k)) * (ky[1] - ky[0])
-    assert resistance == pytest.approx(michell_resistance(density, speed, length, beam, draught), rel=0.01)
-
-
-def test_waves_are_stationary_in_the_frame_of_the_ship():
-    # Stationary waves have omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
-    speed, step = 5.0, 0.25
-    k0 = GRAVITY / speed**2
-    x, y = np.arange(-60, -20, step), np.arange(-20, 20, step)
-    h = kelvin_wake(x, y, speed, 0.0, 10.0, smallest_wavelength=5.0)
-    inner = h[2:-2, 2:-2]
-    along = h[2:-2, :-4] + h[2:-2, 4:] - 4 * (h[2:-2, 1:-3] + h[2:-2, 3:-1]) + 6 * inner
-    laplacian = h[2:-2, 1:-3] + h[2:-2, 3:-1] + h[1:-3, 2:-2] + h[3:-1, 2:-2] - 4 * inner
-    along, laplacian = along / step**4, k0**2 * laplacian / step**2
-    assert np.abs(along + laplacian).max() < 0.02 * np.abs(laplacian).max()
 
 
 @pytest.mark.parametrize("bearing", [0.7, np.pi / 2, -2.5])
@@ -221,18 +132,9 @@ def test_heights_grow_as_the_beam():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"speed": 0}, "speed = 0 must be greater than 0"),
-        ({"bearing": np.inf}, "bearing = inf must be finite"),
-        ({"length": -2}, "length = -2 must be greater than 0"),
-        ({"beam": 0}, "beam = 0 must be greater than 0"),
-        ({"draught": -0.1}, "draught = -0.1 must be greater than 0"),
-        ({"ship_x": np.nan}, "ship_x = nan must be finite"),
-        ({"ship_y": "far"}, "ship_y = 'far' must be a number"),
-        ({"smallest_wavelength": 0}, "smallest_wavelength = 0 must be greater than 0"),
         ({"x": [1.0]}, "x of shape (1,) must be a list of at least 2 numbers"),
         ({"y": [[0, 1]]}, "y of shape (1, 2) must be a list of at least 2 numbers"),
         ({"y": [0, 2, 2]}, "y must increase strictly, but 2 is followed by 2"),
-        ({"x": [0, np.nan]}, "x holds nan but every value must be finite"),
         (
             {"x": [0, 0.05], "y": [0, 0.05], "ship_x": 1e6},
             "wake_x, wake_y: the wake spreads over 3.54e+05 m before this sea, too far for waves of 0.1 m",

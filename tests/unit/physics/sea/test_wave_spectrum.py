@@ -87,54 +87,13 @@ def test_elfouhaily_totals(wind, height, wavelength, up, cross):
     assert spectrum.slope_variance() == pytest.approx((up, cross), abs=1e-5)
 
 
-def test_elfouhaily_at_the_wind_of_the_measured_pulses():
-    spectrum = ElfouhailySpectrum(7.23)
-    assert significant_wave_height(spectrum) == pytest.approx(1.369, abs=5.1e-4)
-    assert 2 * np.pi / spectrum.peak_wavenumber == pytest.approx(47, abs=0.6)
-    assert sum(spectrum.slope_variance()) == pytest.approx(0.04496, abs=1e-5)
-
-
 @pytest.mark.parametrize("wind", [3, 7.23, 15])
-def test_elfouhaily_against_the_formula_and_another_quadrature(wind):
+def test_elfouhaily_against_the_formula(wind):
     density, delta, peak = elfouhaily_written_out(wind)
-
-    def integral(function):
-        pieces = np.geomspace(peak / 10, 7400, 40)
-        return sum(
-            quad(lambda u: function(np.exp(u)) * np.exp(u), np.log(a), np.log(b), epsrel=1e-9)[0]
-            for a, b in pairwise(pieces)
-        )
-
-    spectrum = ElfouhailySpectrum(wind)
-    assert significant_wave_height(spectrum) == pytest.approx(4 * np.sqrt(integral(density)), rel=1e-6)
-    up = integral(lambda k: k**2 * density(k) * (0.5 + delta(k) / 4))
-    cross = integral(lambda k: k**2 * density(k) * (0.5 - delta(k) / 4))
-    assert spectrum.slope_variance() == pytest.approx((up, cross), rel=1e-6)
+    spectrum, k = ElfouhailySpectrum(wind), np.geomspace(peak / 10, 7400, 2000)
+    np.testing.assert_allclose(spectrum.omnidirectional(k), density(k), rtol=1e-9, atol=1e-300)
+    np.testing.assert_allclose(spectrum.spreading(k), delta(k), rtol=1e-9)
     assert spectrum.peak_wavenumber == pytest.approx(peak)
-
-
-@pytest.mark.parametrize(
-    ("wind", "spacing", "up", "cross"),
-    [
-        (3, 0.05, 0.01235, 0.00749),
-        (3, 0.10, 0.01076, 0.00619),
-        (3, 0.25, 0.00816, 0.00416),
-        (3, 0.50, 0.00607, 0.00270),
-        (3, 1.00, 0.00396, 0.00150),
-        (6, 0.05, 0.01532, 0.00989),
-        (6, 0.10, 0.01419, 0.00896),
-        (6, 0.25, 0.01230, 0.00740),
-        (6, 0.50, 0.01045, 0.00590),
-        (6, 1.00, 0.00836, 0.00427),
-        (10, 0.05, 0.01927, 0.01306),
-        (10, 0.10, 0.01729, 0.01146),
-        (10, 0.25, 0.01528, 0.00979),
-        (10, 0.50, 0.01370, 0.00847),
-        (10, 1.00, 0.01182, 0.00693),
-    ],
-)
-def test_elfouhaily_cumulative_slopes(wind, spacing, up, cross):
-    assert partial_slopes(ElfouhailySpectrum(wind), np.pi / spacing) == pytest.approx((up, cross), abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -421,31 +380,11 @@ def test_matched_totals_of_too_large_a_ratio_miss_the_larger():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: ElfouhailySpectrum(31), "wind_speed = 31 must lie between 0 and 30"),
-        (lambda: ElfouhailySpectrum(np.nan), "wind_speed = nan must be finite"),
-        (lambda: ElfouhailySpectrum(5, 0.5), "inverse_wave_age = 0.5 must lie between 0.84 and 5"),
-        (lambda: ElfouhailySpectrum(5, direction=np.inf), "direction = inf must be finite"),
-        (lambda: inverse_wave_age(5, 0), "fetch = 0 must be greater than 0"),
-        (lambda: PiersonMoskowitzSpectrum(-1), "wind_speed = -1 must lie"),
-        (lambda: PiersonMoskowitzSpectrum(1, np.nan), "direction = nan"),
-        (lambda: JonswapSpectrum(0, 100), "wind_speed = 0 must be greater than 0"),
-        (lambda: JonswapSpectrum(5, -1), "fetch = -1 must be greater than 0"),
         (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
-        (lambda: JonswapSpectrum(10, 1e4, 0.9), "peak_enhancement = 0.9 must lie between 1 and 7"),
-        (lambda: JonswapSpectrum(10, 1e4, direction="x"), "direction = 'x' must be a number"),
-        (lambda: SwellSpectrum(-1, 10), "height = -1 must not be negative"),
         (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
-        (lambda: SwellSpectrum(1, 0), "wavelength = 0 must be greater than 0"),
-        (lambda: SwellSpectrum(1, 20, np.nan), "direction = nan"),
-        (lambda: SwellSpectrum(1, 20, 0, 0), "relative_bandwidth = 0 must be greater than 0"),
-        (lambda: SwellSpectrum(1, 20, 0, 0.4), "relative_bandwidth = 0.4 must lie between 0 and 0.3"),
-        (lambda: SwellSpectrum(1, 20, 0, 0.1, 0.7), "directional_spread = 0.7 must lie between 0 and 0.6"),
         (lambda: SeaState(()), "components must hold at least one"),
         (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
         (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
-        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), -0.1, 0.1), "upwind = -0.1 must not be negative"),
-        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), 0.1, np.nan), "crosswind = nan"),
-        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), 0.1, 0.1, 0), "k_from = 0 must be greater than 0"),
     ],
 )
 def test_bad_parameters_are_rejected(call, message):

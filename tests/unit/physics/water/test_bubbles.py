@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.bubbles import CLEAN_BACKSCATTER, WindBubbles
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
@@ -43,9 +42,3 @@ def test_phase_function_scatters_back_as_the_bubbles_do(backscatter):
     function = fournier_forand_parameters(bubbles.backscatter_ratio(backscatter))
     found = bubbles.scattering * float(fournier_forand(np.pi, *function)) / bubbles.void_fraction
     assert found == pytest.approx(backscatter, rel=1e-6)
-
-
-@pytest.mark.parametrize("wind", [-1.0, 25.0, float("nan")])
-def test_other_winds_are_refused(wind):
-    with pytest.raises(UserError, match="wind_speed = "):
-        WindBubbles.of_wind(wind)

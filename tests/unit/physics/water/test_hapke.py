@@ -82,12 +82,6 @@ def test_more_light_than_arrives_is_refused():
         HapkeSurface(0.0).of_albedo("single_scattering_albedo", 1.0)
 
 
-@pytest.mark.parametrize("name", ["albedo", "lobe_asymmetry", "backward_share", "opposition_amplitude"])
-def test_negative_values_are_refused(name):
-    with pytest.raises(UserError, match=f"{name} = -0.1 must lie between 0 and"):
-        HapkeSurface(**{"albedo": 0.5, name: -0.1})
-
-
 def test_bottoms_by_name_have_the_values_of_the_table():
     """At 530 nm, and between it and 540 nm (Maritorena et al. 1994, fig. 6)."""
     assert [bottom_reflectance("reflectance", name, 530.0) for name in BOTTOMS] == [0.429, 0.246, 0.044, 0.075]

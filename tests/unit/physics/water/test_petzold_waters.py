@@ -5,7 +5,6 @@ import pytest
 from scipy.integrate import simpson
 
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
-from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
 # Summary pages of SIO Ref. 72-78: c and bb/b; median angle [deg]; fraction of b and power below 0.1 degree;
 # p at 20, 40, 45 and 90 degrees [1/sr].
@@ -30,8 +29,6 @@ PRINTED = {
     "nuc_2200": (2689.7, 120.98, 1.7321, 6.2107e-3),
     "nuc_2240": (2215.3, 80.269, 1.4749, 3.5956e-3),
 }
-# bb/b and mean cosine of the same tables by the trapezoidal rule
-TRAPEZOID = {"clear": (0.0438, 0.873), "coastal": (0.0133, 0.9475), "turbid": (0.0198, 0.9205)}
 
 WATERS = pytest.mark.parametrize("name", REPORT)
 
@@ -78,15 +75,6 @@ def test_between_angles_and_below_the_first_it_is_a_power(name):
     # From theta^-2 on the integral would diverge.
     assert power > -2
     assert p(0.0) == np.inf
-
-
-@pytest.mark.parametrize("name", TRAPEZOID)
-def test_backscattering_and_mean_cosine_of_the_sampled_table(name):
-    table = PowerLawTable.from_function(petzold_water(name))
-    ratio, mean_cosine = TRAPEZOID[name]
-    # The trapezoidal rule cuts the corners of a steep function: its b is 1 % too large.
-    assert table.backscatter_ratio == pytest.approx(ratio, rel=1.2e-2)
-    assert table.mean_cosine == pytest.approx(mean_cosine, abs=1.6e-3)
 
 
 def test_absorption_and_scattering_add_up_to_the_attenuation():

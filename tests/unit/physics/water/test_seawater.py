@@ -42,11 +42,6 @@ def test_indices_fall_with_wavelength_and_temperature_and_rise_with_salt():
         assert np.all(np.diff(index(532, 20, np.linspace(0, 40, 11))) > 0)
 
 
-def test_inputs_broadcast():
-    assert refractive_index([[500], [532]], [5, 10, 20], 35).shape == (2, 3)
-    assert water_scattering(532.0).shape == ()
-
-
 def test_absorption_is_pope_and_fry():
     np.testing.assert_array_equal(
         water_absorption([525, 527.5, 530, 532.5, 535]), [0.0417, 0.0428, 0.0434, 0.0447, 0.0452]
@@ -99,22 +94,3 @@ def test_phase_function_is_rayleigh_without_depolarisation_and_morel_with_his():
     assert water_phase_function(np.pi, 0) == pytest.approx(0.119366, abs=1e-6)
     assert water_phase_function(np.pi / 2, 0.09) == pytest.approx(0.06225, abs=5e-6)
     assert water_phase_function(0, 0.09) == pytest.approx(0.06225 * 1.835, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: refractive_index(399), "wavelength_nm = 399 must lie between 400 and 700"),
-        (lambda: group_index(701), "wavelength_nm = 701 must lie between 400 and 700"),
-        (lambda: group_index(532, -1), "temperature = -1 must lie between 0 and 30"),
-        (lambda: refractive_index(532, [20, 31]), "temperature = 31 must lie between 0 and 30"),
-        (lambda: water_scattering(532, 20, 41), "salinity = 41 must lie between 0 and 40"),
-        (lambda: water_scattering(532, depolarisation=0.3), r"depolarisation = 0\.3 must lie between 0 and 0\.2"),
-        (lambda: water_phase_function(0, -0.1), r"depolarisation = -0\.1 must lie between 0 and 0\.2"),
-        (lambda: water_absorption(720), "wavelength_nm = 720 must lie between 400 and 700"),
-        (lambda: water_absorption(np.nan), "wavelength_nm holds nan"),
-    ],
-)
-def test_bad_values_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -1,0 +1,212 @@
+"""Errors of echoes by noise and saturation: of records of a receiver, behind a logarithm, and of series."""
+
+import csv
+
+import numpy as np
+import pytest
+import significance
+import xarray as xr
+from lake_waveforms import BINS, SURFACE, TIME, column, echo, in_series, recorded, result, waveform
+from significance import largest_count, largest_z
+
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, saturated_spans
+from mitransient_lidar.core.errors import UserError
+
+
+def test_shots_of_a_receiver_have_true_errors():
+    """600 shots: scatter against stated errors, offset removed, energies in V s."""
+    dataset = recorded(np.stack([waveform(), waveform(bottom=75.3)]), 600, 0.05)
+    table = echo_table.extract(dataset)
+    assert table["time_ns"].dims == ("shot", "pixel", "echo")
+    assert table["energy"].attrs["units"] == "V s"
+    for name, truth in (("surface", [0, 0]), ("bottom", [70.0, 75.3])):
+        time_ns, error = table["time_ns"].sel(echo=name), table["time_ns_stderr"].sel(echo=name)
+        off = time_ns - SURFACE - truth
+        # In one of 100 sets noise is a first peak.
+        real = np.abs(off) < 5
+        assert (~real).sum() <= largest_count(1200, 1e-5)
+        z = (off / error).where(real)
+        assert np.abs(z.std("shot") - 1).max() < largest_z(600) / np.sqrt(2 * 600) + 0.05
+        assert np.abs(off.where(real).mean("shot")).max() < 0.03
+    energy = table["energy"].sel(echo="bottom")
+    assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
+
+
+@pytest.mark.slow
+def test_signals_behind_a_logarithm_are_expanded():
+    """Echoes of a tenth of the light have a tenth of the energy, as behind the same photomultiplier without logarithm.
+
+    Ten times the light would saturate the linear one. Behind the logarithm it is 0.25 V more, of 0.84 V.
+    """
+    clean = np.maximum(np.stack([waveform(), waveform(bottom=75.3)]), 0)
+    tables = {
+        (name, scale): echo_table.extract(detect_waveforms(result(scale * clean), name, 400, 3), saturation_level=level)
+        for name, scale, level in (("pmt_log", 0.03, 0.9), ("pmt_log", 0.003, 0.9), ("pmt", 0.003, None))
+    }
+    strong, weak, linear = (table.sel(echo="bottom") for table in tables.values())
+    for one, other, ratio in ((strong, weak, 10), (weak, linear, 1)):
+        difference = one["energy"].mean("shot") - ratio * other["energy"].mean("shot")
+        error = np.hypot(one["energy"].std("shot"), ratio * other["energy"].std("shot")) / np.sqrt(400)
+        assert (abs(difference) < largest_z(400) * error).all()
+        assert (error < 4e-3 * one["energy"].mean("shot")).all()
+    for table in (strong, weak):
+        for name in ("energy", "time_ns"):
+            ratio = table[name].std("shot") / table[f"{name}_stderr"].mean("shot")
+            assert np.abs(ratio - 1).max() < largest_z(400) / np.sqrt(2 * 400) + 0.05
+        assert (table["flags"] & EchoFlag.SATURATED == 0).all()
+    # 0.835 V is the strong record's highest sample.
+    low = echo_table.extract(detect_waveforms(result(0.03 * clean), "pmt_log", 20, 3), saturation_level=0.8)
+    assert (low["flags"].sel(echo="bottom") & EchoFlag.SATURATED).all()
+    assert (low["flags"].sel(echo="surface") & EchoFlag.SATURATED == 0).all()
+
+
+def test_a_single_record_behind_a_logarithm_is_expanded():
+    """A record without the dimension shot, and without the mean that its deviation belongs to."""
+    clean = np.maximum(np.stack([waveform()]), 0)
+    shots = detect_waveforms(result(0.03 * clean), "pmt_log", 2, 3)
+    both = echo_table.extract(shots)
+    one = echo_table.extract(shots.isel(shot=0, drop=True).drop_vars("signal_mean"))
+    # By the noise, of which the mean is free, 0.6 %; unexpanded, by factors.
+    np.testing.assert_allclose(one["energy"], both["energy"].isel(shot=0), rtol=0.1)
+    del shots.attrs["receiver.logarithm.volts_per_decade"]
+    with pytest.raises(UserError, match=r"no attribute receiver.logarithm.volts_per_decade"):
+        echo_table.extract(shots)
+
+
+def test_correlated_noise_has_larger_errors():
+    """Noise averaged over 4 bins has half the spread, and means of many bins have that of the noise before."""
+    dataset = recorded(np.stack([waveform()]), 400, 0.0)
+    white = 0.1 * np.random.default_rng(4).normal(size=(400, 1, BINS + 3))
+    alike = np.lib.stride_tricks.sliding_window_view(white, 4, axis=2).mean(axis=-1)
+    dataset["signal"] = dataset["signal"] + alike
+    table = echo_table.extract(dataset)
+    bottom = table.sel(echo="bottom")
+    ratio = float(bottom["time_ns"].std() / bottom["time_ns_stderr"].mean())
+    # 1.07 in the mean of many records; as if independent, it would be 1.6.
+    assert abs(ratio - 1) < largest_z(400) / np.sqrt(2 * 400) + 0.08
+
+
+def test_waveforms_in_the_noise_are_flagged():
+    dataset = recorded(np.stack([waveform(), 0 * TIME]), 20, 0.05)
+    table = echo_table.extract(dataset, ["gaussian", "peak", "deconvolution"])
+    dark = table.isel(pixel=1)
+    assert np.isnan(dark["time_ns"]).all()
+    assert (dark["flags"] == EchoFlag.NO_ECHO).all()
+    assert np.isfinite(table["time_ns"].isel(pixel=0).sel(echo="bottom")).all()
+
+
+def test_a_surface_echo_within_its_error_is_not_listed():
+    """The onset of a column without a surface echo, with noise: a time, but no amplitude or energy."""
+    bare = column(SURFACE, SURFACE + 70, 3e-5) + echo(SURFACE + 70, 6e-13)
+    table = echo_table.extract(recorded(np.stack([bare, waveform()]), 200, 0.02))
+    none, some = (table.sel(echo="surface").isel(pixel=pixel) for pixel in (0, 1))
+    # An amplitude beyond its error by chance is listed: in 1 % of the shots.
+    unlisted = (none["flags"] & EchoFlag.COLUMN_ONSET).values > 0
+    assert unlisted.mean() > 0.9
+    none = none.isel(shot=unlisted)
+    for name in ("amplitude", "energy", "width_ns"):
+        assert np.isnan(none[name]).all()
+        assert np.isfinite(some[name]).all()
+    assert (some["flags"] == 0).all()
+    assert np.abs(none["time_ns"] - SURFACE).max() < 2  # a spread of 0.27
+    assert np.isfinite(table["depth_m"].sel(echo="bottom")).all()
+
+
+def test_a_bottom_within_its_error_is_flagged():
+    """Bottoms of 230 standard errors, and some of less than 3 that a low threshold finds."""
+    normal = np.random.default_rng(3).normal(size=(4, BINS))
+    for noise, doubtful in ((1e-6, False), (1e-4, True)):
+        dataset = result(np.stack([waveform()] * 4) + noise * normal)
+        bottom = echo_table.extract(dataset, noise=noise, threshold=1.0).sel(echo="bottom")
+        weak = (bottom["amplitude"] < 3 * bottom["amplitude_stderr"]).values
+        assert weak.any() == doubtful
+        flagged = (bottom["flags"].values & int(EchoFlag.POOR_FIT)) != 0
+        assert flagged[weak].all()
+        assert doubtful or not flagged.any()
+
+
+def test_saturated_echoes_are_flagged_by_mask_and_by_level():
+    values = np.stack([waveform()] * 2)
+    clipped = result(np.minimum(values, 8e-5))
+    table = echo_table.extract(clipped, "peak", saturation_level=8e-5)
+    assert (table["flags"].sel(echo="bottom") & EchoFlag.SATURATED).all()
+    assert not (table["flags"].sel(echo="surface") & EchoFlag.SATURATED).any()
+    dataset = recorded(values, 2, 0.01)
+    mask = np.zeros(dataset["signal"].shape, dtype=bool)
+    mask[1, 0, np.argmax(values[0])] = True
+    table = echo_table.extract(dataset.assign(saturated=(dataset["signal"].dims, mask)))
+    flagged = (table["flags"] & EchoFlag.SATURATED).astype(bool)
+    assert flagged.sel(echo="bottom").values.tolist() == [[False, False], [True, False]]
+    assert not flagged.sel(echo="surface").any()
+
+
+def test_errors_of_saturated_echoes_hold():
+    """Surface and bottom clipped at a tenth to a half of their height, with 1 % of noise of what is left.
+
+    Their samples counted as if they were the echo: with the noise alone as error, arrivals were off by 10 of them.
+    """
+    rng = np.random.default_rng(11 + significance.seed_shift)
+    power = echo(SURFACE, 3e-13) + echo(SURFACE + 25.0, 2e-13)
+    for share in (0.1, 0.25, 0.5):
+        level = share * power.max()
+        noisy = np.minimum(power, level) + 0.01 * level * rng.standard_normal((40, power.size))
+        dims = ("shot", "pixel", "time")
+        signal = xr.DataArray(noisy[:, None], dims=dims, attrs={"units": "V"})
+        saturated = xr.DataArray(np.broadcast_to(power >= level, (40, 1, power.size)), dims=dims)
+        clear = recorded(power[None], 40, 0.01).assign(signal=signal, saturated=saturated)
+        table = echo_table.extract(clear, noise=0.01 * level).isel(pixel=0)
+        for name, true in (("surface", SURFACE), ("bottom", SURFACE + 25.0)):
+            own = table.sel(echo=name)
+            assert (own["flags"] & EchoFlag.SATURATED).all()
+            error = own["time_ns"].values - true
+            stated = own["time_ns_stderr"].values
+            assert np.all(np.abs(error) < 2 * stated)
+            assert np.all(stated < 0.6 * np.count_nonzero(power >= level) * (TIME[1] - TIME[0]))
+            # Without what is clipped, the flanks give the time.
+            assert np.abs(error.mean()) < 0.3
+
+
+def test_spans_of_saturated_samples():
+    """Runs that are an echo width apart count as one; a run counts for echoes within an echo width of it."""
+    saturated = np.zeros((3, 60), dtype=bool)
+    saturated[0, [10, 11, 12, 15, 16]] = saturated[1, [30, 40, 41]] = True
+    bins = np.array([[11, 30, 20], [19, 41, -1], [40, 25, 59]])
+    np.testing.assert_array_equal(saturated_spans(saturated, bins, 4.0), [[7, 1, 0], [7, 2, 0], [0, 0, 0]])
+
+
+def test_shots_of_a_series_have_their_own_errors(tmp_path):
+    """Each shot of a series gives what it gives alone, whatever the errors of the others; the truth comes along."""
+    shots = [result(np.stack([waveform(SURFACE + shift)] * 2)) for shift in (0.0, 1.5, -2.0)]
+    for number, shot in enumerate(shots):
+        shot["waveform_stderr"][:] = 10.0**-number * (1e-8 + 1e-3 * shot["waveform"])
+    found = echo_table.extract(in_series(*shots))
+    for number, shot in enumerate(shots):
+        alone = echo_table.extract(shot)
+        xr.testing.assert_allclose(found.isel(shot=number, drop=True), alone)
+    errors = found["time_ns_stderr"].sel(echo="bottom").isel(pixel=0).values
+    np.testing.assert_allclose(errors[:2] / errors[1:], 10, rtol=0.3)
+    csv_tables.save_csv(found, tmp_path / "echoes.csv")
+    with (tmp_path / "echoes.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert {(line["shot"], line["true_bottom_depth"]) for line in lines} == {("0", "5"), ("1", "6"), ("2", "7")}
+
+
+@pytest.mark.slow
+def test_records_of_a_series_have_true_errors():
+    """Two shots of different strength and time, 200 records each: errors of both are those of their own noise."""
+    powers = (np.maximum(waveform(), 0), 0.2 * np.maximum(waveform(SURFACE + 2), 0))
+    places = in_series(*(result(np.stack([power] * 2)) for power in powers))
+    shots = detect_waveforms(places, "apd", 200, 3, optical_density=1.9)
+    bottoms = echo_table.extract(shots).sel(echo="bottom")
+    for half in (slice(0, 200), slice(200, 400)):
+        time, error = (bottoms[name].isel(shot=half).values.ravel() for name in ("time_ns", "time_ns_stderr"))
+        # One electron's avalanche is the last peak of one in 3000 weak records, and some bottoms are not found.
+        real = np.abs(time - np.nanmedian(time)) < 5
+        assert np.count_nonzero(~real) <= largest_count(400, 2e-3)
+        assert np.std(time[real]) / np.median(error[real]) == pytest.approx(
+            1, abs=largest_z(400) / np.sqrt(2 * 400) + 0.07
+        )
+    errors = bottoms["time_ns_stderr"].values
+    assert np.nanmedian(errors[200:]) > 2 * np.nanmedian(errors[:200])
