@@ -9,64 +9,37 @@ from typing import Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
+from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import name_subject
-from mitransient_lidar.cli.options import pair
+from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.core.errors import UserError
 
 _MOST_SHOTS = 200  # of a printed table
 _WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd"}
 
 
-def retrieve(
+def _retrieve(
+    call: Call,
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series of shots.")
     ],
-    slope_deviation: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ALONG,ACROSS",
-            help="Standard deviations of the slopes of an unknown sea, greater than 0; by default those of a series.",
-        ),
-    ] = None,
-    wind_speed: Annotated[
-        float | None,
-        typer.Option(metavar="M/S", help="Wind speed over the sea, 1 to 30; by default that of the scene."),
-    ] = None,
-    wind_direction_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Direction that the wind blows towards, from +x, any angle."),
-    ] = None,
-    efficiency: Annotated[
-        float | None, typer.Option(help="Two-way efficiency of optics and air, 0 to 1; by default that of the scene.")
-    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
     figure: Annotated[
         Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Retrieve slopes, bottom and water from a result.
-
-    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of FILE;
-    of a series, those of each shot beside the truth.
-    """
-    deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
+    """Print, write and draw the estimates."""
     if output is not None:
         check_suffix("--output", output, ".nc")
     check_figure(figure, option="--figure")
     from mitransient_lidar import results
-    from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
 
     dataset = results.open(file)
     if figure is not None and "true_slope_along" not in dataset.coords:
         raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
-    found = retrieve_from(
-        dataset,
-        wind_speed=wind_speed,
-        wind_direction_deg=wind_direction_deg,
-        slope_deviation=deviations,
-        efficiency=efficiency,
-    )
-    name_subject(file, dataset.attrs)
+    found = call(dataset)
+    name_subject(file, dataset.attrs, quiet)
     for line in _table(found) if "shot" in found.dims else _lines(found):
         typer.echo(line)
     if output is not None:
@@ -161,3 +134,17 @@ def _bottom_lines(found: Any) -> list[str]:
     shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
     classes = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
     return [*lines, f"bottom reflectance: {text}", f"probability of the bottom's class: {classes}"]
+
+
+COMMANDS = {
+    "retrieve": Command(
+        "Analyse results",
+        "analysis.retrieval.retrieve:retrieve",
+        _retrieve,
+        """Retrieve slopes, bottom and water from a result.
+
+        Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
+        FILE; of a series, those of each shot beside the truth.
+        """,
+    ),
+}

@@ -7,21 +7,29 @@ import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, SceneOrResult, Sensor
 from mitransient_lidar.core.validation import FloatArray, integer, positive, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.accuracy import RatioStatistics
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.options import (
+    MOST_PASSES,
+    MaxTime,
+    RenderOptions,
+    SignedSeed,
+    TargetError,
+    TargetQuantile,
+    Variant,
+)
 from mitransient_lidar.rendering.passes import (
     TOLERATED_LOSS,
     Goal,
@@ -34,8 +42,6 @@ from mitransient_lidar.rendering.passes import (
 from mitransient_lidar.results.radiance import build_radiance
 
 if TYPE_CHECKING:
-    import mitsuba as mi
-
     from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
 
 logger = logging.getLogger(__name__)
@@ -54,20 +60,25 @@ _TIMES = ("surface_time", "time")  # names of the time of the sea of an XML scen
 
 @alone
 def render_passive(
-    scene: str | Path | Mapping[str, Any] | mi.Scene,
+    scene: SceneOrResult,
     params: Mapping[str, Any] | None = None,
     *,
-    sensor: str | None = None,
+    sensor: Sensor = None,
     integrator: str | Mapping[str, Any] | None = None,
-    target_error: float | None = None,
-    target_quantile: float | None = None,
-    max_time: float | None = None,
-    passes: int | Sequence[int] | None = None,
-    seed: int | None = None,
-    frames: int = 1,
-    frame_step_s: float = 0.1,
-    filter_width_nm: float | None = None,
-    variant: str | None = None,
+    target_error: TargetError = None,
+    target_quantile: TargetQuantile = None,
+    max_time: MaxTime = None,
+    passes: Annotated[int | Sequence[int] | None, Option("Stop after this many passes", 2, MOST_PASSES)] = None,
+    seed: SignedSeed = None,
+    frames: Annotated[int, Option("Number of frames of an animation, 1 by default", 1, MOST_FRAMES)] = 1,
+    frame_step_s: Annotated[
+        float, Option("Time between frames, 0.1 by default", 0, unit="s", above=True, flag="--frame-step")
+    ] = 0.1,
+    filter_width_nm: Annotated[
+        float | None,
+        Option("Width of the receiver's filter, for the power of the daylight", 0, unit="nm", above=True),
+    ] = None,
+    variant: Variant = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the radiance that the receiver sees by daylight.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from os import PathLike
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -32,17 +33,27 @@ _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the reco
 def train_from_options(
     attributes: Mapping[str, Any],
     *,
-    start_ns: float | None = None,
-    start_depth_m: float | None = None,
-    width_ns: float | None = None,
-    step_ns: float | None = None,
-    count: int = 1,
-    rise_ns: float = 0.0,
-    fall_ns: float = 0.0,
-    profile_file: str | PathLike[str] | None = None,
-    pulses: int = 1,
+    start_ns: Annotated[float | None, Option("Start of the first gate, at half height [ns], any number")] = None,
+    start_depth_m: Annotated[
+        float | None,
+        Option("Depth of its start on the axis [m], any number, instead of a time", flag="--start-depth"),
+    ] = None,
+    width_ns: Annotated[float | None, Option("Width of a gate between half heights", 0, unit="ns", above=True)] = None,
+    step_ns: Annotated[
+        float | None, Option("Time from gate to gate, by default the width", 0, unit="ns", above=True)
+    ] = None,
+    count: Annotated[int, Option("Number of gates", 1, 100_000)] = 1,
+    rise_ns: Annotated[
+        float, Option("10-90 % time of the rising edge; both edges take at most 1.18 widths", 0, unit="ns")
+    ] = 0.0,
+    fall_ns: Annotated[float, Option("90-10 % time of the falling edge", 0, unit="ns")] = 0.0,
+    profile_file: Annotated[
+        str | PathLike[str] | None,
+        Option("Measured gate instead of width and edges: columns time [ns], transmission", flag="--profile"),
+    ] = None,
+    pulses: Annotated[int, Option("Pulses accumulated in a gate", 1, 10**9)] = 1,
 ) -> GateTrain:
-    """Build a gate train from command line options.
+    """Build a gate train from the options of the command ``gates``.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,8 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer
+from mitransient_lidar.core.options import Option, Scene, checked
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.geometry import lidar_geometry
@@ -22,13 +23,14 @@ _PASSES = 8
 _HALF_GATE_NS = 10.0
 
 
+@checked
 def shot_statistics(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    count: int = 200,
-    seed: int = 1,
-    max_time: float | None = None,
+    count: Annotated[int, Option("Number of shots", 2, 100_000)] = 200,
+    max_time: Annotated[float | None, Option("Stop before this many seconds, with fewer shots", 0, above=True)] = None,
+    seed: Annotated[int, Option("Seed of their places", 0, 2**53)] = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at random places of one sea and measure their echoes.
@@ -59,7 +61,6 @@ def shot_statistics(
     UserError
         If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
     """
-    count, seed = integer("count", count, 2, 100_000), integer("seed", seed, 0, 2**53)
     series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, max_time=max_time, progress=progress)
     times = _echo_times(series)
     rows: list[dict[str, Any]] = []
@@ -169,6 +170,12 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
         "sideways": (across, (surface[:, 1] - surface[:, 0]).values),
         "depth": (along, deeper),
     }
+
+
+def describe_statistics(shots: xr.Dataset) -> list[str]:
+    """Return a line for each of the `slope_correlations`; raises as `slope_effects`."""
+    found = slope_correlations(shots).items()
+    return [f"correlation of {name} with the slope: {value:+.3f}" for name, value in found]
 
 
 def slope_correlations(shots: xr.Dataset) -> dict[str, float]:

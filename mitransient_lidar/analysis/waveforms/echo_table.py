@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
@@ -63,17 +64,29 @@ _PER_WAVEFORM = {
 }
 
 
+@checked
 def extract(
     dataset: xr.Dataset,
-    estimators: str | Sequence[str] = "gaussian",
+    estimators: Annotated[
+        str | Sequence[str],
+        Option(
+            "threshold, leading_edge, peak, centroid, gaussian (the default) or deconvolution; repeat it for several",
+            form="NAME",
+            flag="--estimator",
+        ),
+    ] = "gaussian",
     *,
     pulse: Pulse | None = None,
     noise: float | npt.ArrayLike | None = None,
-    threshold: float = 5.0,
-    contrast: float = 0.05,
+    threshold: Annotated[
+        float, Option("Standard deviations of the noise above which a signal counts", 0, above=True)
+    ] = 5.0,
+    contrast: Annotated[
+        float, Option("Share of the signal that an echo in the water must add (at least 0, below 1)")
+    ] = 0.05,
     echo_fwhm_ns: float | None = None,
     saturation_level: float | None = None,
-    layers: int = 0,
+    layers: Annotated[int, Option("Number of changes in the column to test for", 0, 8)] = 0,
     depth_from: Literal["echo", "mean"] = "echo",
     iterations: int = 50,
     block: int = 2048,

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_suffix
+from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import name_subject
+from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -19,27 +21,13 @@ _MOST_LINES = 200  # of a printed table
 _MOST_WAVEFORMS = 16  # whose layers are printed
 
 
-def waveforms(
+def _echoes(
+    call: Call,
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
     ],
     table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
     output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
-    estimator: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--estimator",
-            help="threshold, leading_edge, peak, centroid, gaussian (the default) or deconvolution; repeat it for "
-            "several estimators.",
-        ),
-    ] = None,
-    threshold: Annotated[
-        float, typer.Option(help="Standard deviations of the noise above which a signal counts, greater than 0.")
-    ] = 5.0,
-    contrast: Annotated[
-        float, typer.Option(help="Share of the signal that an echo in the water must add, at least 0 and below 1.")
-    ] = 0.05,
-    layers: Annotated[int, typer.Option(help="Number of changes in the column to test for, 0 to 8.")] = 0,
     mean_surface: Annotated[
         bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
     ] = False,
@@ -55,12 +43,9 @@ def waveforms(
         float | None,
         typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Measure the echoes in the waveforms of a result.
-
-    Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors are
-    those by noise, of depths also by the method.
-    """
+    """Print and write the echoes."""
     if output is not None:
         check_suffix("--csv", output, ".csv")
     elif not table:
@@ -70,22 +55,15 @@ def waveforms(
     if wind_speed is not None and correct is None:
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
     from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, records
-    from mitransient_lidar.analysis.waveforms import echo_table as measuring
 
     dataset = records.open_waveforms(file)
     instrument = str(dataset.attrs.get("instrument", ""))
     corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
-    found = measuring.extract(
-        dataset,
-        estimator or ["gaussian"],
-        threshold=threshold,
-        contrast=contrast,
-        layers=layers,
-        depth_from="mean" if mean_surface else "echo",
-    )
+    estimators = call.arguments["estimators"] or ["gaussian"]
+    found = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
     if corrections is not None:
         found = depth_correction.correct_depths(found, corrections, wind_speed)
-    name_subject(file, dataset.attrs)
+    name_subject(file, dataset.attrs, quiet)
     if table:
         _print(found)
     if output is not None:
@@ -166,3 +144,18 @@ def _with_error(value: float, error: float) -> str:
     if small:
         return f"{value:.3e} +- {error:.0e}"
     return f"{value:.{min(max(1 - math.floor(math.log10(error)), 0), 3)}f} +- {error:.2g}"
+
+
+COMMANDS = {
+    "echoes": Command(
+        "Analyse results",
+        "analysis.waveforms.echo_table:extract",
+        _echoes,
+        """Measure the echoes in the waveforms of a result.
+
+        Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
+        are those by noise, of depths also by the method.
+        """,
+        defaults={"estimators": None},
+    ),
+}

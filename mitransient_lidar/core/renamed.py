@@ -1,0 +1,16 @@
+"""Former names of commands and functions, and those that have taken their place."""
+
+#: Commands.
+COMMANDS = {
+    "sweep": "campaign",
+    "waveforms": "echoes",
+    "plot": "view --plot",
+    "instruments": "scenes instruments",
+}
+
+#: Public functions of the package.
+FUNCTIONS = {
+    "depth_uncertainty": "tpu",
+    "sweep": "campaign",
+    "waveforms": "echoes",
+}
