@@ -473,6 +473,8 @@ def _background(dataset: xr.Dataset, power: npt.ArrayLike | xr.DataArray, dims: 
         raise UserError(
             f"background_power has the shape {values.shape}; it must be a number or have the shape {pixels}"
         )
+    if np.any(values < 0):
+        raise UserError(f"background_power = {values.min():g} must not be negative")
     return values
 
 

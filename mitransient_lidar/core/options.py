@@ -87,7 +87,7 @@ class Option:
     def check(self, name: str, value: Any, kind: Any) -> Any:
         """Return a value of a type as a number or a list of numbers; raise `UserError` if it is out of range."""
         kinds = _parts(kind)
-        if self.low is None or (value == "auto" and isinstance(value, str) and "auto" in kinds):
+        if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
         if any(
             isinstance(get_origin(one), type) and issubclass(get_origin(one), Sequence | np.ndarray) for one in kinds

@@ -59,7 +59,7 @@ FORMS = {
 MADE = sorted(name for name, row in COMMANDS.items() if row.function)
 
 
-class Reached(Exception):
+class ReachedError(Exception):
     """Raised by the function that stands for a public one."""
 
 
@@ -120,14 +120,14 @@ def test_each_option_reaches_its_function(command, needed, monkeypatch):
 
     def reached(*_, **given):
         seen.append(given)
-        raise Reached
+        raise ReachedError
 
     options = options_of(command)
     stub(monkeypatch, command, reached)
 
     def given(*words):
         done = run(command, *needed(command), *words)
-        assert isinstance(done.exception, Reached), (words, done.output)
+        assert isinstance(done.exception, ReachedError), (words, done.output)
         return {name: value for name, value in seen.pop().items() if name != "progress"}
 
     usual = given()
@@ -183,7 +183,7 @@ def test_a_store_is_completed_with_its_options(tmp_path, monkeypatch):
 
     def resume(*given, **options):
         seen.append((given, options))
-        raise Reached
+        raise ReachedError
 
     monkeypatch.setattr("mitransient_lidar.campaigns.sweep.resume", resume)
     for words, value in (([], False), (["--retry-failed"], True)):
