@@ -75,7 +75,7 @@ class _GroupedCommands(TyperGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.commands = {name: LazyCommand(name, row) for name, row in self.commands_of.items()} | self.commands
+        self.commands = {**{name: LazyCommand(name, row) for name, row in self.commands_of.items()}, **self.commands}
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """Parse the options before the subcommand."""

@@ -136,7 +136,7 @@ class LazyCommand(TyperCommand):
     """A command of a table, whose options are made when they are needed."""
 
     def __init__(self, name: str, row: Command) -> None:
-        self._row, self._made = row, None
+        self._row, self._made = row, None  # type: tuple[Command, Any]
         super().__init__(name, help=inspect.cleandoc(row.help), rich_help_panel=row.heading, rich_markup_mode=None)
 
     def _full(self) -> Any:
@@ -196,7 +196,7 @@ def _typer(name: str, option: Option, default: Any) -> Any:
 
 def _parameter(name: str, kind: Any, option: Option, default: Any) -> inspect.Parameter:
     """Return a parameter of the callback, with the default as Typer shows it."""
-    annotation = Annotated[typed(kind, option), _typer(name, option, default)]
+    annotation: Any = Annotated[typed(kind, option), _typer(name, option, default)]
     if isinstance(default, (tuple, list)):
         text = [f"{one:g}" if isinstance(one, (int, float)) else str(one) for one in default]
         default = ",".join(text) if text and option.form not in _REPEATED else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -89,10 +89,8 @@ class Option:
         kinds = _parts(kind)
         if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
-        if any(
-            isinstance(get_origin(one), type) and issubclass(get_origin(one), Sequence | np.ndarray) for one in kinds
-        ):
-            return self._check_list(name, value)
+        if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
+            return self._check_list(name, value, whole=int in kinds)
         if int in kinds:
             assert isinstance(self.low, int)
             assert isinstance(self.high, int)
@@ -103,12 +101,12 @@ class Option:
             return non_negative(name, value)
         return in_range(name, value, self.low, self.high)
 
-    def _check_list(self, name: str, values: Any) -> list[float]:
-        numbers, low, high = number_list(name, values), self.low, self.high
-        inside = (numbers > low if self.above else numbers >= low) & (True if high is None else numbers <= high)
+    def _check_list(self, name: str, values: Any, whole: bool) -> list[float]:
+        numbers, low = number_list(name, values), np.float64(-np.inf if self.low is None else self.low)
+        inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
         if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
             raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")
-        return [float(number) for number in numbers]
+        return [int(number) if whole else float(number) for number in numbers]
 
 
 #: Arguments and options of several functions.
@@ -153,19 +151,17 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that checks its arguments by the `Option` of their annotations; None may stay where allowed.
 
+    Its signature shows their types alone, for the help of Python.
+
     Raises
     ------
     UserError
         If a number is out of range; the sentence names the parameter.
     """
-
-    @functools.cache
-    def about() -> tuple[inspect.Signature, Mapping[str, tuple[Any, Option]]]:
-        return inspect.signature(function), declared(function)
+    signature, options = inspect.signature(function), declared(function)
 
     @functools.wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        signature, options = about()
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
             if name in options and not is_unset(value, signature.parameters[name].default):
@@ -173,12 +169,23 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
                 given.arguments[name] = option.check(name, value, kind)
         return function(*given.args, **given.kwargs)
 
+    shown = [
+        one.replace(annotation=options[name][0]) if name in options else one
+        for name, one in signature.parameters.items()
+    ]
+    run.__signature__ = signature.replace(parameters=shown)  # type: ignore[attr-defined]
     return run
 
 
 def is_unset(value: Any, default: Any) -> bool:
     """Return whether a value is a default that needs no check: None, or an empty list."""
     return (value is None and default is None) or (isinstance(default, tuple) and not default and len(value) == 0)
+
+
+def _is_list(kinds: tuple[Any, ...]) -> bool:
+    """Return whether one of the types is that of a list or an array."""
+    origins = [get_origin(one) for one in kinds]
+    return any(isinstance(one, type) and issubclass(one, Sequence | np.ndarray) for one in origins)
 
 
 def _parts(kind: Any) -> tuple[Any, ...]:

@@ -14,8 +14,8 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, SceneOrResult, Sensor
-from mitransient_lidar.core.validation import FloatArray, integer, positive, require_memory, shown
+from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checked
+from mitransient_lidar.core.validation import FloatArray, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -24,7 +24,6 @@ from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.options import (
     MOST_PASSES,
     MaxTime,
-    RenderOptions,
     SignedSeed,
     TargetError,
     TargetQuantile,
@@ -58,6 +57,7 @@ _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
 _TIMES = ("surface_time", "time")  # names of the time of the sea of an XML scene [s]
 
 
+@checked
 @alone
 def render_passive(
     scene: SceneOrResult,
@@ -121,9 +121,7 @@ def render_passive(
     UserError
         If the scene, a parameter or an option is invalid.
     """
-    frames, step = integer("frames", frames, 1, MOST_FRAMES), positive("frame_step_s", frame_step_s)
-    width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
-    seed = RenderOptions(seed=seed).seed or 0
+    step, width, seed = frame_step_s, filter_width_nm, seed or 0
     counts: list[Any] = list(passes) if isinstance(passes, (list, tuple)) else [passes] * frames
     if len(counts) != frames:
         raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor
+from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
@@ -42,6 +42,7 @@ DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
+@checked
 @alone
 def render(
     scene: SceneOrResult,

@@ -21,7 +21,7 @@ import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -30,6 +30,7 @@ from mitransient_lidar.results.geometry import lidar_geometry, optional_number
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
 
+@checked
 def train_from_options(
     attributes: Mapping[str, Any],
     *,

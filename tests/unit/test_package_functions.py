@@ -37,9 +37,15 @@ def test_unknown_functions_are_attribute_errors():
         _ = mitransient_lidar.rendr
 
 
+def test_former_names_are_refused_with_the_new_one():
+    for old, new in (("waveforms", "echoes"), ("sweep", "campaign"), ("depth_uncertainty", "tpu")):
+        with pytest.raises(AttributeError, match=f"^mitransient_lidar.{old} is now {new}$"):
+            getattr(mitransient_lidar, old)
+
+
 def test_help_lists_the_options_of_a_render():
     text = pydoc.plain(pydoc.render_doc(mitransient_lidar.render))
-    for option in ("target_error: 'float | None' = None", "max_time", "components", "Returns", "Longest time"):
+    for option in ("target_error: float | None = None", "max_time", "components", "Returns", "Longest time"):
         assert option in text
 
 

@@ -323,7 +323,7 @@ AXES = {
 GATES = ("--start-ns", 1410, "--width-ns", 5, "--step-ns", 5, "--count", 4)
 
 
-LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("plot", "waveforms", "retrieve", "compare")]
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("view", "echoes", "retrieve", "compare")]
 
 
 @pytest.mark.slow

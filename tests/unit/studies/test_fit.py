@@ -193,7 +193,8 @@ def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path
     ("options", "message"),
     [
         (["--free", "depth"], "parameter 'depth' is not one of the scene"),
-        (["--free", ""], "must name one or more parameters"),
+        (["--free", ""], "--free = '' has an empty entry"),
+        ([], "--free = [] must name one or more parameters"),
         (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
         (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
         (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),
