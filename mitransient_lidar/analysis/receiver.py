@@ -71,8 +71,6 @@ def detect_waveforms(
         The receiver of every channel, or one chain for all; a name in `physics.receiver.presets.RECEIVERS` or of an
         instrument, or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
         of the result, and the preset ``apd`` without one.
-    shots, seed : int
-        Number of records of each waveform with independent noise, at least 1, and seed of the noise, at least 0.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.

@@ -46,8 +46,7 @@ _TRIALS = 8
 
 #: Options of campaigns and flights.
 ProcessCount = Annotated[
-    int | None,
-    Option("Processes on this machine, by default one for each processor that may be used", 1, 1024),
+    int | None, Option("Processes on this machine, by default one for each processor that may be used", 1, 1024)
 ]
 Scheduler = Annotated[Any, Option("A running Dask scheduler instead, as tcp://host:8786", form="ADDRESS")]
 
@@ -80,16 +79,12 @@ def campaign(
         A TOML file, or a dict of its contents; see docs/guide/campaigns.md.
     store
         Folder of the store. One that holds the same campaign is completed.
-    workers
-        Processes on this machine, 1 to 1024; by default one for each processor that this process may use.
     scheduler
         Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
         the same versions of this package, Mitsuba, Dr.Jit, NumPy and Python, and the store at the same path.
     shard_size
         Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
         8 to 1024, and fewer where a shard would take more than half a gigabyte.
-    retry_failed
-        Whether to render runs that have failed, too.
     progress
         Called with a `rendering.passes.Progress` about every second.
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
+import textwrap
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -109,6 +111,11 @@ class Option:
         return [int(number) if whole else float(number) for number in numbers]
 
 
+def positive_option(meaning: str, unit: str = "") -> Option:
+    """Return the declaration of a number greater than 0."""
+    return Option(meaning, 0, unit=unit, above=True)
+
+
 #: Arguments and options of several functions.
 Scene = Annotated[Any, Option("Name of a shipped scene, or path of a Mitsuba XML file", form="SCENE", is_argument=True)]
 SceneOrResult = Annotated[
@@ -121,7 +128,7 @@ SceneOrResult = Annotated[
     ),
 ]
 Seed = Annotated[int, Option("Seed of the random numbers", 0, 2**53)]
-FewerPasses = Annotated[float | None, Option("Stop before this many seconds, with fewer passes", 0, above=True)]
+FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
 TargetId = Annotated[str, Option("Id of the shape that is the target")]
 BackgroundPower = Annotated[float, Option("Power of the daylight on each pixel", 0, unit="W")]
 Instrument = Annotated[str | None, Option("Instrument instead of the scene's lidar, from the list of instruments")]
@@ -151,7 +158,8 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that checks its arguments by the `Option` of their annotations; None may stay where allowed.
 
-    Its signature shows their types alone, for the help of Python.
+    Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
+    Python.
 
     Raises
     ------
@@ -174,7 +182,21 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
         for name, one in signature.parameters.items()
     ]
     run.__signature__ = signature.replace(parameters=shown)  # type: ignore[attr-defined]
+    run.__doc__ = _documented(function.__doc__ or "", {name: option for name, (_, option) in options.items()})
     return run
+
+
+def _documented(text: str, options: Mapping[str, Option]) -> str:
+    """Return a documentation whose section of parameters has all options; those that it describes stay."""
+    beginning, heading, rest = text.partition("Parameters\n    ----------\n")
+    described, blank, end = rest.partition("\n\n")
+    known = {name for line in described.splitlines() if line[4:5].strip() for name in re.findall(r"\w+", line)}
+    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in options.items() if name not in known]
+    return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
+
+
+def _indented(text: str) -> str:
+    return textwrap.fill(text, 120, initial_indent=" " * 8, subsequent_indent=" " * 8)
 
 
 def is_unset(value: Any, default: Any) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, declared
+from mitransient_lidar.core.options import Option, declared, positive_option
 
 #: Largest number of passes that can be asked for.
 MOST_PASSES = 10**9
@@ -26,13 +26,12 @@ TargetError = Annotated[
 TargetQuantile = Annotated[
     float | None, Option("Share that must reach the target error instead of 0.95; 0.5 is the median", 0.01, 1)
 ]
-MaxTime = Annotated[float | None, Option("Stop before this many seconds, after at least two passes", 0, above=True)]
+MaxTime = Annotated[float | None, positive_option("Stop before this many seconds, after at least two passes")]
 Passes = Annotated[int | None, Option("Stop after this many independent passes", 2, MOST_PASSES)]
 SignedSeed = Annotated[int | None, Option("Seed of the random numbers, 0 by default", -(2**63), 2**63 - 1)]
 PassShare = Annotated[float | None, Option("Share of the paths of a full pass in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
-    float | None,
-    Option("Memory for histograms [GB], 2 by default; with less, only gates are kept", 0, above=True),
+    float | None, positive_option("Memory for histograms [GB], 2 by default; with less, only gates are kept")
 ]
 Components = Annotated[bool | None, Option("Also separate the light of surface, water, bottom and targets")]
 Derivatives = Annotated[

@@ -14,7 +14,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checked
+from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
@@ -75,8 +75,7 @@ def render_passive(
         float, Option("Time between frames, 0.1 by default", 0, unit="s", above=True, flag="--frame-step")
     ] = 0.1,
     filter_width_nm: Annotated[
-        float | None,
-        Option("Width of the receiver's filter, for the power of the daylight", 0, unit="nm", above=True),
+        float | None, positive_option("Width of the receiver's filter, for the power of the daylight", "nm")
     ] = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,
@@ -87,8 +86,6 @@ def render_passive(
     ----------
     scene
         As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
-    sensor
-        Id of a receiver of the scene, by default the first one.
     integrator
         Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
@@ -98,13 +95,9 @@ def render_passive(
         As for `render.render`.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
-    frames
-        Number of frames, 1 to 10 000.
     frame_step_s
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to ``time``
         of the ``ocean_surface`` of a dict.
-    filter_width_nm
-        Width of the receiver's filter [nm], greater than 0, for ``background_power``.
     progress
         Called with a `passes.Progress` of the frame after every pass.
 

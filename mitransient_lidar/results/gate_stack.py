@@ -21,7 +21,7 @@ import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -36,13 +36,10 @@ def train_from_options(
     *,
     start_ns: Annotated[float | None, Option("Start of the first gate, at half height [ns], any number")] = None,
     start_depth_m: Annotated[
-        float | None,
-        Option("Depth of its start on the axis [m], any number, instead of a time", flag="--start-depth"),
+        float | None, Option("Depth of its start on the axis [m], any number, instead of a time", flag="--start-depth")
     ] = None,
-    width_ns: Annotated[float | None, Option("Width of a gate between half heights", 0, unit="ns", above=True)] = None,
-    step_ns: Annotated[
-        float | None, Option("Time from gate to gate, by default the width", 0, unit="ns", above=True)
-    ] = None,
+    width_ns: Annotated[float | None, positive_option("Width of a gate between half heights", "ns")] = None,
+    step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
     count: Annotated[int, Option("Number of gates", 1, 100_000)] = 1,
     rise_ns: Annotated[
         float, Option("10-90 % time of the rising edge; both edges take at most 1.18 widths", 0, unit="ns")
@@ -63,18 +60,6 @@ def train_from_options(
     start_ns, start_depth_m : float, optional
         Half height of the first gate's rising edge, as a time [ns] or a depth on the receiver's axis [m]; exactly one
         of them.
-    width_ns : float, optional
-        Time between the half heights of a gate [ns], greater than 0; not with `profile_file`.
-    step_ns : float, optional
-        Time between the starts of consecutive gates [ns], greater than 0; by default the width.
-    count : int
-        Number of gates, 1 to 100 000.
-    rise_ns, fall_ns : float
-        10-90 % times of the edges [ns], at least 0; not with `profile_file`.
-    profile_file : path, optional
-        Measured gate: two columns, time [ns] and transmission 0 to 1.
-    pulses : int
-        Number of pulses summed in a gate, 1 to 10^9.
 
     Raises
     ------

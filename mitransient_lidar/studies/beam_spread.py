@@ -84,14 +84,6 @@ def beam_spread(
         As for `rendering.render.render`.
     depths
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
-    passes
-        Number of independent passes, 2 to 10 000.
-    max_time
-        Time after which no pass begins [s], above 0; at least two passes are made.
-    photons
-        Photons of a pass, 1024 to 2^24.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every pass.
 

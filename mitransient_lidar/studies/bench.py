@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
 
 if TYPE_CHECKING:
@@ -106,8 +106,7 @@ def run(
         Option("Stop when 95 % of the bins of lit pixels have reached this relative standard error", 0, 1, above=True),
     ] = None,
     max_time: Annotated[
-        float | None,
-        Option("Stop each render before this many seconds, by default 120 with a target error", 0, above=True),
+        float | None, positive_option("Stop each render before this many seconds, by default 120 with a target error")
     ] = None,
 ) -> None:
     """Measure every case with every integrator, and instruments with merging; print a table or one JSON object.

@@ -19,7 +19,16 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.options import RECEIVERS, BackgroundPower, NumberOrAuto, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import (
+    RECEIVERS,
+    BackgroundPower,
+    NumberOrAuto,
+    Option,
+    Scene,
+    Seed,
+    checked,
+    positive_option,
+)
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
@@ -84,7 +93,7 @@ def bounds(
     renders: Annotated[int, Option("Independent renders of each design; 3 or more give errors", 2, 1000)] = 4,
     passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 16,
     max_time: Annotated[
-        float | None, Option("Begin no further design after this many seconds, and leave it out", 0, above=True)
+        float | None, positive_option("Begin no further design after this many seconds, and leave it out")
     ] = None,
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
@@ -103,15 +112,11 @@ def bounds(
     receiver, gain, optical_density
         As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`; several receivers in a list
         are compared on the same renders, and ``receiver`` is then the last parameter of a design.
-    background_power_w
-        Steady power on each pixel [W], at least 0.
     nuisances
         As for `analysis.information.fisher.fisher_information`.
     renders
         Independent renders of each design, 2 to 1000, whose noise is kept out of the information; from three on their
         spread gives standard errors.
-    passes
-        Passes of each render, 2 to 100 000.
     max_time
         Time after which no design is begun [s], above 0; the first one always is. The attribute ``designs_left_out``
         has the number of the others that are left out, with a warning.

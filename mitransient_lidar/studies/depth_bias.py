@@ -25,7 +25,7 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
-from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked
+from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -39,8 +39,7 @@ WATERS = ("IB", "1C", "5C")
 #: Parameters of tables of an instrument.
 InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
 Winds = Annotated[
-    Numbers,
-    Option("Wind speeds; 0 for a level sea with ripples", 0, None, "m/s", ascending=True, form="N,N,..."),
+    Numbers, Option("Wind speeds; 0 for a level sea with ripples", 0, None, "m/s", ascending=True, form="N,N,...")
 ]
 Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
 Depths = Annotated[Numbers, Option("Depths of the bottom", 0, None, "m", above=True, ascending=True, form="N,N,...")]
@@ -49,8 +48,7 @@ OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrum
 Places = Annotated[int, Option("Random places of a sea with waves, or renders of a level sea", 2, 10_000)]
 Records = Annotated[int, Option("Records with noise of each place", 1, 10_000)]
 SeaTime = Annotated[
-    float | None,
-    Option("Render no sea after this many seconds; those left out are NaN in the table", 0, above=True),
+    float | None, positive_option("Render no sea after this many seconds; those left out are NaN in the table")
 ]
 SeaSeed = Annotated[int, Option("Seed of the random numbers", 0, 2**31)]
 
@@ -142,18 +140,12 @@ def depth_bias(
 
     Parameters
     ----------
-    instrument
-        Name of the instrument.
     params, scene
         A scene with the parameters ``aim_x``, ``aim_y``, ``off_nadir_deg``, ``wind_speed``, ``spectrum``, ``jerlov``
         and ``bottom_depth``, and further parameters.
     angles_deg
         Angles from nadir [degree], ascending; by default that of the instrument, and 5 degrees more,
         or less near grazing.
-    winds
-        Wind speeds [m/s], ascending, at least 0; 0 for level seas with ripples.
-    ripples
-        Winds whose ripples the level seas have [m/s], above 0, ascending.
     waters
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
@@ -162,16 +154,12 @@ def depth_bias(
         NaN.
     estimators
         Estimators of `echo_table.extract`.
-    receiver
-        A receiver as of `receiver_files.receiver`; by default that of the instrument.
     shots, records
         Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
         each, 1 to 10 000.
     target_error
         Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
         have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
-    seed
-        Seed of places, seas and noise, at least 0.
     corrections
         A former table, its file, or ``auto`` for the shipped one, to correct the depths by.
     max_time

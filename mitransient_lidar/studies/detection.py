@@ -25,6 +25,7 @@ from mitransient_lidar.core.options import (
     Seed,
     TargetId,
     checked,
+    positive_option,
 )
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.loading.exclusive import alone
@@ -65,11 +66,9 @@ def detect(
     passes: Annotated[int, Option("Number of independent passes of each render", 16, 100_000)] = 16,
     max_time: Annotated[
         float | None,
-        Option(
+        positive_option(
             "Begin no further depth of --depths after this many seconds, and leave it out; the scene's own depth is "
-            "always rendered",
-            0,
-            above=True,
+            "always rendered"
         ),
     ] = None,
     seed: Seed = 0,
@@ -80,12 +79,10 @@ def detect(
 
     Parameters
     ----------
-    scene, params, target_id, integrator
+    scene, params, integrator
         As for `target_signal.target_signal`, with at most 16 pixels.
     receiver
         Detector and electronics of every pixel, or a name in `physics.receiver.presets.RECEIVERS`.
-    pfa, pd
-        Required probabilities of false alarm, 1e-12 to 0.5, and of detection, above `pfa` and below 1.
     depths
         Further depths of the target to render [m], increasing: values of the parameter ``target_depth`` of the scene.
     shots
@@ -95,15 +92,9 @@ def detect(
         4 to 1000.
     renders
         Independent renders of the scene without clutter, 3 to 1000, from whose spread the intervals are estimated.
-    background_power_w
-        Steady power on each pixel [W], at least 0.
-    passes
-        Passes of each render, 16 to 100 000.
     max_time
         Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
         attribute ``depths_left_out`` has those that are left out as text, and a warning names them.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every render.
 

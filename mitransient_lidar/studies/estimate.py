@@ -74,12 +74,8 @@ def estimate(
 
     Parameters
     ----------
-    scene, params, instrument
+    scene, params
         As for `rendering.render.render`.
-    paths
-        Number of paths, 64 to 2^22.
-    seed
-        Seed of the random numbers, at least 0.
 
     Returns
     -------

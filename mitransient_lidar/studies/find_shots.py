@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.options import Option, Scene, checked
+from mitransient_lidar.core.options import Option, Scene, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
@@ -62,12 +62,11 @@ def find_shots(
     params: Mapping[str, Any] | None = None,
     *,
     at: Annotated[Sequence[tuple[float, float]], Option("A place, instead of a search", unit="m", form="X,Y")] = (),
-    slope_sigmas: Annotated[float, Option("Slopes to find, in standard deviations", 0, above=True)] = 2.0,
+    slope_sigmas: Annotated[float, positive_option("Slopes to find, in standard deviations")] = 2.0,
     count: Annotated[int, Option("Places of each kind", 1, 100)] = 1,
     waveforms: Annotated[bool, Option("Also render the shots")] = True,
     max_time: Annotated[
-        float | None,
-        Option("Stop before this many seconds, with fewer passes or waveforms", 0, above=True),
+        float | None, positive_option("Stop before this many seconds, with fewer passes or waveforms")
     ] = None,
     progress: ProgressCallback | None = None,
 ) -> RenderedShots:
@@ -79,12 +78,6 @@ def find_shots(
     ----------
     scene, params, waveforms, max_time, progress
         As for `render_found_shots`.
-    at
-        Places (x, y) [m], instead of a search.
-    slope_sigmas
-        Required slopes in standard deviations of the mean slope over a footprint.
-    count
-        Places of each kind.
 
     Returns
     -------

@@ -24,7 +24,7 @@ from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Instrument, Option, checked
+from mitransient_lidar.core.options import Instrument, Option, checked, positive_option
 from mitransient_lidar.core.parameters.water import LAYERED_WATER
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_parameters
@@ -55,8 +55,7 @@ def fit(
         Option("Name or XML file of the scene; by default that of the result"),
     ] = None,
     free: Annotated[
-        Sequence[str],
-        Option("Free parameters of the scene, and bandwidth_mhz of a receiver", form="NAME,NAME,..."),
+        Sequence[str], Option("Free parameters of the scene, and bandwidth_mhz of a receiver", form="NAME,NAME,...")
     ] = (),
     *,
     params: Mapping[str, Any] | None = None,
@@ -65,8 +64,7 @@ def fit(
         Mapping[str, float] | None, Option("Start of a free parameter. Repeatable", form="NAME=VALUE")
     ] = None,
     bounds: Annotated[
-        Mapping[str, tuple[float, float]] | None,
-        Option("Bounds of a free parameter. Repeatable", form="NAME=LOW:HIGH"),
+        Mapping[str, tuple[float, float]] | None, Option("Bounds of a free parameter. Repeatable", form="NAME=LOW:HIGH")
     ] = None,
     free_scale: Annotated[
         bool | None,
@@ -76,8 +74,7 @@ def fit(
         bool | None, Option("Fit the time offset, as by default of CSV files", flag="--free-time/--fixed-time")
     ] = None,
     noise: Annotated[
-        float | None,
-        Option("Standard deviation of every sample, in the unit of the waveforms", 0, above=True),
+        float | None, positive_option("Standard deviation of every sample, in the unit of the waveforms")
     ] = None,
     receiver: Annotated[
         str | os.PathLike[str] | ReceiverChain | None,
@@ -91,8 +88,7 @@ def fit(
         int | None, Option("Passes of each render, by default by the errors of the waveforms", 2, MOST_PASSES)
     ] = None,
     max_time: Annotated[
-        float | None,
-        Option("Try no step after this many seconds, so that the fit may not converge", 0, above=True),
+        float | None, positive_option("Try no step after this many seconds, so that the fit may not converge")
     ] = None,
     seed: Annotated[
         int | None, Option("Seed of all renders, by default not that of the result", -(2**63), 2**63 - 1)
@@ -122,20 +118,14 @@ def fit(
     free_scale, free_time
         Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
         file, whose unit and time zero are unknown.
-    noise
-        Standard deviation of every sample, above 0, in the unit of the waveforms, instead of their own errors.
     receiver
         Receiver of a recorded signal, by default the one that it names; or of a CSV file, whose response and noise the
         model gets (`analysis.information.measured.measured`).
-    scale_errors
-        Whether to multiply the covariance by the reduced chi-squared.
     passes
         Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
         a tenth of that of the waveforms, 16 to 256.
     seed
         Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
-    most_renders
-        Renders after which the fit ends without convergence, 2 to 10000.
     max_time
         Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
         warning. The start is always rendered.

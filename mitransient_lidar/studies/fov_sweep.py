@@ -15,7 +15,7 @@ import xarray as xr
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Numbers, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import Numbers, Option, Scene, Seed, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
@@ -47,17 +47,12 @@ def fov_sweep(
         float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
     ] = 1.0,
     max_depth: Annotated[
-        float,
-        Option("Depth where it ends, below --min-depth, above bottom and targets", 0, unit="m", above=True),
+        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
     ] = 5.0,
     passes: Annotated[int, Option("Number of independent passes of each render", 4, 10_000)] = 48,
     max_time: Annotated[
         float | None,
-        Option(
-            "Stop before this many seconds, without the widest fields of view, but with the narrowest one",
-            0,
-            above=True,
-        ),
+        positive_option("Stop before this many seconds, without the widest fields of view, but with the narrowest one"),
     ] = None,
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
@@ -69,17 +64,11 @@ def fov_sweep(
     scene, params
         As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
         ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
-    fov_mrad
-        Full angles of the circles, in any order.
     min_depth, max_depth
         Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
-    passes
-        Independent passes for each field of view, 4 to 10 000.
     max_time
         Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
         out, with a warning; the narrowest one is always rendered.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every pass.
 

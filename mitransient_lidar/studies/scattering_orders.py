@@ -44,12 +44,6 @@ def scattering_orders(
         As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
-    passes
-        Number of passes, 2 to 100 000.
-    seed
-        Seed of the random numbers, 0 to 2^53.
-    max_time
-        Time after which no pass begins [s], above 0; at least two passes are made.
     progress
         Called with a `passes.Progress` after every pass.
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, Scene, checked
+from mitransient_lidar.core.options import Option, Scene, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
@@ -29,7 +29,7 @@ def shot_statistics(
     params: Mapping[str, Any] | None = None,
     *,
     count: Annotated[int, Option("Number of shots", 2, 100_000)] = 200,
-    max_time: Annotated[float | None, Option("Stop before this many seconds, with fewer shots", 0, above=True)] = None,
+    max_time: Annotated[float | None, positive_option("Stop before this many seconds, with fewer shots")] = None,
     seed: Annotated[int, Option("Seed of their places", 0, 2**53)] = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -39,12 +39,6 @@ def shot_statistics(
     ----------
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
-    count
-        Number of shots, 2 to 100 000.
-    seed
-        Seed of the places, at least 0.
-    max_time
-        Time after which no shots begin [s], above 0; the result has fewer shots then.
     progress
         Called with a `passes.Progress` after every shot.
 

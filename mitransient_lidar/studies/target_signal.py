@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Option, Scene, TargetId, checked
+from mitransient_lidar.core.options import FewerPasses, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
@@ -37,16 +37,12 @@ def target_signal(
     *,
     target_id: TargetId = "target",
     grid: Annotated[int, Option("Places of the target along each axis", 1, 15)] = 1,
-    max_offset: Annotated[
-        float, Option("Largest offset of these places along each axis", 0, unit="m", above=True)
-    ] = 2.0,
+    max_offset: Annotated[float, positive_option("Largest offset of these places along each axis", "m")] = 2.0,
     passes: Annotated[int, Option("Number of independent passes of each render", _GROUPS, 100_000)] = 64,
     max_time: Annotated[
         float | None,
-        Option(
-            "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more",
-            0,
-            above=True,
+        positive_option(
+            "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more"
         ),
     ] = None,
     seed: Annotated[int, Option("Seed of the random numbers", -(2**63), 2**63 - 1)] = 0,
@@ -62,17 +58,11 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, seed, integrator
+    scene, params, integrator
         As for `rendering.render.render`.
-    target_id
-        Id of the target's shape.
     grid, max_offset
         Places of the target along each axis, and their largest offset from that in the scene, for the result of
         `target_map` on a square.
-    passes
-        Number of passes of each render, 16 to 100 000.
-    max_time
-        Time after which no pass begins [s], above 0; at least 16 passes are made.
     axis
         Time bins instead of automatic ones.
     progress

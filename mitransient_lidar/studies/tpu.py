@@ -91,16 +91,10 @@ def tpu(
 
     Parameters
     ----------
-    instrument, params, waters, depths, scene, receiver, shots, records, seed
+    params, scene
         As of `depth_bias.depth_bias`.
-    altitudes
-        Heights of the lidar above the sea [m], above 0, ascending; by default that of the instrument.
-    angles_deg
-        Angles from nadir [degree], ascending; by default that of the instrument.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
-    estimator
-        An estimator of `echo_table.extract`.
     corrections
         A table of `depth_bias.depth_bias` to also correct the depths by, its file, ``auto`` for the shipped one, or
         None.

@@ -49,8 +49,7 @@ _TITLES = {
 @checked
 def describe_water(
     kind: Annotated[
-        str,
-        Option("jerlov, chlorophyll, kd, secchi, petzold, profile or pure", form="KIND", is_argument=True),
+        str, Option("jerlov, chlorophyll, kd, secchi, petzold, profile or pure", form="KIND", is_argument=True)
     ],
     value: Annotated[
         str | None,

@@ -2,6 +2,7 @@
 
 import inspect
 import pydoc
+import re
 from pathlib import Path
 
 import jedi
@@ -22,6 +23,9 @@ def test_every_function_has_a_signature_and_documentation(name):
     assert not any(one.kind is one.VAR_KEYWORD for one in parameters if name != "render")
     assert len(inspect.getdoc(function)) > 40
     assert "self" not in inspect.signature(function).parameters
+    described = re.findall(r"^\S.*$", inspect.getdoc(function), flags=re.MULTILINE)
+    if "Parameters" in described:
+        assert set(inspect.signature(function).parameters) <= {*re.findall(r"\w+", " ".join(described))} | {"others"}
 
 
 def test_citations_name_the_version():

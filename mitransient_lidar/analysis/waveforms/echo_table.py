@@ -27,7 +27,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
@@ -78,9 +78,7 @@ def extract(
     *,
     pulse: Pulse | None = None,
     noise: float | npt.ArrayLike | None = None,
-    threshold: Annotated[
-        float, Option("Standard deviations of the noise above which a signal counts", 0, above=True)
-    ] = 5.0,
+    threshold: Annotated[float, positive_option("Standard deviations of the noise above which a signal counts")] = 5.0,
     contrast: Annotated[
         float, Option("Share of the signal that an echo in the water must add (at least 0, below 1)")
     ] = 0.05,
@@ -115,14 +113,10 @@ def extract(
         echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over a pulse
         to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
         ``signal_mean_stderr``, so that errors of a render are no echoes.
-    threshold, contrast
-        As for `echo_detection.find_echoes`.
     echo_fwhm_ns : float, optional
         Expected full width of an echo [ns]. By default, that of pulse, response and the beam's spread over the surface.
     saturation_level : float, optional
         Smallest saturated sample, as recorded, in addition to the variable ``saturated``.
-    layers : int
-        Number of changes in the column to test for, 0 to 8; see `column_fits.change_points`.
     depth_from : {'echo', 'mean'}
         Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
     iterations : int

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
-from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
@@ -77,7 +77,7 @@ def figures(
     output: str | os.PathLike[str] = "output/figures",
     *,
     target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
-    max_time: Annotated[float | None, Option("Begin no further figure after this many seconds", 0, above=True)] = None,
+    max_time: Annotated[float | None, positive_option("Begin no further figure after this many seconds")] = None,
     seed: Annotated[int, Option("Seed of the random numbers", 0, 10**6)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
@@ -93,10 +93,6 @@ def figures(
     target_error
         Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
         warning.
-    max_time
-        Time after which no further figure is begun [s], greater than 0; by default all are made.
-    seed
-        Seed of all random numbers and of the other places, 0 to 10^6.
     progress
         Called with a `passes.Progress` after every batch of shots.
 

@@ -17,7 +17,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked
+from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
@@ -80,8 +80,7 @@ def render_shots(
         float | None, Option("Relative standard error of the median bin, instead of full passes", 0, 1, above=True)
     ] = None,
     max_time: Annotated[
-        float | None,
-        Option("Stop before this many seconds for all shots, with fewer passes or shots", 0, above=True),
+        float | None, positive_option("Stop before this many seconds for all shots, with fewer passes or shots")
     ] = None,
     pass_share: float | None = None,
     seed: Annotated[int, Option("Seed of random places, 1 by default", 0, 2**53)] = 1,
@@ -122,8 +121,6 @@ def render_shots(
         Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
         needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
         signal by about 0.3 %.
-    seed
-        Seed of random places, at least 0.
     first_seed
         Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
     axis
@@ -131,14 +128,8 @@ def render_shots(
         twentieth of the record.
     shot_passes
         Most passes of each shot, shape (shots,), 2 to `passes`, as the coordinate of a series that is rendered again.
-    components
-        Whether to separate the light by its origin, by default not, as for `rendering.render.render`.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
-    instrument
-        Name of the instrument whose laser and receiver replace those of the scene.
-    sensor
-        Id of a receiver of the scene, by default the first one.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     progress
