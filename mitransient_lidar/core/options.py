@@ -92,7 +92,7 @@ class Option:
         if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
         if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
-            return self._check_list(name, value, whole=int in kinds)
+            return self._check_list(name, value)
         if int in kinds:
             assert isinstance(self.low, int)
             assert isinstance(self.high, int)
@@ -103,12 +103,12 @@ class Option:
             return non_negative(name, value)
         return in_range(name, value, self.low, self.high)
 
-    def _check_list(self, name: str, values: Any, whole: bool) -> list[float]:
+    def _check_list(self, name: str, values: Any) -> list[float]:
         numbers, low = number_list(name, values), np.float64(-np.inf if self.low is None else self.low)
         inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
         if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
             raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")
-        return [int(number) if whole else float(number) for number in numbers]
+        return list(values) if isinstance(values, (list, tuple)) else [float(number) for number in numbers]
 
 
 def positive_option(meaning: str, unit: str = "") -> Option:

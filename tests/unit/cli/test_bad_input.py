@@ -145,7 +145,7 @@ def test_parameters_of_scenes_on_the_command_line(folder, scene, name, value, pa
 
 
 RENDER = ("render", "table1")
-#: Numbers outside their ranges are tried in `test_option_ranges`.
+#: Numbers outside their ranges are tried in `test_contract`.
 OPTIONS = [
     (RENDER, "--passes", "2.5", "must be a valid integer"),
     (RENDER, "--passes", "nan", "must be a valid integer"),
