@@ -20,18 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import (
-    campaigns,
-    depth_errors,
-    echoes,
-    fit,
-    gates,
-    render,
-    results,
-    retrieve,
-    scenes,
-    studies,
-)
+from mitransient_lidar.cli import analysis, campaigns, depth_errors, gates, render, results, scenes, studies
 from mitransient_lidar.cli.generator import Command, LazyCommand
 from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.core.errors import UserError
@@ -46,9 +35,7 @@ COMMANDS: dict[str, Command] = {
     **campaigns.FIGURES,
     **results.COMMANDS,
     **gates.COMMANDS,
-    **echoes.COMMANDS,
-    **retrieve.COMMANDS,
-    **fit.COMMANDS,
+    **analysis.COMMANDS,
     **scenes.COMMANDS,
 }
 

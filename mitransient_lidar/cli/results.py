@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command
-from mitransient_lidar.cli.messages import name_subject, reporting
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix
+from mitransient_lidar.cli.generator import Command
+from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import DrawingOnly, Quiet
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
@@ -118,29 +118,6 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
     return dataset.sel(shot=number)
 
 
-def _record(
-    call: Call,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Record the waveforms of a file, and write the signals."""
-    target = output or file.with_name(f"{file.stem}_recorded.nc")
-    check_suffix("--output", target, ".nc")
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis import receiver as analysis
-
-    with reporting(quiet):
-        result = results.open(file)
-    recorded = call(result)
-    name_subject(file, result.attrs, quiet)
-    write_netcdf(recorded, target, analysis.encoding(recorded))
-    for line in analysis.describe_recording(recorded):
-        typer.echo(line)
-
-
 def _compare(
     first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and time bins.")],
@@ -187,17 +164,6 @@ COMMANDS = {
         """Test whether two results agree within their errors.
 
         Draws both and prints the path; exit code 1 if they differ.
-        """,
-    ),
-    "record": Command(
-        "Analyse results",
-        "analysis.receiver:detect_waveforms",
-        _record,
-        """Record the waveforms of a result with a receiver.
-
-        Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
-        is saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
-        gain or the filter is chosen so that nothing is saturated.
         """,
     ),
 }

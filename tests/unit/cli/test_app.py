@@ -140,7 +140,7 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     stub(monkeypatch, "record", lambda *_, **__: ())
     for name in ("encoding", "describe_recording"):
         monkeypatch.setattr(f"mitransient_lidar.analysis.receiver.{name}", lambda *_, **__: ())
-    monkeypatch.setattr("mitransient_lidar.cli.results.write_netcdf", lambda *_: logger.warning("late"))
+    monkeypatch.setattr("mitransient_lidar.cli.analysis.write_netcdf", lambda *_: logger.warning("late"))
     done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
     assert done.exit_code == 0, done.output
     assert ("early" in done.stderr, caplog.messages) == ((False, []) if quiet else (True, ["early", "late"]))
