@@ -69,7 +69,7 @@ def _render_row(call: Call, campaign: Path, row: int, path: Path) -> None:
     from mitransient_lidar import results
     from mitransient_lidar.campaigns.sweep import render_row
 
-    series = replace(call, function=render_row, arguments={})(campaign, row)
+    series = replace(call, function=render_row, arguments={}, flags={"row": "--row"})(campaign, row)
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced():
         results.save(series, path)

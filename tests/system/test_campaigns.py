@@ -304,10 +304,10 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
         (changed(parameters={"bottom_depth": [-3, -2]}), [], "all fail"),
         (changed(fixed={"aim_x": 3}, design={**QUICK["design"], "shots": 2}), [], "leave out aim_x"),
         (changed(scene="table9"), [], "table9"),
-        (changed(), ["--scheduler", "nonsense://a"], "scheduler = 'nonsense://a' cannot be reached"),
-        (changed(), ["--workers", "0"], "workers = 0 must lie between 1 and 1024"),
+        (changed(), ["--scheduler", "nonsense://a"], "--scheduler = 'nonsense://a' cannot be reached"),
+        (changed(), ["--workers", "0"], "--workers = 0 must lie between 1 and 1024"),
         (changed(), ["--workers", "2", "--row", "1"], "--workers and --row are alternatives"),
-        (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "row = 12 must lie between 0 and 11"),
+        (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "--row = 12 must lie between 0 and 11"),
     ]
     for given_campaign, options, message in cases:
         given = [] if "-o" in options else ["-o", out]
@@ -323,7 +323,7 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
     assert_refused(run("campaign", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
     assert_refused(run("campaign", quick, "-o", out, "-q"), "--output is fixed in the store")
     same = write_toml(tmp_path / "same.toml", campaign)
-    assert_refused(run("campaign", same, "-o", quick, "--shard-size", 5, "-q"), "shard_size = 5 must be that of", "6")
+    assert_refused(run("campaign", same, "-o", quick, "--shard-size", 5, "-q"), "--shard-size = 5 must be that of", "6")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
