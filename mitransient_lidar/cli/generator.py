@@ -51,6 +51,13 @@ _REPEATED: dict[str, Callable[[str, str], Any]] = {
 _PLAIN = (float, int, bool, Path, str)
 
 
+def function_at(place: str) -> Callable[..., Any]:
+    """Return the function at ``module:name`` of the package as it is now, and import its module for that."""
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(f"mitransient_lidar.{module}"), name)
+    return found
+
+
 @dataclass(frozen=True)
 class Call:
     """The public function of a command, with the arguments that were given."""
@@ -69,11 +76,13 @@ class Call:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """Let sentences of errors that begin with a parameter name the option that was typed."""
+        """Let sentences of errors name options where they state parameters with values, or begin with one."""
         try:
             yield
         except UserError as error:
-            text = re.sub(r"^\w+(?= (=|must|holds|is) )", lambda word: self.flags.get(word[0], word[0]), str(error))
+            text = re.sub(
+                r"\b\w+(?= = )|^\w+(?= (must|holds|is) )", lambda word: self.flags.get(word[0], word[0]), str(error)
+            )
             error.args = (text,)
             raise
 
@@ -92,18 +101,12 @@ class Command:
     help: str
     defaults: Mapping[str, Any] = field(default_factory=dict)
 
-    def resolve(self) -> Callable[..., Any]:
-        """Return the public function as it is now, and import its module for that."""
-        place, _, name = self.function.partition(":")
-        found: Callable[..., Any] = getattr(importlib.import_module(f"mitransient_lidar.{place}"), name)
-        return found
-
     def callback(self, name: str) -> Callable[..., None]:
         """Return the function that Typer calls, with a signature of all options."""
         own = list(inspect.signature(self.body, eval_str=True).parameters.values())
         if not self.function:
             return _decorated(name, lambda **given: self.body(**given), own)
-        function = self.resolve()
+        function = function_at(self.function)
         known, options = inspect.signature(function).parameters, declared(function)
         defaults = {key: self.defaults.get(key, known[key].default) for key in options}
         flags = {key: flag(key, option) for key, (_, option) in options.items() if not option.is_argument}
@@ -116,7 +119,7 @@ class Command:
             if "params" in known:
                 arguments["params"] = parameters(given.pop("define"))
             quiet = bool(given.get("quiet"))
-            self.body(Call(self.resolve(), arguments, quiet, "progress" in known, flags), **given)
+            self.body(Call(function_at(self.function), arguments, quiet, "progress" in known, flags), **given)
 
         listed = [_parameter(key, kind, option, defaults[key]) for key, (kind, option) in options.items()]
         if "params" in known:

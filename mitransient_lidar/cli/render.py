@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_suffix, check_targets, scene_of
-from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.generator import Call, Command, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
 from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -57,41 +57,34 @@ def _render(
     exit_if_interrupted(dataset)
 
 
+#: Functions that draw a result, by the ends of the names of their files.
+_DRAWINGS = {
+    "_components": "plots.waveforms:plot_components",
+    "_derivatives": "plots.derivatives:plot_derivatives",
+    "_layout": "plots.layout:plot_layout",
+    "": "plots.waveforms:plot_waveforms",
+}
+
+
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
-    if target.suffix == ".exr":
-        try:
+    dispensable = {".exr": "EXR file"}.get(target.suffix, "drawing of the pixels" * target.stem.endswith("_layout"))
+    try:
+        if target.suffix == ".exr":
             results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
-        except WriteError:
+        elif target.suffix == ".nc":
+            (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+        else:
+            function_at(next(_DRAWINGS[end] for end in _DRAWINGS if target.stem.endswith(end)))(dataset, target)
+    except WriteError:
+        raise
+    except UserError as error:
+        if not dispensable:
             raise
-        except UserError as error:
-            typer.echo(f"no EXR file: {error}", err=True)
-    elif target.suffix == ".nc":
-        (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
-    elif target.stem.endswith("_components"):
-        from mitransient_lidar.plots.waveforms import plot_components
-
-        plot_components(dataset, target)
-    elif target.stem.endswith("_derivatives"):
-        from mitransient_lidar.plots.derivatives import plot_derivatives
-
-        plot_derivatives(dataset, target)
-    elif not target.stem.endswith("_layout"):
-        from mitransient_lidar.plots.waveforms import plot_waveforms
-
-        plot_waveforms(dataset, target)
-    else:
-        from mitransient_lidar.plots.layout import plot_layout
-
-        try:
-            plot_layout(dataset, target)
-        except WriteError:
-            raise
-        except UserError as error:
-            typer.echo(f"no drawing of the pixels: {error}", err=True)
+        typer.echo(f"no {dispensable}: {error}", err=True)
 
 
 def _passive(

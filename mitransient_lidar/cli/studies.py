@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.generator import Call, Command, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.cli.options import OUTPUT, DrawingOnly, Quiet
 
@@ -32,22 +30,16 @@ def _study(
         found = call()
         output.parent.mkdir(parents=True, exist_ok=True)
         with announced():
-            _function(plot if ":" in plot else f"plots.studies.{name}:{plot}")(found, output)
+            function_at(plot if ":" in plot else f"plots.studies.{name}:{plot}")(found, output)
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
-                _function(f"studies.{name}:{table}")(found, output.with_suffix(".csv"))
-        typer.echo("\n".join(_function(f"studies.{name}:{describe}")(found)))
+                function_at(f"studies.{name}:{table}")(found, output.with_suffix(".csv"))
+        typer.echo("\n".join(function_at(f"studies.{name}:{describe}")(found)))
         for one in getattr(found, "results", [found])[:1]:
             exit_if_interrupted(one)
 
     return Command("Study", f"studies.{name}:{function or name}", body, text)
-
-
-def _function(place: str) -> Callable[..., Any]:
-    module, _, name = place.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(f"mitransient_lidar.{module}"), name)
-    return found
 
 
 def _water(call: Call, output: DrawingOnly = None) -> None:
@@ -56,7 +48,7 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
     with announced():
         lines = call()
         if output is not None:
-            _function("plots.water:plot_water")(**call.arguments, path=output)
+            function_at("plots.water:plot_water")(**call.arguments, path=output)
         typer.echo("\n".join(lines))
 
 

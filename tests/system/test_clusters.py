@@ -291,7 +291,7 @@ def test_other_servers_than_schedulers(campaign, tmp_path, kind):
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-q", "--scheduler", address]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-    text = f"scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
+    text = f"--scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
     assert (done.returncode, done.stderr) == (2, text)
 
 

@@ -11,6 +11,7 @@ from command_line import GROUP, assert_refused, run, stub
 
 from mitransient_lidar import results
 from mitransient_lidar.cli.app import COMMANDS
+from mitransient_lidar.cli.generator import function_at
 from mitransient_lidar.core.options import declared
 from mitransient_lidar.results import netcdf
 
@@ -66,7 +67,7 @@ class ReachedError(Exception):
 @functools.cache
 def options_of(command):
     """Return type, declaration and default of each parameter of a command's function, and its option."""
-    function = COMMANDS[command].resolve()
+    function = function_at(COMMANDS[command].function)
     parameters = {one.name: one for one in GROUP.commands[command].params}
     defaults = {name: one.default for name, one in inspect.signature(function).parameters.items()}
     return {
