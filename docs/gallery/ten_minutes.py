@@ -191,7 +191,7 @@ plt.show()
 #
 # - **Your own scene:** ``mitransient-lidar scenes copy fig09_2x2 mine.xml``, change the parameters at its top, and
 #   ``mitransient_lidar.render("mine.xml", target_error=0.02)``.
-# - **Many shots:** ``render_shots`` and the commands ``find-shots`` and ``shot-statistics`` cover a sea, whose waves
+# - **Many shots:** ``render_shots`` and the commands ``find-shots`` and ``shots`` cover a sea, whose waves
 #   are the noise that this tutorial leaves out.
 # - **Files:** ``results.save(shot, "shot.nc")`` writes, ``mitransient_lidar.open("shot.nc")`` reads; also EXR stacks.
 # - **Without Python:** ``mitransient-lidar render``, ``retrieve``, ``gates`` and more; ``--help`` lists them.

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import GateFiles, announced, check_suffix, check_targets, scene_of
+from mitransient_lidar.cli.files import (
+    GateFiles,
+    announced,
+    check_figure,
+    check_suffix,
+    check_targets,
+    scene_of,
+    write_netcdf,
+)
 from mitransient_lidar.cli.generator import Call, Command, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
 from mitransient_lidar.cli.options import OUTPUT, Quiet
@@ -128,6 +136,10 @@ def _shots(
         typer.Option(metavar="FILE", help="CSV file of places, columns x and y [m], instead of random ones."),
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = OUTPUT / "shots.nc",
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Render a series, and write it."""
@@ -135,11 +147,16 @@ def _shots(
     if given["positions"] and places is not None:
         raise UserError("--at and --places are alternatives: give one of them.")
     check_suffix("--output", output, ".nc")
+    check_figure(figure, ".nc", option="--figure")
+    if figure is not None and figure.with_suffix(".nc") == output:
+        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name.")
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
+    from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.shots import series as study
+    from mitransient_lidar.studies import shot_statistics as statistics
 
     if places is not None:
         given = {**given, "positions": study.read_places(places)}
@@ -156,8 +173,15 @@ def _shots(
         output.parent.mkdir(parents=True, exist_ok=True)
         with announced():
             results.save(series, output)
+            if figure is not None:
+                measured = statistics.shot_statistics(series)
+                figure.parent.mkdir(parents=True, exist_ok=True)
+                plot_shot_statistics(measured, figure)
+                write_netcdf(measured, figure.with_suffix(".nc"))
     if not quiet:
         typer.echo("\n".join(study.describe_shots(series)))
+    if figure is not None:
+        typer.echo("\n".join(statistics.describe_statistics(measured)))
     exit_if_interrupted(series)
 
 
@@ -196,7 +220,7 @@ COMMANDS = {
         """Render a series of shots over one sea.
 
         Writes one file of all waveforms, with the true slope, height and depth at each place, which record, echoes,
-        retrieve and view read.
+        retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
         """,
         defaults={"count": None, "seed": None},
     ),

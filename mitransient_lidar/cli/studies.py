@@ -63,12 +63,6 @@ STUDIES = {
         """,
         has_data=False,
     ),
-    "shot-statistics": _study(
-        "shot_statistics",
-        "plot_shot_statistics",
-        "describe_statistics",
-        "Correlate the echoes of random shots with the sea's slopes.",
-    ),
     "target-signal": _study(
         "target_signal",
         "plot_target_signal",

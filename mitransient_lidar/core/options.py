@@ -83,8 +83,9 @@ class Option:
 
     def help(self) -> str:
         """Return meaning, unit and range as a sentence."""
-        limits = self.range()
-        return f"{self.meaning}{f' [{self.unit}]' if self.unit else ''}{f' ({limits})' if limits else ''}."
+        limits, clause = self.range(), re.split("(?=[,;.])", self.meaning, maxsplit=1)
+        meaning = f"{clause[0]} [{self.unit}]{''.join(clause[1:])}" if self.unit else self.meaning
+        return f"{meaning}{f' ({limits})' if limits else ''}."
 
     def check(self, name: str, value: Any, kind: Any) -> Any:
         """Return a value of a type as a number or a list of numbers; raise `UserError` if it is out of range."""

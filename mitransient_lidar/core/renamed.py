@@ -5,6 +5,7 @@ COMMANDS = {
     "sweep": "campaign",
     "waveforms": "echoes",
     "plot": "view --plot",
+    "shot-statistics": "shots --figure",
     "instruments": "scenes instruments",
 }
 

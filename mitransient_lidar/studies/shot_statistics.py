@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,36 +10,20 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, Scene, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.geometry import lidar_geometry
-
-_PASSES = 8
 
 #: Half width of the gates about the echoes of a level sea [ns].
 _HALF_GATE_NS = 10.0
 
 
-@checked
-def shot_statistics(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    count: Annotated[int, Option("Number of shots", 2, 100_000)] = 200,
-    max_time: Annotated[float | None, positive_option("Stop before this many seconds, with fewer shots")] = None,
-    seed: Annotated[int, Option("Seed of their places", 0, 2**53)] = 1,
-    progress: ProgressCallback | None = None,
-) -> xr.Dataset:
-    """Render shots at random places of one sea and measure their echoes.
+def shot_statistics(series: xr.Dataset) -> xr.Dataset:
+    """Measure the echoes of shots at places of one sea, for their dependence on its slopes.
 
     Parameters
     ----------
-    scene, params
-        An XML scene with the parameters ``aim_x`` and ``aim_y``.
-    progress
-        Called with a `passes.Progress` after every shot.
+    series
+        A result of `rendering.shots.series.render_shots` of a scene with the parameter ``bottom_depth``.
 
     Returns
     -------
@@ -53,9 +36,8 @@ def shot_statistics(
     Raises
     ------
     UserError
-        If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
+        If the scene has no bottom, or the record lacks an echo.
     """
-    series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, max_time=max_time, progress=progress)
     times = _echo_times(series)
     rows: list[dict[str, Any]] = []
     for number in range(series.sizes["shot"]):
@@ -80,7 +62,7 @@ def _echo_times(shot: xr.Dataset) -> dict[str, float]:
     """Return the times of surface and bottom echo of a level sea [ns]."""
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
-        raise UserError("shot-statistics needs a scene with a sea and the parameter bottom_depth")
+        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
     geometry = lidar_geometry(shot.attrs)
     return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 

@@ -127,9 +127,10 @@ def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
     options = [part for name, value in WAVES.items() for part in ("-D", f"{name}={value}")]
     target = tmp_path / "out" / "survey.png"
     scene = few_paths("fig09_2x2", tmp_path)
-    done = run("shot-statistics", scene, *options, "--count", 5, "-q", "-o", target)
+    series = tmp_path / "out" / "shots.nc"
+    done = run("shots", scene, *options, "--count", 5, "-q", "-o", series, "--figure", target)
     assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[:2] == [str(target), str(target.with_suffix(".nc"))]
+    assert done.stdout.splitlines()[:3] == [str(series), str(target), str(target.with_suffix(".nc"))]
     assert "correlation of strength with the slope" in done.stdout
     with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
         assert dict(found.sizes) == {"shot": 5, "pixel": 4}
@@ -146,11 +147,14 @@ def test_invalid_input_is_refused(tmp_path):
     with pytest.raises(UserError, match="every shot on a flat sea is the same"):
         shots.find_shots("fig09_2x2", {"spectrum": "flat"})
     with pytest.raises(UserError, match="must hold 14"):
-        shot_statistics.shot_statistics(few_paths("fig09_2x2", tmp_path), {**WAVES, "bin_count": 40}, count=2)
+        shot_statistics.shot_statistics(
+            shots.render_shots(few_paths("fig09_2x2", tmp_path), {**WAVES, "bin_count": 40}, count=2)
+        )
     for arguments, message in (
         (["find-shots", "fig09_2x2", "--at", "3;4"], "--at = '3;4' must hold numbers only"),
         (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "--slope-sigmas = -1 must be"),
-        (["shot-statistics", "fig09_2x2", "-o", "survey.txt"], "must end in"),
+        (["shots", "fig09_2x2", "--figure", "survey.txt"], "must end in"),
+        (["shots", "fig09_2x2", "--figure", "output/shots.png"], "which holds the shots: give it another name"),
         (["find-shots", "fig09_2x2", "-o", "shots.txt"], "must end in"),
     ):
         assert_refused(run(*arguments), message)

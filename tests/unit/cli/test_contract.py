@@ -197,7 +197,7 @@ def test_a_store_is_completed_with_its_options(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("sweep", "campaign"), ("waveforms", "echoes"), ("plot", "view --plot"), ("instruments", "scenes instruments")],
+    [("sweep", "campaign"), ("waveforms", "echoes"), ("plot", "view --plot"), ("shot-statistics", "shots --figure")],
 )
 def test_former_names_are_refused_with_the_new_one(old, new):
     assert_refused(run(old, "a.nc"), f"the command {old} is now {new}")

@@ -16,15 +16,14 @@ FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4
 FLAT = ["-D", "spectrum=flat", "-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=95"]
 #: Only these ask for waves.
 WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
-SEA_COMMANDS = ("find-shots", "shot-statistics")
+SEA_COMMANDS = ("find-shots",)
 #: Those that take most time.
-SLOW = {"detect", "target-signal", "shot-statistics", "beam-spread", "fov-sweep", "passive"}
+SLOW = {"detect", "target-signal", "beam-spread", "fov-sweep", "passive"}
 SLOW |= {"echoes", "scattering-orders", "bounds", "figures"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
-    "shot-statistics": ["--count", 2],
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "estimate": [],
