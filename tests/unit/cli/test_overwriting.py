@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from command_line import GROUP, assert_refused, run
+from command_line import GROUP, assert_refused, run, stub
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import files, overwriting
@@ -285,7 +285,7 @@ def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
         return found(*arguments, **options)
 
     found = estimate.estimate
-    monkeypatch.setattr(estimate, "estimate", slow)
+    stub(monkeypatch, "estimate", slow)
     done = run("estimate", "table1", "--paths", 64, "-o", "d/f.png")
     assert done.exit_code == 0
     assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
