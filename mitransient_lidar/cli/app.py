@@ -40,6 +40,37 @@ COMMANDS: dict[str, Command] = {
 }
 
 
+#: Arguments of an example in the help of each command.
+EXAMPLES = {
+    "render": "table1 -D wind_speed=5 --target-error 0.05",
+    "shots": "table1 --count 20 --passes 4 -o output/shots.nc",
+    "passive": "passive_sea --frames 10",
+    "campaign": "bottoms.toml --workers 4",
+    "fly": "palmer",
+    "find-shots": "table1 --slope-sigmas 1.5",
+    "target-signal": "fig13_2x2 --grid 5",
+    "detect": "fig13_2x2 --receiver pmt --depths 6,8,10",
+    "estimate": "table1 --instrument riegl_vq840g",
+    "bounds": "table1 --free attenuation,bottom_depth --over field_of_view_mrad=10,20,40",
+    "beam-spread": "table1 --depths 2,4,8",
+    "fov-sweep": "table1 --fov-mrad 5,20,80",
+    "scattering-orders": "table1 --orders 4",
+    "water": "jerlov 3C",
+    "depth-bias": "riegl_vq840g --winds 0,3 --depths 3,6",
+    "tpu": "riegl_vq840g --altitudes 100,150",
+    "figures": "fig09 fig13",
+    "view": "output/table1.nc -o waveforms.png",
+    "compare": "one/table1.nc other/table1.nc",
+    "gates": "output/table1.nc --start-depth 1 --width-ns 5 --count 8",
+    "record": "output/table1.nc --receiver apd --gain auto",
+    "echoes": "output/table1_recorded.nc --csv echoes.csv",
+    "retrieve": "output/table1.nc",
+    "fit": "output/table1.nc --free attenuation,bottom_reflectance",
+    "info": "output/table1.nc",
+    "bench": "--quick",
+}
+
+
 #: Error of the parser of options, of the release of Click that Typer uses.
 _UsageError: Any = typer.BadParameter.__base__
 
@@ -62,7 +93,8 @@ class _GroupedCommands(TyperGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.commands = {**{name: LazyCommand(name, row) for name, row in self.commands_of.items()}, **self.commands}
+        made = {name: LazyCommand(name, row, EXAMPLES.get(name)) for name, row in self.commands_of.items()}
+        self.commands = {**made, **self.commands}
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """Parse the options before the subcommand."""

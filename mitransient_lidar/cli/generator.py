@@ -138,9 +138,10 @@ def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Paramet
 class LazyCommand(TyperCommand):
     """A command of a table, whose options are made when they are needed."""
 
-    def __init__(self, name: str, row: Command) -> None:
+    def __init__(self, name: str, row: Command, example: str | None = None) -> None:
         self._row, self._made = row, None  # type: tuple[Command, Any]
-        super().__init__(name, help=inspect.cleandoc(row.help), rich_help_panel=row.heading, rich_markup_mode=None)
+        text = inspect.cleandoc(row.help) + (f"\n\nExample: mitransient-lidar {name} {example}" if example else "")
+        super().__init__(name, help=text, rich_help_panel=row.heading, rich_markup_mode=None)
 
     def _full(self) -> Any:
         if self._made is None:

@@ -10,7 +10,7 @@ import synthetic_shots
 from command_line import GROUP, assert_refused, run, stub
 
 from mitransient_lidar import results
-from mitransient_lidar.cli.app import COMMANDS
+from mitransient_lidar.cli.app import COMMANDS, EXAMPLES
 from mitransient_lidar.cli.generator import function_at
 from mitransient_lidar.core.options import declared
 from mitransient_lidar.results import netcdf
@@ -175,6 +175,13 @@ def test_help_shows_ranges_and_defaults(command):
             shown = ",".join(map("{:g}".format, default)) if option.form == "N,N,..." else default
             shown = ",".join(default) if option.form == "NAME,NAME,..." else shown
             assert f"[default: {shown}]" in text or default is True, name
+
+
+def test_every_help_has_an_example_that_can_be_typed():
+    assert EXAMPLES.keys() == COMMANDS.keys()
+    for name, example in EXAMPLES.items():
+        assert f"Example: mitransient-lidar {name} {example}" in GROUP.commands[name].help
+        GROUP.commands[name].make_context(name, example.split())
 
 
 def test_a_store_is_completed_with_its_options(tmp_path, monkeypatch):
