@@ -28,6 +28,7 @@ if importlib.util.find_spec("mitransient_lidar.plugins") is None:
     __path__.append(str(Path(__file__).resolve().parent.parent))
 
 from mitransient_lidar.core.errors import UserError as _UserError
+from mitransient_lidar.core.renamed import FUNCTIONS as _FORMER
 from mitransient_lidar.loading import variants as _variants
 
 _variants.prepare_llvm()
@@ -56,8 +57,8 @@ if TYPE_CHECKING:
     from mitransient_lidar.analysis.receiver import detect_waveforms as record
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve
     from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths
-    from mitransient_lidar.analysis.waveforms.echo_table import extract as waveforms
-    from mitransient_lidar.campaigns.sweep import sweep
+    from mitransient_lidar.analysis.waveforms.echo_table import extract as echoes
+    from mitransient_lidar.campaigns.sweep import campaign
     from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
@@ -67,19 +68,20 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.studies.bounds import bounds
     from mitransient_lidar.studies.depth_bias import depth_bias
-    from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
     from mitransient_lidar.studies.fit import fit
+    from mitransient_lidar.studies.tpu import tpu
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
     "bounds": ("studies.bounds", "bounds"),
+    "campaign": ("campaigns.sweep", "campaign"),
     "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
     "cut_gates": ("analysis.gates.cut", "cut_gates"),
     "depth_bias": ("studies.depth_bias", "depth_bias"),
-    "depth_uncertainty": ("studies.depth_uncertainty", "depth_uncertainty"),
     "detect": ("studies.detection", "detect"),
+    "echoes": ("analysis.waveforms.echo_table", "extract"),
     "estimate": ("studies.estimate", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
@@ -92,19 +94,19 @@ _FUNCTIONS = {
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
-    "sweep": ("campaigns.sweep", "sweep"),
+    "tpu": ("studies.tpu", "tpu"),
     "view": ("plots.viewer", "view"),
-    "waveforms": ("analysis.waveforms.echo_table", "extract"),
 }
 
 __all__ = [
     "__version__",
     "bounds",
+    "campaign",
     "correct_depths",
     "cut_gates",
     "depth_bias",
-    "depth_uncertainty",
     "detect",
+    "echoes",
     "estimate",
     "figures",
     "fit",
@@ -118,14 +120,15 @@ __all__ = [
     "retrieve",
     "scene_names",
     "scene_parameters",
-    "sweep",
+    "tpu",
     "view",
-    "waveforms",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Import a function when it is first used."""
+    if name in _FORMER:
+        raise AttributeError(f"{__name__}.{name} is now {_FORMER[name]}")
     if name not in _FUNCTIONS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, function = _FUNCTIONS[name]

@@ -26,7 +26,7 @@ class TimeGatedFilm(mi.Film):
     With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
     ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
     before the first light of any pixel, from the highest crest or a target above it, and ten bins before the time
-    until which ``waveforms`` measures the noise, by up to 100 ns more. It ends as much, and 12 times the
+    until which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, and 12 times the
     response time, after the last light of any pixel. This comes from a bottom or target; light that is scattered
     several times is given up to 40 ns, a quarter of the echo's time in the water, and the time of the way from the beam
     to the edge of the view. Where no bottom is seen, or below 1e-12, it comes from the depth at which the column signal

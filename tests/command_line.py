@@ -6,15 +6,24 @@ import functools
 
 import typer.testing
 
-from mitransient_lidar.cli.app import app
+from mitransient_lidar.cli.app import COMMANDS, app
 
 # Typer builds its command anew for every call, which takes longer than most commands of the tests.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
+
+GROUP = typer.testing._get_command(app)
 
 
 def run(*arguments):
     """Return the result of a command, whose arguments may be of any type."""
     return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def stub(monkeypatch, command, function):
+    """Let a command call another function; its options stay those of its own one."""
+    GROUP.commands[command].params  # noqa: B018 (reads the signature)
+    place, _, name = COMMANDS[command].function.partition(":")
+    monkeypatch.setattr(f"mitransient_lidar.{place}.{name}", function)
 
 
 def assert_refused(result, *parts):

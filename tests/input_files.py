@@ -245,14 +245,14 @@ def plan_table(path: Path) -> None:
 
 def store(folder: Path) -> Path:
     """Render a small campaign."""
-    from mitransient_lidar.campaigns.sweep import sweep
+    from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 
     fixed = {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160}
     given = {
         **{"scene": "table1", "target_error": 0.5, "keep": ["waveform", "echoes", "truth"], "fixed": fixed},
         **{"parameters": {"bottom_depth": {"low": 2.0, "high": 9.0}}, "design": {"count": 6}},
     }
-    sweep(given, folder / "store.zarr", workers=1, shard_size=3)
+    run_campaign(given, folder / "store.zarr", workers=1, shard_size=3)
     return folder / "store.zarr"
 
 

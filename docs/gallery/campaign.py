@@ -37,7 +37,7 @@ CAMPAIGN = {
 # Runs are rendered by processes, as many at a time as there are workers.
 
 with tempfile.TemporaryDirectory() as folder:
-    data = mitransient_lidar.sweep(CAMPAIGN, Path(folder) / "bottoms.zarr", workers=1).load()
+    data = mitransient_lidar.campaign(CAMPAIGN, Path(folder) / "bottoms.zarr", workers=1).load()
 bottom = data.sel(echo="bottom").isel(pixel=0)
 error = bottom.echo_depth_m - bottom.true_bottom_depth
 stated = np.hypot(bottom.echo_depth_m_stderr, bottom.echo_depth_m_method_error)

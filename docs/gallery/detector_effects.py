@@ -64,7 +64,7 @@ SHOTS = 200
 def bottoms(shot, receiver, gain):
     """Return depths [m], heights [V] and attenuations [1/m] that are measured in records of a shot."""
     record = mitransient_lidar.record(shot, receiver, SHOTS, 1, gain=gain)
-    table = mitransient_lidar.waveforms(record, "gaussian", depth_from="mean").isel(pixel=0)
+    table = mitransient_lidar.echoes(record, "gaussian", depth_from="mean").isel(pixel=0)
     bottom = table.sel(echo="bottom")
     return bottom.depth_m.values, bottom.amplitude.values, table.attenuation.values
 

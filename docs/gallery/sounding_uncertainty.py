@@ -1,7 +1,7 @@
 """The uncertainty of soundings
 ============================
 
-How good is the depth of one sounding? ``depth_uncertainty`` renders an instrument over bottoms of known depth, records
+How good is the depth of one sounding? ``tpu`` renders an instrument over bottoms of known depth, records
 the shots with its receiver, measures the depths as a survey does, and adds the errors of the trajectory.
 """
 
@@ -10,20 +10,17 @@ import numpy as np
 
 import mitransient_lidar
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
-from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 
 # %%
 # One wind and one water, and few places of the sea: a table for a survey takes more, as the guide of uncertainties has.
 
-INSTRUMENT = "riegl_vq840g"
-found = mitransient_lidar.depth_uncertainty(
-    INSTRUMENT,
+found = mitransient_lidar.tpu(
+    "riegl_vq840g",
     winds=(3.0,),
     waters=("1C",),
     depths=(3.0, 6.0, 9.0),
     shots=6,
     records=4,
-    corrections=corrections_for(INSTRUMENT, "auto"),
     seed=1,
 )
 found = found.isel(altitude=0, off_nadir_deg=0, wind_speed=0, water=0)

@@ -81,10 +81,10 @@ plt.show()
 # 3. Measure the echoes
 # ---------------------
 #
-# ``waveforms`` returns surface, column, target and bottom echoes of every pixel and shot: time, depth, amplitude,
+# ``echoes`` returns surface, column, target and bottom echoes of every pixel and shot: time, depth, amplitude,
 # energy and width with their errors, and flags (0 without a problem), together with the attenuation of the column.
 
-echoes = mitransient_lidar.waveforms(recorded)
+echoes = mitransient_lidar.echoes(recorded)
 first = echoes.isel(shot=0).sel(echo=["surface", "bottom"])
 columns = ["time_ns", "time_ns_stderr", "depth_m", "depth_m_stderr", "width_ns", "flags"]
 print(first[columns].reset_coords(drop=True).to_dataframe().round(3).to_string())
@@ -191,7 +191,7 @@ plt.show()
 #
 # - **Your own scene:** ``mitransient-lidar scenes copy fig09_2x2 mine.xml``, change the parameters at its top, and
 #   ``mitransient_lidar.render("mine.xml", target_error=0.02)``.
-# - **Many shots:** ``render_shots`` and the commands ``find-shots`` and ``shot-statistics`` cover a sea, whose waves
+# - **Many shots:** ``render_shots`` and the commands ``find-shots`` and ``shots`` cover a sea, whose waves
 #   are the noise that this tutorial leaves out.
 # - **Files:** ``results.save(shot, "shot.nc")`` writes, ``mitransient_lidar.open("shot.nc")`` reads; also EXR stacks.
 # - **Without Python:** ``mitransient-lidar render``, ``retrieve``, ``gates`` and more; ``--help`` lists them.

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import RECEIVERS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
@@ -28,15 +29,37 @@ _BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when i
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 
+@checked
 def detect_waveforms(
     dataset: xr.Dataset,
-    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
-    shots: int = 1,
-    seed: int = 0,
-    background_power: npt.ArrayLike | xr.DataArray = 0.0,
+    chain: Annotated[
+        ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None,
+        Option(f"{RECEIVERS}. By default that of the result's instrument, or apd", flag="--receiver"),
+    ] = None,
+    shots: Annotated[int, Option("Number of records of each waveform with independent noise", 1, 10**9)] = 1,
+    seed: Seed = 0,
+    background_power: Annotated[
+        npt.ArrayLike | xr.DataArray,
+        Option("Power of the daylight on each pixel (at least 0) [W]", flag="--background-power-w"),
+    ] = 0.0,
     *,
-    gain: Setting | None = None,
-    optical_density: Setting | None = None,
+    gain: Annotated[
+        Setting | None,
+        Option(
+            "Factor of the amplifier's gain, or auto; by default the receiver's, or 1",
+            0,
+            above=True,
+            form="NUMBER|auto",
+        ),
+    ] = None,
+    optical_density: Annotated[
+        Setting | None,
+        Option(
+            "Optical density of a filter before the detector, or auto; by default the receiver's, or 0",
+            *(0, DENSEST),
+            form="NUMBER|auto",
+        ),
+    ] = None,
 ) -> xr.Dataset:
     """Record shots of a result, or of each shot of a series, with a receiver chain.
 
@@ -48,8 +71,6 @@ def detect_waveforms(
         The receiver of every channel, or one chain for all; a name in `physics.receiver.presets.RECEIVERS` or of an
         instrument, or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
         of the result, and the preset ``apd`` without one.
-    shots, seed : int
-        Number of records of each waveform with independent noise, at least 1, and seed of the noise, at least 0.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
@@ -450,6 +471,8 @@ def _background(dataset: xr.Dataset, power: npt.ArrayLike | xr.DataArray, dims: 
         raise UserError(
             f"background_power has the shape {values.shape}; it must be a number or have the shape {pixels}"
         )
+    if np.any(values < 0):
+        raise UserError(f"background_power = {values.min():g} must not be negative")
     return values
 
 

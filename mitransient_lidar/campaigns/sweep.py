@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -20,10 +20,11 @@ import xarray as xr
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer, check_names, record_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path
-from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, LARGEST_SHARD, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.versions import check_versions
 from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import integer, require_memory, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -43,14 +44,31 @@ _MOST_LEFT = 8
 _TRIALS = 8
 
 
-def sweep(
-    campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str],
+#: Options of campaigns and flights.
+ProcessCount = Annotated[
+    int | None, Option("Processes on this machine, by default one for each processor that may be used", 1, 1024)
+]
+Scheduler = Annotated[Any, Option("A running Dask scheduler instead, as tcp://host:8786", form="ADDRESS")]
+
+
+@checked
+def campaign(
+    campaign: Annotated[
+        Campaign | Mapping[str, Any] | str | os.PathLike[str],
+        Option("TOML file of a campaign, or the store of one to complete it", form="CAMPAIGN", is_argument=True),
+    ],
     store: str | os.PathLike[str],
     *,
-    workers: int | None = None,
-    scheduler: Client | str | None = None,
-    shard_size: int | None = None,
-    retry_failed: bool = False,
+    workers: ProcessCount = None,
+    scheduler: Scheduler = None,
+    shard_size: Annotated[
+        int | None,
+        Option(
+            "Runs that one process renders and writes, by default a sixteenth of them, but 8 to 1024 in number",
+            *(1, LARGEST_SHARD),
+        ),
+    ] = None,
+    retry_failed: Annotated[bool, Option("Render runs that have failed again")] = False,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the runs of a campaign into a Zarr store, or those that an interrupted one has left.
@@ -61,16 +79,12 @@ def sweep(
         A TOML file, or a dict of its contents; see docs/guide/campaigns.md.
     store
         Folder of the store. One that holds the same campaign is completed.
-    workers
-        Processes on this machine, 1 to 1024; by default one for each processor that this process may use.
     scheduler
         Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
         the same versions of this package, Mitsuba, Dr.Jit, NumPy and Python, and the store at the same path.
     shard_size
         Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
         8 to 1024, and fewer where a shard would take more than half a gigabyte.
-    retry_failed
-        Whether to render runs that have failed, too.
     progress
         Called with a `rendering.passes.Progress` about every second.
 

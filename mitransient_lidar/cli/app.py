@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 from typing import Annotated, Any
 
@@ -20,54 +20,54 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import (
-    bounds,
-    campaigns,
-    depth_bias,
-    figures,
-    fit,
-    flights,
-    gates,
-    render,
-    results,
-    retrieve,
-    scenes,
-    studies,
-    waveforms,
-)
-from mitransient_lidar.cli.messages import exit_on_error, printable_streams, silenced
-from mitransient_lidar.cli.overwriting import keeping
+from mitransient_lidar.cli import analysis, campaigns, depth_errors, gates, render, results, scenes, studies
+from mitransient_lidar.cli.generator import Command, LazyCommand
+from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.renamed import COMMANDS as RENAMED
 
-#: Commands by the headings of the help.
-_COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Render": (render.render, studies.shots, campaigns.sweep, flights.fly, render.passive),
-    "Study": (
-        studies.find_shots,
-        studies.shot_statistics,
-        studies.target_signal,
-        studies.detect,
-        studies.estimate,
-        depth_bias.depth_bias,
-        depth_bias.tpu,
-        bounds.bounds,
-        studies.beam_spread,
-        studies.fov_sweep,
-        studies.scattering_orders,
-        studies.water,
-        figures.figures,
-    ),
-    "Analyse results": (
-        results.view,
-        results.plot,
-        results.compare,
-        results.record,
-        gates.gates,
-        waveforms.waveforms,
-        retrieve.retrieve,
-        fit.fit,
-    ),
-    "Scenes and system": (scenes.instruments, scenes.info, scenes.bench),
+#: All commands but ``scenes``, in the order of the help.
+COMMANDS: dict[str, Command] = {
+    **render.COMMANDS,
+    **campaigns.COMMANDS,
+    **studies.STUDIES,
+    **depth_errors.COMMANDS,
+    **campaigns.FIGURES,
+    **results.COMMANDS,
+    **gates.COMMANDS,
+    **analysis.COMMANDS,
+    **scenes.COMMANDS,
+}
+
+
+#: Arguments of an example in the help of each command.
+EXAMPLES = {
+    "render": "table1 -D wind_speed=5 --target-error 0.05",
+    "shots": "table1 --count 20 --passes 4 -o output/shots.nc",
+    "passive": "passive_sea --frames 10",
+    "campaign": "bottoms.toml --workers 4",
+    "fly": "palmer",
+    "find-shots": "table1 --slope-sigmas 1.5",
+    "target-signal": "fig13_2x2 --grid 5",
+    "detect": "fig13_2x2 --receiver pmt --depths 6,8,10",
+    "estimate": "table1 --instrument riegl_vq840g",
+    "bounds": "table1 --free attenuation,bottom_depth --over field_of_view_mrad=10,20,40",
+    "beam-spread": "table1 --depths 2,4,8",
+    "fov-sweep": "table1 --fov-mrad 5,20,80",
+    "scattering-orders": "table1 --orders 4",
+    "water": "jerlov 3C",
+    "depth-bias": "riegl_vq840g --winds 0,3 --depths 3,6",
+    "tpu": "riegl_vq840g --altitudes 100,150",
+    "figures": "fig09 fig13",
+    "view": "output/table1.nc -o waveforms.png",
+    "compare": "one/table1.nc other/table1.nc",
+    "gates": "output/table1.nc --start-depth 1 --width-ns 5 --count 8",
+    "record": "output/table1.nc --receiver apd --gain auto",
+    "echoes": "output/table1_recorded.nc --csv echoes.csv",
+    "retrieve": "output/table1.nc",
+    "fit": "output/table1.nc --free attenuation,bottom_reflectance",
+    "info": "output/table1.nc",
+    "bench": "--quick",
 }
 
 
@@ -78,10 +78,23 @@ _UsageError: Any = typer.BadParameter.__base__
 class _GroupedCommands(TyperGroup):
     """A command whose help lists the subcommands under headings, and whose usage errors are one sentence."""
 
+    def get_command(self, ctx: Any, name: str) -> Any:
+        """Return a command; refuse a former name of one."""
+        if name in self.former:
+            raise UserError(f"the command {name} is now {self.former[name]}")
+        return super().get_command(ctx, name)
+
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Run the command line, whose output holds no control characters."""
         with printable_streams():
             return super().main(*args, **kwargs)
+
+    commands_of, former = COMMANDS, RENAMED
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        made = {name: LazyCommand(name, row, EXAMPLES.get(name)) for name, row in self.commands_of.items()}
+        self.commands = {**made, **self.commands}
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """Parse the options before the subcommand."""
@@ -103,6 +116,12 @@ class _GroupedCommands(TyperGroup):
         for heading, rows in sections.items():
             with formatter.section(heading):
                 formatter.write_dl(rows)
+
+
+class _SceneCommands(_GroupedCommands):
+    """The commands of scenes."""
+
+    commands_of, former = scenes.SCENES, {}
 
 
 @contextlib.contextmanager
@@ -132,10 +151,11 @@ app = typer.Typer(
     cls=_GroupedCommands,
     help="Simulate multipixel depth-sounding lidar.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-_scenes_app = typer.Typer(rich_markup_mode=None)
+_scenes_app = typer.Typer(cls=_SceneCommands, rich_markup_mode=None)
 
 
 def main() -> None:
@@ -156,7 +176,7 @@ def _run() -> None:
     os.environ["MPLBACKEND"] = "agg"
     # Rasterio says it of a GeoTIFF that is then refused.
     warnings.filterwarnings("ignore", "Dataset has no geotransform")
-    if sys.argv[1:2] not in (["sweep"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
+    if sys.argv[1:2] not in (["campaign"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
         # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it. An
         # xarray that a script has imported before remembers where Dask is, and goes on with it.
         sys.modules["dask"] = None  # type: ignore[assignment]
@@ -202,14 +222,9 @@ def _common(
 
 @_scenes_app.callback(invoke_without_command=True)
 def _scenes(context: typer.Context) -> None:
-    """List, show or copy the shipped scenes."""
+    """List, show or copy the shipped scenes, or list instruments."""
     if context.invoked_subcommand is None:
         scenes.list_scenes()
 
 
-for _heading, _functions in _COMMANDS.items():
-    for _function in _functions:
-        app.command(rich_help_panel=_heading)(keeping(silenced(_function)))
-for _name, _function in (("list", scenes.list_scenes), ("show", scenes.show_scene), ("copy", scenes.copy_scene)):
-    _scenes_app.command(_name)(_function)
 app.add_typer(_scenes_app, name="scenes", rich_help_panel="Scenes and system")

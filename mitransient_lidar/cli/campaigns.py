@@ -1,44 +1,30 @@
-"""Command for campaigns of many runs."""
+"""Commands of many renders: campaigns, flights, and the figures of the publication."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_writable
-from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted, reporting
-from mitransient_lidar.cli.options import Quiet
+from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
+from mitransient_lidar.cli.options import OUTPUT, Quiet
+from mitransient_lidar.cli.overwriting import replace_freely
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.marks import read_mark
 
 
-def sweep(
-    campaign: Annotated[
-        Path,
-        typer.Argument(metavar="CAMPAIGN", help="TOML file of a campaign, or the store of one to complete it."),
-    ],
+def _campaign(
+    call: Call,
     output: Annotated[
         Path | None,
         typer.Option(
             "-o", "--output", help="Zarr store, by default beside the campaign; with --row .nc, with --show a figure."
         ),
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(help="Processes on this machine, 1 to 1024; by default one for each processor that may be used."),
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
-    ] = None,
-    shard_size: Annotated[
-        int | None,
-        typer.Option(
-            help="Runs that one process renders and writes, 1 to 1 000 000; by default a sixteenth of them, but 8 to "
-            "1024."
-        ),
-    ] = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Render runs that have failed again.")] = False,
     row: Annotated[
         int | None, typer.Option(help="Render the run of this number alone, from 0, to a NetCDF file.")
     ] = None,
@@ -47,57 +33,43 @@ def sweep(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a campaign of many runs.
-
-    Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one Zarr
-    store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
-    docs/guide/campaigns.md describes the file.
-    """
-    _check_alternatives(workers, scheduler, row, show)
+    """Render a campaign or one of its runs, complete or draw its store."""
+    campaign = Path(call.arguments["campaign"])
+    given = {name: call.arguments[name] for name in ("workers", "scheduler")} | {"row": row, "show": show or None}
+    used = [f"--{name}" for name, value in given.items() if value is not None]
+    if len(used) > 1:
+        raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them.")
     if row is not None:
-        path = output or campaign.with_name(f"{campaign.stem}_row{row}.nc")
-        check_suffix("--output", path, ".nc")
-        _render_row(campaign, row, path, quiet)
+        _render_row(call, campaign, row, output or campaign.with_name(f"{campaign.stem}_row{row}.nc"))
         return
     if show:
         _show(campaign, output or campaign.with_suffix(".png"))
         return
     from mitransient_lidar.campaigns import sweep as campaigns
 
-    options: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "retry_failed": retry_failed}
+    store = campaign if campaign.is_dir() else output or campaign.with_suffix(".zarr")
     if campaign.is_dir():
-        if output is not None or shard_size is not None:
-            given = "--output" if output is not None else "--shard-size"
-            raise UserError(f"{given} is fixed in the store {campaign}: leave it out")
-        store = campaign
-        with reporting(quiet) as progress:
-            campaigns.resume(store, progress=progress, **options)
+        fixed = {"--output": output, "--shard-size": call.arguments["shard_size"]}
+        for name in [name for name, value in fixed.items() if value is not None][:1]:
+            raise UserError(f"{name} is fixed in the store {campaign}: leave it out")
+        kept = {name: call.arguments[name] for name in ("workers", "scheduler", "retry_failed")}
+        replace(call, function=campaigns.resume, arguments=kept)(store)
     else:
-        store = output or campaign.with_suffix(".zarr")
         check_writable(store.parent, [])
-        with reporting(quiet) as progress:
-            campaigns.sweep(campaign, store, shard_size=shard_size, progress=progress, **options)
+        call(store=store)
     typer.echo(store)
     if not quiet:
         typer.echo("\n".join(campaigns.describe_campaign(store)))
     exit_if_failed(store)
 
 
-def _check_alternatives(workers: int | None, scheduler: str | None, row: int | None, show: bool) -> None:
-    """Raise `UserError` for options that exclude each other."""
-    given = {"--workers": workers, "--scheduler": scheduler, "--row": row, "--show": show or None}
-    used = [name for name, value in given.items() if value is not None]
-    if len(used) > 1:
-        raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them.")
-
-
-def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
+def _render_row(call: Call, campaign: Path, row: int, path: Path) -> None:
     """Render one run to a NetCDF file."""
+    check_suffix("--output", path, ".nc")
     from mitransient_lidar import results
     from mitransient_lidar.campaigns.sweep import render_row
 
-    with reporting(quiet) as progress:
-        series = render_row(campaign, row, progress=progress)
+    series = replace(call, function=render_row, arguments={}, flags={"row": "--row"})(campaign, row)
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced():
         results.save(series, path)
@@ -116,3 +88,97 @@ def _show(store: Path, path: Path) -> None:
     with announced(), reporting_damage(store):
         plot_campaign(dataset, path)
     typer.echo("\n".join(describe_campaign(store)))
+
+
+def _fly(
+    call: Call,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; output/FLIGHT by default."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Render a flight, draw it, and print the errors of its points."""
+    folder = output or OUTPUT / Path(call.arguments["flight"]).stem
+    from mitransient_lidar.campaigns.store import Store
+    from mitransient_lidar.flights.fly import STORE
+    from mitransient_lidar.flights.products import Flown, describe_points
+    from mitransient_lidar.plots.point_clouds import plot_flight
+
+    written = [folder / name for name in ("points.laz", "waveforms.las", "waveforms.wdp")]
+    files = [*written, folder / "flight.png", folder / "profile.png"]
+    if (folder / STORE).is_dir():  # which goes on only if it is of this flight
+        replace_freely(path for path in files if _is_of_a_flight(path))
+    check_writable(folder, files)
+    points = call(folder=folder)
+    for path in (*written, *plot_flight(Flown.of(Store(folder / STORE)), points, folder)):
+        typer.echo(path)
+    typer.echo("\n".join(describe_points(points)))
+    exit_if_failed(folder / STORE)
+
+
+def _is_of_a_flight(path: Path) -> bool:
+    """Return whether a command has written a file of points, waveforms or pictures of a flight."""
+    from mitransient_lidar.flights.las_header import is_simulated
+
+    return (read_mark(path) or {}).get("command") == "fly" or is_simulated(path)
+
+
+def _figures(
+    call: Call,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
+    quiet: Quiet = False,
+) -> None:
+    """Make the figures, and print the statements."""
+    from mitransient_lidar.plots.publication import figures as publication
+    from mitransient_lidar.studies.publication.statements import describe_statements
+
+    chosen = publication.check_names(call.arguments["names"])
+    check_writable(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
+    made = call(names=chosen, output=output)
+    for path in made.files:
+        typer.echo(path)
+    for line in describe_statements(made.statements):
+        typer.echo(line)
+    if made.interrupted:
+        done = max(len(made.files) - 1, 0)
+        raise KeyboardInterrupt(f"interrupted after {done} of {len(chosen)} figures, which are kept.")
+
+
+COMMANDS = {
+    "campaign": Command(
+        "Render",
+        "campaigns.sweep:campaign",
+        _campaign,
+        """Render a campaign of many runs.
+
+        Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one
+        Zarr store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
+        docs/guide/campaigns.md describes the file.
+        """,
+    ),
+    "fly": Command(
+        "Render",
+        "flights.fly:fly",
+        _fly,
+        """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
+
+        Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and
+        prints the errors of the points' heights against the truth [cm]. After an interruption, the same command goes
+        on. Failed pulses end it with exit code 1. docs/guide/flights.md describes the file.
+        """,
+    ),
+}
+
+FIGURES = {
+    "figures": Command(
+        "Study",
+        "plots.publication.figures:figures",
+        _figures,
+        """Make the figures of the published model again.
+
+        Writes a PNG file for each figure, and a table of the publication's statements with our numbers, their errors,
+        and whether they hold.
+        """,
+    )
+}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,15 +103,6 @@ def write_netcdf(dataset: xr.Dataset, path: Path, encoding: Mapping[str, Mapping
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced(), replacing(path) as temporary:
         netcdf.dump(dataset, temporary, encoding or {})
-
-
-def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:
-    """Write a figure and a NetCDF file of its data, and print both paths; without a path do nothing."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
-            plot(dataset, path)
-            write_netcdf(dataset, path.with_suffix(".nc"))
 
 
 @dataclass(frozen=True)

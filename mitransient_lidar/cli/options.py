@@ -2,73 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
+import math
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import typer
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, number_list
-from mitransient_lidar.rendering.options import RenderOptions
 
-Instrument = Annotated[
-    str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
-]
-Sensor = Annotated[
-    str | None, typer.Option(metavar="ID", help="Receiver of a scene that has several, instead of the first one.")
-]
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene, or path of a Mitsuba XML file.")]
-SceneOrResult = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENE",
-        help="Name of a shipped scene, path of a Mitsuba XML file, or a result (.nc, .exr) to render again, with its "
-        "own options unless others are given.",
-    ),
-]
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers, 0 to 2^53.")]
-MaxTime = Annotated[
-    float | None, typer.Option(help="Stop before this many seconds, with fewer passes (greater than 0).")
 ]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 #: Default folder of the files that a command renders.
 OUTPUT = Path("output")
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
-
-#: Help of an option for the receiver.
-RECEIVERS = (
-    "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
-    "file."
-)
-
-
-def render_options(*names: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add options of `RenderOptions` to a command, by their names, some with a help of the command's own.
-
-    The command takes them as keywords, None for those that are not given. They follow the scene and its parameters.
-    """
-    types = get_type_hints(RenderOptions)
-
-    def add(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command, eval_str=True)
-        added = []
-        for name in (*names, *helps):
-            flags = [f"--{name.replace('_', '-')}"] if types[name] == bool | None else []
-            option = typer.Option(*flags, help=helps.get(name) or RenderOptions.help(name))
-            kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-            added.append(inspect.Parameter(name, kind, default=None, annotation=Annotated[types[name], option]))
-
-        plain = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
-        # Typer reads the signature, and calls the command with all options as keywords.
-        command.__signature__ = own.replace(parameters=[*plain[:2], *added, *plain[2:]])  # type: ignore[attr-defined]
-        return command
-
-    return add
 
 
 def parameters(definitions: list[str] | None) -> dict[str, str]:
@@ -95,9 +44,54 @@ def pair(option: str, text: str) -> tuple[float, float]:
     return values[0], values[1]
 
 
+def names(option: str, text: str) -> list[str]:
+    """Return names separated by commas."""
+    found = [name.strip() for name in text.split(",")]
+    if not all(found):
+        raise UserError(f"{option} = {text!r} has an empty entry: it must be names separated by commas")
+    return found
+
+
 def number_or_auto(option: str, text: str) -> float | str:
     """Return a finite number, or the word auto."""
     try:
         return text if text == "auto" else finite(option, text)
     except UserError:
         raise UserError(f"{option} {text} must be a number or auto.") from None
+
+
+def name_and_value(option: str, text: str) -> tuple[str, float]:
+    """Return a name and a finite number from ``name=value``."""
+    name, value = _parted(option, text, "name=value")
+    return name, finite(f"{option} {name}", value)
+
+
+def limits(option: str, text: str) -> tuple[str, tuple[float, float]]:
+    """Return a name and two finite numbers from ``name=low:high``."""
+    name, value = _parted(option, text, "name=low:high")
+    ends = value.split(":")
+    if len(ends) != 2:
+        raise UserError(f"{option} {text} is not of the form name=low:high.")
+    return name, (finite(f"{option} {name}", ends[0]), finite(f"{option} {name}", ends[1]))
+
+
+def name_and_values(option: str, text: str) -> tuple[str, list[str]]:
+    """Return a name and texts, which semicolons separate where they hold commas."""
+    name, value = _parted(option, text, "name=value,value,...")
+    values = [one.strip() for one in value.split(";" if ";" in value else ",")]
+    if not all(values):
+        raise UserError(f"{option} {text} is not of the form name=value,value,...")
+    return name, values
+
+
+def name_and_deviation(option: str, text: str) -> tuple[str, float]:
+    """Return a name and a finite number, infinite where there is none."""
+    name, equals, known = text.partition("=")
+    return name.strip(), finite(f"{option} {name.strip()}", known) if equals else math.inf
+
+
+def _parted(option: str, text: str, form: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name.strip() and equals and value.strip()):
+        raise UserError(f"{option} {text} is not of the form {form}.")
+    return name.strip(), value.strip()

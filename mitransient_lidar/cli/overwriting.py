@@ -66,8 +66,7 @@ def keeping(command: Callable[..., None]) -> Callable[..., None]:
 
     every = list(own.parameters.values())
     place = list(own.parameters).index("output") + 1
-    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    every.insert(place, inspect.Parameter("overwrite", kind, default=False, annotation=Overwrite))
+    every.insert(place, inspect.Parameter("overwrite", every[0].kind, default=False, annotation=Overwrite))
     run.__signature__ = own.replace(parameters=every)  # type: ignore[attr-defined]
     return run
 

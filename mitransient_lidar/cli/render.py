@@ -1,25 +1,26 @@
-"""Commands that render a scene with the laser or by daylight."""
+"""Commands that render a scene with the laser, shot by shot or by daylight."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
-from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import (
-    OUTPUT,
-    Define,
-    Instrument,
-    Quiet,
-    SceneOrResult,
-    Sensor,
-    parameters,
-    render_options,
+from mitransient_lidar.cli.files import (
+    GateFiles,
+    announced,
+    check_figure,
+    check_suffix,
+    check_targets,
+    scene_of,
+    write_netcdf,
 )
+from mitransient_lidar.cli.generator import Call, Command, function_at
+from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
+from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -29,48 +30,28 @@ if TYPE_CHECKING:
 Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
 
 
-@render_options(
-    *("target_error", "target_quantile", "max_time", "passes", "seed", "max_memory", "components", "derivatives"),
-    *("batches", "variant"),
-)
-def render(
-    scene: SceneOrResult,
-    define: Define = None,
+def _render(
+    call: Call,
     output: Folder = OUTPUT,
-    instrument: Instrument = None,
-    sensor: Sensor = None,
-    integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
     mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates, by ffmpeg.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
-    **options: Any,
 ) -> None:
-    """Render the waveforms and gates of a scene.
-
-    Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
-    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by origin and
-    derivatives are in the .nc file, and drawn in _components.png and _derivatives.png; batches of passes are in the .nc
-    file. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second
-    one on.
-    """
-    params = parameters(define)
+    """Render a scene, and write and draw its result."""
+    scene = call.arguments["scene"]
     name, text, _ = scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
-    targets += [output / f"{name}_components.png"] if plot and options["components"] else []
-    targets += [output / f"{name}_derivatives.png"] if plot and options["derivatives"] else []
+    targets += [output / f"{name}_components.png"] if plot and call.arguments["components"] else []
+    targets += [output / f"{name}_derivatives.png"] if plot and call.arguments["derivatives"] else []
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
     check_targets(output, [*targets, *gates.names()], scene)
-    from mitransient_lidar.rendering import render as rendering
-
     with DeferredInterrupt(at_once=False):
-        with reporting(quiet) as progress:
-            chosen: dict[str, Any] = {"instrument": instrument, "sensor": sensor, "integrator": integrator}
-            dataset = rendering.render(scene, params=params, progress=progress, **chosen, **options)
+        dataset = call()
         output.mkdir(parents=True, exist_ok=True)
         if "waveform" not in dataset:
             targets = [output / f"{name}.nc"]
@@ -84,87 +65,54 @@ def render(
     exit_if_interrupted(dataset)
 
 
+#: Functions that draw a result, by the ends of the names of their files.
+_DRAWINGS = {
+    "_components": "plots.waveforms:plot_components",
+    "_derivatives": "plots.derivatives:plot_derivatives",
+    "_layout": "plots.layout:plot_layout",
+    "": "plots.waveforms:plot_waveforms",
+}
+
+
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
-    if target.suffix == ".exr":
-        try:
+    dispensable = {".exr": "EXR file"}.get(target.suffix, "drawing of the pixels" * target.stem.endswith("_layout"))
+    try:
+        if target.suffix == ".exr":
             results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
-        except WriteError:
+        elif target.suffix == ".nc":
+            (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+        else:
+            function_at(next(_DRAWINGS[end] for end in _DRAWINGS if target.stem.endswith(end)))(dataset, target)
+    except WriteError:
+        raise
+    except UserError as error:
+        if not dispensable:
             raise
-        except UserError as error:
-            typer.echo(f"no EXR file: {error}", err=True)
-    elif target.suffix == ".nc":
-        (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
-    elif target.stem.endswith("_components"):
-        from mitransient_lidar.plots.waveforms import plot_components
-
-        plot_components(dataset, target)
-    elif target.stem.endswith("_derivatives"):
-        from mitransient_lidar.plots.derivatives import plot_derivatives
-
-        plot_derivatives(dataset, target)
-    elif not target.stem.endswith("_layout"):
-        from mitransient_lidar.plots.waveforms import plot_waveforms
-
-        plot_waveforms(dataset, target)
-    else:
-        from mitransient_lidar.plots.layout import plot_layout
-
-        try:
-            plot_layout(dataset, target)
-        except WriteError:
-            raise
-        except UserError as error:
-            typer.echo(f"no drawing of the pixels: {error}", err=True)
+        typer.echo(f"no {dispensable}: {error}", err=True)
 
 
-@render_options("target_error", "target_quantile", "max_time", "passes", "seed", "variant")
-def passive(
-    scene: SceneOrResult,
-    define: Define = None,
+def _passive(
+    call: Call,
     output: Folder = OUTPUT,
-    sensor: Sensor = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Number of frames of an animation, 1 to 10 000; 1 by default.")
-    ] = None,
-    frame_step: Annotated[
-        float | None, typer.Option(help="Time between frames [s], greater than 0; 0.1 by default.")
-    ] = None,
-    filter_width_nm: Annotated[
-        float | None,
-        typer.Option(help="Width of the receiver's filter [nm], greater than 0, for the power of the daylight."),
-    ] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
     quiet: Quiet = False,
-    **options: Any,
 ) -> None:
-    """Render an image by daylight.
-
-    Writes DIR/<scene>_passive.nc, .exr and .png (.gif of frames), and prints the paths. The limits of error, time and
-    passes hold for each frame.
-    """
-    params = parameters(define)
+    """Render an image, or frames, and write and draw them."""
+    scene, frames = call.arguments["scene"], call.arguments["frames"]
     name, _, former = scene_of(scene, "passive")
     is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
     suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
     check_targets(output, targets, scene)
     from mitransient_lidar.plots import passive as passive_plots
-    from mitransient_lidar.rendering.again import is_result
-    from mitransient_lidar.rendering.passive import render_passive
-    from mitransient_lidar.rendering.render import render_again
     from mitransient_lidar.results.radiance import save_radiance
 
-    series = {"sensor": sensor, "frames": frames, "frame_step_s": frame_step, "filter_width_nm": filter_width_nm}
-    options |= {option: value for option, value in series.items() if value is not None}
     with DeferredInterrupt(at_once=False):
-        with reporting(quiet) as progress:
-            image = (render_again if is_result(scene) else render_passive)(
-                scene, params=params, progress=progress, **options
-            )
+        image = _again(call)()
         output.mkdir(parents=True, exist_ok=True)
         writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
             ".gif": passive_plots.animate_passive,
@@ -179,3 +127,112 @@ def passive(
         if "background_power" in image:
             typer.echo(f"mean power of a pixel: {float(image['background_power'].mean()):.4g} W")
     exit_if_interrupted(image)
+
+
+def _shots(
+    call: Call,
+    places: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="CSV file of places, columns x and y [m], instead of random ones."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = OUTPUT / "shots.nc",
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Render a series, and write it."""
+    scene, given = call.arguments["scene"], call.arguments
+    if given["positions"] and places is not None:
+        raise UserError("--at and --places are alternatives: give one of them.")
+    check_suffix("--output", output, ".nc")
+    check_figure(figure, ".nc", option="--figure")
+    if figure is not None and figure.with_suffix(".nc") == output:
+        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name.")
+    scene_of(scene, "shots")
+    check_targets(output.parent, [output], scene)
+    from mitransient_lidar import results
+    from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
+    from mitransient_lidar.rendering.again import is_result
+    from mitransient_lidar.rendering.shots import series as study
+    from mitransient_lidar.studies import shot_statistics as statistics
+
+    if places is not None:
+        given = {**given, "positions": study.read_places(places)}
+    if is_result(scene):
+        own = {name: given[name] for name in ("count", "positions", "move_target", "seed")}
+        if where := [call.flags[name].lstrip("-") for name, value in own.items() if value]:
+            raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}.")
+        if given["instrument"] is not None:
+            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument.")
+    else:
+        given = {"count": 20, **{name: value for name, value in given.items() if value is not None}}
+    with DeferredInterrupt(at_once=False):
+        series = _again(replace(call, arguments=given))()
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with announced():
+            results.save(series, output)
+            if figure is not None:
+                measured = statistics.shot_statistics(series)
+                figure.parent.mkdir(parents=True, exist_ok=True)
+                plot_shot_statistics(measured, figure)
+                write_netcdf(measured, figure.with_suffix(".nc"))
+    if not quiet:
+        typer.echo("\n".join(study.describe_shots(series)))
+    if figure is not None:
+        typer.echo("\n".join(statistics.describe_statistics(measured)))
+    exit_if_interrupted(series)
+
+
+def _again(call: Call) -> Call:
+    """Return a call without what is not given, of the function that renders a result again if the scene is one."""
+    from mitransient_lidar.rendering.again import is_result
+    from mitransient_lidar.rendering.render import render_again
+
+    given = {name: value for name, value in call.arguments.items() if value is not None}
+    if not is_result(given["scene"]):
+        return replace(call, arguments=given)
+    given["result"] = given.pop("scene")
+    return replace(
+        call, function=render_again, arguments={name: one for name, one in given.items() if one is not False}
+    )
+
+
+COMMANDS = {
+    "render": Command(
+        "Render",
+        "rendering.render:render",
+        _render,
+        """Render the waveforms and gates of a scene.
+
+        Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with
+        gates gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by
+        origin and derivatives are in the .nc file, and drawn in _components.png and _derivatives.png; batches of passes
+        are in the .nc file. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed
+        passes, from the second one on.
+        """,
+    ),
+    "shots": Command(
+        "Render",
+        "rendering.shots.series:render_shots",
+        _shots,
+        """Render a series of shots over one sea.
+
+        Writes one file of all waveforms, with the true slope, height and depth at each place, which record, echoes,
+        retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
+        """,
+        defaults={"count": None, "seed": None},
+    ),
+    "passive": Command(
+        "Render",
+        "rendering.passive:render_passive",
+        _passive,
+        """Render an image by daylight.
+
+        Writes DIR/<scene>_passive.nc, .exr and .png (.gif of frames), and prints the paths. The limits of error, time
+        and passes hold for each frame.
+        """,
+        defaults={"frames": None, "frame_step_s": None},
+    ),
+}

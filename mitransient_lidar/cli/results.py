@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
-from mitransient_lidar.cli.messages import name_subject, reporting
-from mitransient_lidar.cli.options import RECEIVERS, DrawingOnly, Quiet, Seed, number_or_auto
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix
+from mitransient_lidar.cli.generator import Command
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.options import DrawingOnly, Quiet
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 
@@ -21,26 +22,36 @@ _DIFFERENT = 1
 _PAGE_MB = 200.0
 
 
-def plot(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
-    output: DrawingOnly = None,
-    log: Annotated[bool, typer.Option("--log", help="Logarithmic power axis only.")] = False,
-    linear: Annotated[bool, typer.Option("--linear", help="Linear power axis only.")] = False,
+def _view(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, a gate stack or recorded signals.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="HTML file of the page, by default a temporary one; PNG, PDF or SVG of a drawing."
+        ),
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     shot: Annotated[
         int | None, typer.Option(help="Number of a shot of a series, from 0; by default the mean of all.")
     ] = None,
+    plot: Annotated[bool, typer.Option("--plot", help="Draw the waveforms instead, to FILE.png.")] = False,
+    log: Annotated[bool, typer.Option("--log", help="Draw them with a logarithmic power axis only.")] = False,
+    linear: Annotated[bool, typer.Option("--linear", help="Draw them with a linear power axis only.")] = False,
     components: Annotated[
         bool, typer.Option("--components", help="Draw the light by origin instead, to FILE_components.png.")
     ] = False,
     layout: Annotated[
         bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
     ] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Draw the waveforms or the layout of a result.
-
-    Writes a PNG file, by default in the folder of FILE, and prints its path. With --layout it also prints where the
-    axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths and the bottom: x, y, z.
-    """
+    """Show a result in the browser, or draw it."""
+    is_page = output is None or output.suffix.lower() == ".html"
+    if not (plot or log or linear or components or layout) and is_page:
+        _show(file, output, shot, browser, quiet)
+        return
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
     if components and (log or linear or layout):
@@ -55,35 +66,19 @@ def plot(
     dataset = open_waveforms(file)
     if shot is not None:
         dataset = _shot(dataset, shot, file)
-    if layout:
-        with announced():
+    with announced():
+        if layout:
             plot_layout(dataset, target)
-        typer.echo("\n".join(axis_points(dataset)))
-    elif components:
-        with announced():
+        elif components:
             plot_components(dataset, target)
-    else:
-        with announced():
+        else:
             plot_waveforms(dataset, target, "both" if log == linear else "log" if log else "linear")
+    if layout:
+        typer.echo("\n".join(axis_points(dataset)))
 
 
-def view(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, a gate stack or recorded signals.")
-    ],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="HTML file to write; by default a temporary one.")
-    ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
-    shot: Annotated[
-        int | None, typer.Option(help="Number of a shot of a series, from 0; by default the mean of all.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Show a result in the browser: a map of the pixels at each time, and the waveforms of those that are clicked.
-
-    Writes a page that needs no network, prints its path, and opens it. Gates are shown where FILE has them.
-    """
+def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quiet: bool) -> None:
+    """Write the page of a result, and open it in the browser."""
     if output is not None:
         check_suffix("--output", output, ".html")
     from mitransient_lidar.plots.viewer import view as page_of
@@ -123,69 +118,12 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
     return dataset.sel(shot=number)
 
 
-def record(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
-    receiver: Annotated[
-        str | None, typer.Option(help=f"{RECEIVERS} By default that of the result's instrument, or apd.")
-    ] = None,
-    gain: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FACTOR",
-            help="Factor of the amplifier's gain, greater than 0, or auto; by default the receiver's, or 1.",
-        ),
-    ] = None,
-    optical_density: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DENSITY",
-            help="Optical density of a filter before the detector, 0 to 12, or auto; by default the receiver's, or 0.",
-        ),
-    ] = None,
-    shots: Annotated[
-        int, typer.Option(help="Number of records of each waveform with independent noise, 1 to 10^9.")
-    ] = 1,
-    background_power_w: Annotated[
-        float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
-    ] = 0.0,
-    seed: Seed = 0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Record the waveforms of a result with a receiver.
-
-    Writes the signals with the noise of detector and electronics, which waveforms and plot read, and prints how much is
-    saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the gain or
-    the filter is chosen so that nothing is saturated.
-    """
-    target = output or file.with_name(f"{file.stem}_recorded.nc")
-    check_suffix("--output", target, ".nc")
-    chosen: dict[str, Any] = {}
-    for option, text in (("gain", gain), ("optical_density", optical_density)):
-        chosen[option] = None if text is None else number_or_auto(f"--{option.replace('_', '-')}", text)
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis import receiver as analysis
-
-    with reporting(quiet):
-        result = results.open(file)
-        recorded = analysis.detect_waveforms(result, receiver, shots, seed, background_power_w, **chosen)
-    name_subject(file, result.attrs, quiet)
-    write_netcdf(recorded, target, analysis.encoding(recorded))
-    for line in analysis.describe_recording(recorded):
-        typer.echo(line)
-
-
-def compare(
+def _compare(
     first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and time bins.")],
     output: DrawingOnly = None,
 ) -> None:
-    """Test whether two results agree within their errors.
-
-    Draws both and prints the path; exit code 1 if they differ.
-    """
+    """Compare and draw two results."""
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
     from mitransient_lidar.plots.comparison import plot_comparison
@@ -203,3 +141,29 @@ def compare(
     )
     if not outcome.agrees:
         raise typer.Exit(_DIFFERENT)
+
+
+COMMANDS = {
+    "view": Command(
+        "Analyse results",
+        "",
+        _view,
+        """Show a result in the browser, or draw its waveforms or layout.
+
+        The page is a map of the pixels at each time, and the waveforms of those that are clicked; it needs no network.
+        Gates are shown where FILE has them. With --plot, --components, --layout or a drawing as --output, a PNG, PDF or
+        SVG file is written instead, by default in the folder of FILE. Both print the path. With --layout, the command
+        also prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths
+        and the bottom: x, y, z.
+        """,
+    ),
+    "compare": Command(
+        "Analyse results",
+        "",
+        _compare,
+        """Test whether two results agree within their errors.
+
+        Draws both and prints the path; exit code 1 if they differ.
+        """,
+    ),
+}

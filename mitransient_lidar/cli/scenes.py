@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.options import render_options
+from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.core.errors import UserError
+
+_HEADING = "Scenes and system"
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
 
@@ -23,14 +25,14 @@ def list_scenes() -> None:
         typer.echo(f"{name:{width}}  {catalogue.scene_summary(name)}".rstrip())
 
 
-def show_scene(name: Name) -> None:
+def _show(name: Name) -> None:
     """Print the XML of a scene, self-contained."""
     from mitransient_lidar.loading.catalogue import scene_text
 
     typer.echo(scene_text(name), nl=False)
 
 
-def copy_scene(
+def _copy(
     name: Name,
     destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder, or path of the new file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
@@ -41,15 +43,11 @@ def copy_scene(
     typer.echo(catalogue.copy_scene(name, destination, overwrite))
 
 
-def instruments(
+def _instruments(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of an instrument.")] = None,
     xml: Annotated[bool, typer.Option("--xml", help="Print XML of laser and receiver, to be included.")] = False,
 ) -> None:
-    """List the instruments, or print the parameters of one with their sources.
-
-    Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML file
-    that record takes. Use with render SCENE --instrument NAME.
-    """
+    """List the instruments, or print the parameters of one."""
     from mitransient_lidar.loading import instruments as shipped
 
     if name is None:
@@ -73,14 +71,10 @@ def instruments(
     typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
 
 
-def info(
+def _info(
     file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="An EXR or NetCDF result.")] = None,
 ) -> None:
-    """Print versions, the Mitsuba variant and the path of LLVM, or the parameters of a result.
-
-    Of a result: its attributes, then every object of its scene with the values of all parameters, defaults too; a dash
-    for those that are not given and have no default, or are not used.
-    """
+    """Print versions and paths, or the parameters of a result."""
     if file is None:
         from mitransient_lidar.loading import variants
 
@@ -94,30 +88,53 @@ def info(
         typer.echo(f"{name:{width}}  {value}")
 
 
-@render_options(
-    target_error="Stop when 95 % of the bins of lit pixels have reached this relative standard error (greater than 0).",
-    max_time="Stop each render before this many seconds (greater than 0), by default 120 with a target error.",
-)
-def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer cases, in less than a minute.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    case: Annotated[str | None, typer.Option(help="Run only this case.")] = None,
+def _bench(
+    call: Call,
     images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
     beams: Annotated[
         bool, typer.Option("--beams", help="Compare beams of 0.1 to 20 mrad in all views instead.")
     ] = False,
-    **options: Any,
 ) -> None:
-    """Measure the time to a given accuracy."""
-    from mitransient_lidar.studies import bench as benchmark
+    """Run one of the benchmarks."""
     from mitransient_lidar.studies import bench_beams, bench_images
 
     if images and beams:
         raise UserError("--images and --beams: give one of them")
     if images:
-        bench_images.run(json=json)
+        bench_images.run(json=call.arguments["json"])
     elif beams:
-        bench_beams.run(json=json)
+        bench_beams.run(json=call.arguments["json"])
     else:
-        ends = {name: value for name, value in options.items() if value is not None}
-        benchmark.run(quick=quick, json=json, case=case, **ends)
+        with call.named():
+            call.function(**call.arguments)
+
+
+COMMANDS = {
+    "info": Command(
+        _HEADING,
+        "",
+        _info,
+        """Print versions, the Mitsuba variant and the path of LLVM, or the parameters of a result.
+
+        Of a result: its attributes, then every object of its scene with the values of all parameters, defaults too; a
+        dash for those that are not given and have no default, or are not used.
+        """,
+    ),
+    "bench": Command(_HEADING, "studies.bench:run", _bench, "Measure the time to a given accuracy."),
+}
+
+SCENES = {
+    "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
+    "show": Command("Commands", "", _show, "Print the XML of a scene, self-contained."),
+    "copy": Command("Commands", "", _copy, "Copy a scene to a self-contained file to edit, and print its path."),
+    "instruments": Command(
+        "Commands",
+        "",
+        _instruments,
+        """List the instruments, or print the parameters of one with their sources.
+
+        Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML
+        file that record takes. Use with render SCENE --instrument NAME.
+        """,
+    ),
+}

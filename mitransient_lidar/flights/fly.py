@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import xarray as xr
 
 from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
-from mitransient_lidar.campaigns.sweep import complete
+from mitransient_lidar.campaigns.sweep import ProcessCount, Scheduler, complete
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import integer
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import telling_errors_alone
@@ -21,7 +21,7 @@ from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
 
 if TYPE_CHECKING:
-    from distributed import Client
+    pass
 
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
@@ -33,13 +33,23 @@ _FEWEST, _MOST, _SHARDS = 512, 1024, 8
 _SAMPLE = 2
 
 
+@checked
 def fly(
-    flight: FlightPlan | Mapping[str, Any] | str | os.PathLike[str],
+    flight: Annotated[
+        FlightPlan | Mapping[str, Any] | str | os.PathLike[str],
+        Option("TOML file of a flight, or the name of a shipped one", form="FLIGHT", is_argument=True),
+    ],
     folder: str | os.PathLike[str],
     *,
-    workers: int | None = None,
-    scheduler: Client | str | None = None,
-    shard_size: int | None = None,
+    workers: ProcessCount = None,
+    scheduler: Scheduler = None,
+    shard_size: Annotated[
+        int | None,
+        Option(
+            "Pulses that one process renders and writes, by default an eighth of them, but 512 to 1024 in number",
+            *(1, LARGEST_SHARD),
+        ),
+    ] = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the pulses of a flight, or those that an interrupted one has left, and write its points and waveforms.
@@ -71,8 +81,6 @@ def fly(
     KeyboardInterrupt
         After Ctrl-C; pulses that are written stay, and the same call goes on.
     """
-    if shard_size is not None:
-        shard_size = integer("shard_size", shard_size, 1, LARGEST_SHARD)
     if isinstance(flight, Mapping):
         plan = FlightPlan.of(flight)
     else:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from mitransient_lidar.analysis.retrieval.retrieval_table import estimates, truth_statistics
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
@@ -59,58 +59,6 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
         ax.legend(loc="upper left", framealpha=0.9, fontsize="small", handletextpad=0.2)
     axes[0].set_ylabel("slope retrieved from one shot (deg)")
     return drawing.save(figure, path)
-
-
-class Estimate(NamedTuple):
-    """An estimate over the shots of a series: heading with unit, values, standard errors and truth, if known."""
-
-    head: str
-    values: FloatArray
-    errors: FloatArray
-    truth: FloatArray | None
-
-
-def estimates(found: xr.Dataset) -> list[Estimate]:
-    """Return slopes, heights, depths and reflectances of a result of `analysis.retrieval.retrieve.retrieve`.
-
-    The result is over ``shot``. Depths are those below the mean sea level through the slope of the shot, reflectances
-    those by the ratio to the column.
-    """
-    through_slope = found.sel(correction="slope")
-    columns = {
-        "slope along": ("slope_along", "true_slope_along"),
-        "slope across": ("slope_across", "true_slope_across"),
-        "height (m)": ("surface_height", "true_surface_height"),
-        "depth (m)": ("depth_m", "true_bottom_depth"),
-    }
-
-    listed = [
-        Estimate(
-            head,
-            through_slope[name].values,
-            through_slope[f"{name}_stderr"].values,
-            through_slope[truth].values if truth in through_slope else None,
-        )
-        for head, (name, truth) in columns.items()
-    ]
-    by_column = found.sel(correction="column")
-    values, errors = (by_column[name].values for name in ("reflectance", "reflectance_stderr"))
-    return [*listed, Estimate("reflectance", values, errors, None)]
-
-
-def truth_statistics(one: Estimate) -> str:
-    """Return a line with bias and scatter of an estimate about the truth; empty for fewer than 2 known shots."""
-    if one.truth is None:
-        return ""
-    known = np.isfinite(one.values) & np.isfinite(one.truth)
-    if np.count_nonzero(known) < 2:
-        return ""
-    error = one.values[known] - one.truth[known]
-    text = f"{one.head}: bias {error.mean():+.3f}, rms error {np.sqrt(np.mean(error**2)):.3f}"
-    if np.ptp(one.truth[known]) > 0 and np.ptp(one.values[known]) > 0:
-        text += f", correlation {np.corrcoef(one.values[known], one.truth[known])[0, 1]:+.2f}"
-    text += f", rms of error / standard error {np.sqrt(np.mean((error / one.errors[known]) ** 2)):.2f}"
-    return f"{text}, {np.count_nonzero(known)} shots"
 
 
 def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:

@@ -6,7 +6,6 @@ import logging
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.options import KEPT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import input_format
@@ -86,8 +85,7 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     given = {name: value for name, value in options.items() if value is not None}
     folder = None if isinstance(result, xr.Dataset) else Path(result).parent
     scene = SceneRecord.from_attributes(attributes, folder)
-    held = {one.name: one.metadata["attribute"] for one in fields(RenderOptions)}
-    own = {name: _held(attributes, held[name]) for name in _RECORDED[kind]}
+    own = {name: _held(attributes, KEPT[name]) for name in _RECORDED[kind]}
     compare_versions(attributes)
     if kind == "shots":
         own |= _series_options(result, attributes, given)

@@ -1,12 +1,12 @@
-"""Options of a render: type, range, meaning and attribute of each, shared by functions and commands."""
+"""Options of a render: type, range and meaning of each, shared by functions and commands."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Annotated
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, integer, positive, relative_error
+from mitransient_lidar.core.options import Option, declared, positive_option
 
 #: Largest number of passes that can be asked for.
 MOST_PASSES = 10**9
@@ -14,14 +14,46 @@ MOST_PASSES = 10**9
 #: Smallest share of the paths of a full pass.
 SMALLEST_SHARE = 2**-9
 
+TargetError = Annotated[
+    float | None,
+    Option(
+        "Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have reached "
+        "this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels",
+        *(0, 1),
+        above=True,
+    ),
+]
+TargetQuantile = Annotated[
+    float | None, Option("Share that must reach the target error instead of 0.95; 0.5 is the median", 0.01, 1)
+]
+MaxTime = Annotated[float | None, positive_option("Stop before this many seconds, after at least two passes")]
+Passes = Annotated[int | None, Option("Stop after this many independent passes", 2, MOST_PASSES)]
+SignedSeed = Annotated[int | None, Option("Seed of the random numbers, 0 by default", -(2**63), 2**63 - 1)]
+PassShare = Annotated[float | None, Option("Share of the paths of a full pass in each pass", SMALLEST_SHARE, 1)]
+MaxMemory = Annotated[
+    float | None, positive_option("Memory for histograms [GB], 2 by default; with less, only gates are kept")
+]
+Components = Annotated[bool | None, Option("Also separate the light of surface, water, bottom and targets")]
+Derivatives = Annotated[
+    list[str] | str | None,
+    Option(
+        "Also differentiate the waveforms by this parameter, e.g. attenuation, bottom_reflectance or bottom_depth. "
+        "Repeatable",
+        form="NAME",
+    ),
+]
+Batches = Annotated[
+    int | None,
+    Option(
+        "Also keep the waveforms of this many batches of passes, from which a fit to the result takes the correlation "
+        "of its errors",
+        *(2, 256),
+    ),
+]
+Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
 
-def _option(meaning: str, allowed: str = "", low: Any = None, high: Any = None, attribute: str = "") -> Any:
-    """Return a field of `RenderOptions`: meaning, range as text and numbers, and the attribute of results that hold it.
-
-    Numbers are greater than 0 where no limits are given.
-    """
-    about = {"meaning": meaning, "allowed": allowed, "low": low, "high": high, "attribute": attribute}
-    return field(default=None, metadata=about)
+#: Options that results keep, and the attributes that hold them.
+KEPT = {name: name for name in ("passes", "seed", "pass_share", "variant")} | {"max_memory": "max_memory_gb"}
 
 
 @dataclass(frozen=True)
@@ -34,61 +66,25 @@ class RenderOptions:
         If a number is out of range, or a quantile has no error that it must reach.
     """
 
-    target_error: float | None = _option(
-        "Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have reached "
-        "this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels",
-        "greater than 0, at most 1",
-    )
-    target_quantile: float | None = _option(
-        "Share that must reach the target error instead of 0.95; 0.5 is the median", "0.01 to 1", 0.01, 1
-    )
-    max_time: float | None = _option("Stop before this many seconds, after at least two passes", "greater than 0")
-    passes: int | None = _option("Stop after this many independent passes", "2 to 10^9", 2, MOST_PASSES, "passes")
-    seed: int | None = _option(
-        "Seed of the random numbers, 0 by default", "-2^63 to 2^63 - 1", -(2**63), 2**63 - 1, "seed"
-    )
-    pass_share: float | None = _option(
-        "Share of the paths of a full pass in each pass", "1/512 to 1", SMALLEST_SHARE, 1, "pass_share"
-    )
-    max_memory: float | None = _option(
-        "Memory for histograms [GB], 2 by default; with less, only gates are kept",
-        "greater than 0",
-        attribute="max_memory_gb",
-    )
-    components: bool | None = _option("Also separate the light of surface, water, bottom and targets")
-    derivatives: list[str] | None = _option(  # noqa: RUF009 (the default is None)
-        "Also differentiate the waveforms by this parameter, e.g. attenuation, bottom_reflectance or bottom_depth. "
-        "Repeatable"
-    )
-    batches: int | None = _option(
-        "Also keep the waveforms of this many batches of passes, from which a fit to the result takes the correlation "
-        "of its errors",
-        "2 to 256",
-        2,
-        256,
-        "batches",
-    )
-    variant: str | None = _option("Mitsuba variant, e.g. llvm_ad_mono", attribute="variant")
+    target_error: TargetError = None
+    target_quantile: TargetQuantile = None
+    max_time: MaxTime = None
+    passes: Passes = None
+    seed: SignedSeed = None
+    pass_share: PassShare = None
+    max_memory: MaxMemory = None
+    components: Components = None
+    derivatives: Derivatives = None
+    batches: Batches = None
+    variant: Variant = None
 
     def __post_init__(self) -> None:
+        options = declared(RenderOptions)
         for one in fields(self):
-            value, low, high = getattr(self, one.name), one.metadata["low"], one.metadata["high"]
-            if value is None or not one.metadata["allowed"]:
-                continue
-            if one.name == "target_error":
-                number: float = relative_error(one.name, value)
-            elif low is None:
-                number = positive(one.name, value)
-            else:
-                number = (integer if isinstance(low, int) else in_range)(one.name, value, low, high)
-            object.__setattr__(self, one.name, number)
+            if (value := getattr(self, one.name)) is not None:
+                kind, option = options[one.name]
+                object.__setattr__(self, one.name, option.check(one.name, value, kind))
         if self.target_quantile is not None and self.target_error is None and (self.passes or self.max_time):
             raise UserError(
                 f"target_quantile = {self.target_quantile:g} needs a target_error: the error that it must reach"
             )
-
-    @classmethod
-    def help(cls, name: str) -> str:
-        """Return meaning and range of an option as a sentence."""
-        about = cls.__dataclass_fields__[name].metadata
-        return f"{about['meaning']} ({about['allowed']})." if about["allowed"] else f"{about['meaning']}."

@@ -7,21 +7,28 @@ import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer, positive, require_memory, shown
+from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checked, positive_option
+from mitransient_lidar.core.validation import FloatArray, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.accuracy import RatioStatistics
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.options import (
+    MOST_PASSES,
+    MaxTime,
+    SignedSeed,
+    TargetError,
+    TargetQuantile,
+    Variant,
+)
 from mitransient_lidar.rendering.passes import (
     TOLERATED_LOSS,
     Goal,
@@ -34,8 +41,6 @@ from mitransient_lidar.rendering.passes import (
 from mitransient_lidar.results.radiance import build_radiance
 
 if TYPE_CHECKING:
-    import mitsuba as mi
-
     from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
 
 logger = logging.getLogger(__name__)
@@ -52,22 +57,27 @@ _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
 _TIMES = ("surface_time", "time")  # names of the time of the sea of an XML scene [s]
 
 
+@checked
 @alone
 def render_passive(
-    scene: str | Path | Mapping[str, Any] | mi.Scene,
+    scene: SceneOrResult,
     params: Mapping[str, Any] | None = None,
     *,
-    sensor: str | None = None,
+    sensor: Sensor = None,
     integrator: str | Mapping[str, Any] | None = None,
-    target_error: float | None = None,
-    target_quantile: float | None = None,
-    max_time: float | None = None,
-    passes: int | Sequence[int] | None = None,
-    seed: int | None = None,
-    frames: int = 1,
-    frame_step_s: float = 0.1,
-    filter_width_nm: float | None = None,
-    variant: str | None = None,
+    target_error: TargetError = None,
+    target_quantile: TargetQuantile = None,
+    max_time: MaxTime = None,
+    passes: Annotated[int | Sequence[int] | None, Option("Stop after this many passes", 2, MOST_PASSES)] = None,
+    seed: SignedSeed = None,
+    frames: Annotated[int, Option("Number of frames of an animation, 1 by default", 1, MOST_FRAMES)] = 1,
+    frame_step_s: Annotated[
+        float, Option("Time between frames, 0.1 by default", 0, unit="s", above=True, flag="--frame-step")
+    ] = 0.1,
+    filter_width_nm: Annotated[
+        float | None, positive_option("Width of the receiver's filter, for the power of the daylight", "nm")
+    ] = None,
+    variant: Variant = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the radiance that the receiver sees by daylight.
@@ -76,8 +86,6 @@ def render_passive(
     ----------
     scene
         As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
-    sensor
-        Id of a receiver of the scene, by default the first one.
     integrator
         Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
@@ -87,13 +95,9 @@ def render_passive(
         As for `render.render`.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
-    frames
-        Number of frames, 1 to 10 000.
     frame_step_s
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to ``time``
         of the ``ocean_surface`` of a dict.
-    filter_width_nm
-        Width of the receiver's filter [nm], greater than 0, for ``background_power``.
     progress
         Called with a `passes.Progress` of the frame after every pass.
 
@@ -110,9 +114,7 @@ def render_passive(
     UserError
         If the scene, a parameter or an option is invalid.
     """
-    frames, step = integer("frames", frames, 1, MOST_FRAMES), positive("frame_step_s", frame_step_s)
-    width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
-    seed = RenderOptions(seed=seed).seed or 0
+    step, width, seed = frame_step_s, filter_width_nm, seed or 0
     counts: list[Any] = list(passes) if isinstance(passes, (list, tuple)) else [passes] * frames
     if len(counts) != frames:
         raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")

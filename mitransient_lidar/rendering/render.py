@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.options import (
+    Batches,
+    Components,
+    Derivatives,
+    MaxMemory,
+    MaxTime,
+    Passes,
+    RenderOptions,
+    SignedSeed,
+    TargetError,
+    TargetQuantile,
+    Variant,
+)
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
 
 if TYPE_CHECKING:
     import mitsuba as mi
     import xarray
 
-    from mitransient_lidar.loading.scene_record import SceneRecord
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -31,25 +43,26 @@ DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
+@checked
 @alone
 def render(
-    scene: str | Path | Mapping[str, Any] | mi.Scene | LoadedScene | SceneRecord | xarray.Dataset,
+    scene: SceneOrResult,
     *,
     params: Mapping[str, Any] | None = None,
-    instrument: str | None = None,
-    sensor: str | None = None,
-    integrator: str | Mapping[str, Any] | mi.Integrator | None = None,
-    target_error: float | None = None,
-    target_quantile: float | None = None,
-    max_time: float | None = None,
-    passes: int | None = None,
-    seed: int | None = None,
-    max_memory: float | None = None,
+    instrument: Instrument = None,
+    sensor: Sensor = None,
+    integrator: Annotated[Any, Option("Integrator to use instead of the scene's")] = None,
+    target_error: TargetError = None,
+    target_quantile: TargetQuantile = None,
+    max_time: MaxTime = None,
+    passes: Passes = None,
+    seed: SignedSeed = None,
+    max_memory: MaxMemory = None,
     pass_share: float | None = None,
-    components: bool | None = None,
-    derivatives: Sequence[str] | str | None = None,
-    batches: int | None = None,
-    variant: str | None = None,
+    components: Components = None,
+    derivatives: Derivatives = None,
+    batches: Batches = None,
+    variant: Variant = None,
     progress: ProgressCallback | None = None,
     **others: Any,
 ) -> xarray.Dataset:

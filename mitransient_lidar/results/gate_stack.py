@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from os import PathLike
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -29,20 +30,28 @@ from mitransient_lidar.results.geometry import lidar_geometry, optional_number
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
 
+@checked
 def train_from_options(
     attributes: Mapping[str, Any],
     *,
-    start_ns: float | None = None,
-    start_depth_m: float | None = None,
-    width_ns: float | None = None,
-    step_ns: float | None = None,
-    count: int = 1,
-    rise_ns: float = 0.0,
-    fall_ns: float = 0.0,
-    profile_file: str | PathLike[str] | None = None,
-    pulses: int = 1,
+    start_ns: Annotated[float | None, Option("Start of the first gate, at half height [ns], any number")] = None,
+    start_depth_m: Annotated[
+        float | None, Option("Depth of its start on the axis [m], any number, instead of a time", flag="--start-depth")
+    ] = None,
+    width_ns: Annotated[float | None, positive_option("Width of a gate between half heights", "ns")] = None,
+    step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
+    count: Annotated[int, Option("Number of gates", 1, 100_000)] = 1,
+    rise_ns: Annotated[
+        float, Option("10-90 % time of the rising edge; both edges take at most 1.18 widths", 0, unit="ns")
+    ] = 0.0,
+    fall_ns: Annotated[float, Option("90-10 % time of the falling edge", 0, unit="ns")] = 0.0,
+    profile_file: Annotated[
+        str | PathLike[str] | None,
+        Option("Measured gate instead of width and edges: columns time [ns], transmission", flag="--profile"),
+    ] = None,
+    pulses: Annotated[int, Option("Pulses accumulated in a gate", 1, 10**9)] = 1,
 ) -> GateTrain:
-    """Build a gate train from command line options.
+    """Build a gate train from the options of the command ``gates``.
 
     Parameters
     ----------
@@ -51,18 +60,6 @@ def train_from_options(
     start_ns, start_depth_m : float, optional
         Half height of the first gate's rising edge, as a time [ns] or a depth on the receiver's axis [m]; exactly one
         of them.
-    width_ns : float, optional
-        Time between the half heights of a gate [ns], greater than 0; not with `profile_file`.
-    step_ns : float, optional
-        Time between the starts of consecutive gates [ns], greater than 0; by default the width.
-    count : int
-        Number of gates, 1 to 100 000.
-    rise_ns, fall_ns : float
-        10-90 % times of the edges [ns], at least 0; not with `profile_file`.
-    profile_file : path, optional
-        Measured gate: two columns, time [ns] and transmission 0 to 1.
-    pulses : int
-        Number of pulses summed in a gate, 1 to 10^9.
 
     Raises
     ------

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.core.options import FewerPasses, Numbers, Option, Scene, Seed, checked
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 
 if TYPE_CHECKING:
@@ -63,16 +63,17 @@ _COLUMNS = (
 _COLUMN = 17
 
 
+@checked
 @alone
 def beam_spread(
-    scene: Any,
-    depths: npt.ArrayLike,
+    scene: Scene,
+    depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
     params: Mapping[str, Any] | None = None,
     *,
-    passes: int = 8,
-    max_time: float | None = None,
-    photons: int = 2**16,
-    seed: int = 0,
+    passes: Annotated[int, Option("Number of independent passes of each render", 2, 10_000)] = 8,
+    max_time: FewerPasses = None,
+    photons: Annotated[int, Option("Photons of a pass", 1024, 2**24)] = 2**16,
+    seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its places and delays.
@@ -83,14 +84,6 @@ def beam_spread(
         As for `rendering.render.render`.
     depths
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
-    passes
-        Number of independent passes, 2 to 10 000.
-    max_time
-        Time after which no pass begins [s], above 0; at least two passes are made.
-    photons
-        Photons of a pass, 1024 to 2^24.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -121,13 +114,7 @@ def beam_spread(
     Light is in the field of view where the line of sight from the receiver to it through a level sea is in a pixel.
     Paths end at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
-    passes, photons = integer("passes", passes, 2, 10_000), integer("photons", photons, 1024, 2**24)
-    seed, options = integer("seed", seed, 0, 2**53), RenderOptions(max_time=max_time)
-    wanted = np.unique(finite_array("depths", depths))
-    if wanted.size == 0:
-        raise UserError("depths must hold at least one depth in metres")
-    if wanted[0] <= 0:
-        raise UserError(f"depths = {wanted[0]:g} m must be greater than 0")
+    wanted = np.unique(depths)
     session = open_scene(scene, params)
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -149,7 +136,7 @@ def beam_spread(
         measured.append([_measure(lidar, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=options.max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
     missed = float(np.mean(outside))
     if missed > TOLERATED_LOSS:
         logger.warning(

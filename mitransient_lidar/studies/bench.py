@@ -15,13 +15,13 @@ import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -95,13 +95,19 @@ _COLUMNS = {
 }
 
 
+@checked
 def run(
     *,
-    quick: bool = False,
-    json: bool = False,
-    case: str | None = None,
-    target_error: float | None = None,
-    max_time: float | None = None,
+    quick: Annotated[bool, Option("Fewer cases, in less than a minute")] = False,
+    json: Annotated[bool, Option("Print JSON")] = False,
+    case: Annotated[str | None, Option("Run only this case")] = None,
+    target_error: Annotated[
+        float | None,
+        Option("Stop when 95 % of the bins of lit pixels have reached this relative standard error", 0, 1, above=True),
+    ] = None,
+    max_time: Annotated[
+        float | None, positive_option("Stop each render before this many seconds, by default 120 with a target error")
+    ] = None,
 ) -> None:
     """Measure every case with every integrator, and instruments with merging; print a table or one JSON object.
 
@@ -114,7 +120,6 @@ def run(
     instruments = instrument_names()
     if case is not None and case not in CASES and case not in instruments:
         raise UserError(f"case = {case!r} must be one of {', '.join([*CASES, *instruments])}")
-    RenderOptions(target_error=target_error, max_time=max_time)
     ends = {"target_error": target_error, "max_time": max_time}
     tasks: dict[tuple[str, ...], dict[str, Any]] = {
         (name, integrator): {"case": name, "integrator": integrator, "quick": quick, **ends}

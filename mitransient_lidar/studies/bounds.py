@@ -9,7 +9,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -19,11 +19,20 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.validation import in_range, integer, non_negative, positive, shown
+from mitransient_lidar.core.options import (
+    RECEIVERS,
+    BackgroundPower,
+    NumberOrAuto,
+    Option,
+    Scene,
+    Seed,
+    checked,
+    positive_option,
+)
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
 
@@ -35,22 +44,58 @@ MOST_DESIGNS = 1000
 _JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
 
 
+@checked
 @alone
 def bounds(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    free: Sequence[str],
-    over: Mapping[str, Sequence[Any]] | None = None,
-    receiver: Any = None,
-    gain: Any = None,
-    optical_density: Any = None,
-    background_power_w: float = 0.0,
-    nuisances: Mapping[str, float] | None = None,
-    renders: int = 4,
-    passes: int = 16,
-    max_time: float | None = None,
-    seed: int = 0,
+    free: Annotated[
+        Sequence[str], Option("Unknown parameters, e.g. attenuation,bottom_reflectance", form="NAME,NAME,...")
+    ],
+    over: Annotated[
+        Mapping[str, Sequence[Any]] | None,
+        Option(
+            "Values of a parameter of the scene to compare, separated by semicolons where they hold commas. "
+            "Repeatable: all combinations count",
+            form="NAME=V1,V2,...",
+        ),
+    ] = None,
+    receiver: Annotated[
+        Any,
+        Option(
+            f"{RECEIVERS}. Several, separated by commas, are compared. By default the instrument's, or apd",
+            form="NAME,NAME,...",
+        ),
+    ] = None,
+    gain: Annotated[
+        NumberOrAuto,
+        Option(
+            "Factor of the receiver's gain, or auto for the largest without saturation",
+            0,
+            above=True,
+            form="NUMBER|auto",
+        ),
+    ] = None,
+    optical_density: Annotated[
+        NumberOrAuto,
+        Option("Optical density of a filter, or auto for the least without saturation", 0, DENSEST, form="NUMBER|auto"),
+    ] = None,
+    background_power_w: BackgroundPower = 0.0,
+    nuisances: Annotated[
+        Mapping[str, float] | None,
+        Option(
+            "Also unknown: time_offset [ns] or scale of the light [1], or known to a standard deviation. Repeatable",
+            form="NAME[=STD]",
+            flag="--nuisance",
+        ),
+    ] = None,
+    renders: Annotated[int, Option("Independent renders of each design; 3 or more give errors", 2, 1000)] = 4,
+    passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 16,
+    max_time: Annotated[
+        float | None, positive_option("Begin no further design after this many seconds, and leave it out")
+    ] = None,
+    seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Compute the Cramer-Rao bounds of parameters of a scene from one shot's record, and compare designs.
@@ -67,15 +112,11 @@ def bounds(
     receiver, gain, optical_density
         As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`; several receivers in a list
         are compared on the same renders, and ``receiver`` is then the last parameter of a design.
-    background_power_w
-        Steady power on each pixel [W], at least 0.
     nuisances
         As for `analysis.information.fisher.fisher_information`.
     renders
         Independent renders of each design, 2 to 1000, whose noise is kept out of the information; from three on their
         spread gives standard errors.
-    passes
-        Passes of each render, 2 to 100 000.
     max_time
         Time after which no design is begun [s], above 0; the first one always is. The attribute ``designs_left_out``
         has the number of the others that are left out, with a warning.
@@ -104,13 +145,7 @@ def bounds(
     """
     if isinstance(free, str) or len(free) == 0 or len(set(free)) != len(free):
         raise UserError(f"free = {free!r} must be a list of different names of parameters")
-    renders, passes = integer("renders", renders, 2, 1000), integer("passes", passes, 2, 100_000)
-    seed, sky = integer("seed", seed, 0, 2**53), non_negative("background_power_w", background_power_w)
-    if gain not in (None, "auto"):
-        gain = positive("gain", gain)
-    if optical_density not in (None, "auto"):
-        optical_density = in_range("optical_density", optical_density, 0, DENSEST)
-    limit = RenderOptions(max_time=max_time).max_time or math.inf
+    sky, limit = background_power_w, max_time or math.inf
     receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render

@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,15 +18,16 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
+    corrections_for,
     summarize_depths,
     usual_attenuation,
 )
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer, relative_error
+from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 
@@ -34,6 +35,22 @@ _LOG = logging.getLogger(__name__)
 
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
+
+#: Parameters of tables of an instrument.
+InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
+Winds = Annotated[
+    Numbers, Option("Wind speeds; 0 for a level sea with ripples", 0, None, "m/s", ascending=True, form="N,N,...")
+]
+Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
+Depths = Annotated[Numbers, Option("Depths of the bottom", 0, None, "m", above=True, ascending=True, form="N,N,...")]
+SeaScene = Annotated[str, Option("Scene whose sea, water and bottom count")]
+OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrument's")]
+Places = Annotated[int, Option("Random places of a sea with waves, or renders of a level sea", 2, 10_000)]
+Records = Annotated[int, Option("Records with noise of each place", 1, 10_000)]
+SeaTime = Annotated[
+    float | None, positive_option("Render no sea after this many seconds; those left out are NaN in the table")
+]
+SeaSeed = Annotated[int, Option("Seed of the random numbers", 0, 2**31)]
 
 #: Wavelength of their tables [nm].
 _WAVELENGTH = 532.0
@@ -81,42 +98,54 @@ _SLOPES = {
 }
 
 
+@checked
 def depth_bias(
-    instrument: str,
+    instrument: InstrumentName,
     params: Mapping[str, Any] | None = None,
     *,
-    scene: str = "table1",
-    angles_deg: Sequence[float] | None = None,
-    winds: Sequence[float] = (0.0, 3.0, 6.0),
-    ripples: Sequence[float] = (3.0, 6.0),
-    waters: Sequence[str] = WATERS,
-    depths: Sequence[float] = (3.0, 6.0, 10.0),
+    angles_deg: Annotated[
+        Numbers | None,
+        Option(
+            "Angles from nadir; the instrument's and 5 more by default",
+            *(0, None, "degrees"),
+            ascending=True,
+            form="N,N,...",
+            flag="--angles",
+        ),
+    ] = None,
+    winds: Winds = (0.0, 3.0, 6.0),
+    ripples: Annotated[
+        Numbers,
+        Option("Winds whose ripples level seas have", 0, None, "m/s", above=True, ascending=True, form="N,N,..."),
+    ] = (3.0, 6.0),
+    waters: Waters = WATERS,
+    depths: Depths = (3.0, 6.0, 10.0),
+    scene: SeaScene = "table1",
     estimators: Sequence[str] = ESTIMATORS,
-    receiver: str | None = None,
-    shots: int = 12,
-    records: int = 5,
-    target_error: float = 0.05,
-    seed: int = 1,
-    corrections: xr.Dataset | None = None,
-    max_time: float | None = None,
+    receiver: OwnReceiver = None,
+    shots: Places = 12,
+    records: Records = 5,
+    target_error: Annotated[
+        float, Option("Relative standard error of a render over waves; of a level sea 0.6 of it", 0, 1, above=True)
+    ] = 0.05,
+    corrections: Annotated[
+        xr.Dataset | str | None,
+        Option("Table of another seed to also correct the depths by; auto for the shipped one", form="FILE"),
+    ] = None,
+    max_time: SeaTime = None,
+    seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Measure the errors of depths in an instrument's records, by angle, wind, water and depth.
 
     Parameters
     ----------
-    instrument
-        Name of the instrument.
     params, scene
         A scene with the parameters ``aim_x``, ``aim_y``, ``off_nadir_deg``, ``wind_speed``, ``spectrum``, ``jerlov``
         and ``bottom_depth``, and further parameters.
     angles_deg
         Angles from nadir [degree], ascending; by default that of the instrument, and 5 degrees more,
         or less near grazing.
-    winds
-        Wind speeds [m/s], ascending, at least 0; 0 for level seas with ripples.
-    ripples
-        Winds whose ripples the level seas have [m/s], above 0, ascending.
     waters
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
@@ -125,18 +154,14 @@ def depth_bias(
         NaN.
     estimators
         Estimators of `echo_table.extract`.
-    receiver
-        A receiver as of `receiver_files.receiver`; by default that of the instrument.
     shots, records
         Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
         each, 1 to 10 000.
     target_error
         Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
         have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
-    seed
-        Seed of places, seas and noise, at least 0.
     corrections
-        A former table, to correct the depths by.
+        A former table, its file, or ``auto`` for the shipped one, to correct the depths by.
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
         out are NaN, and the attribute ``seas_left_out`` has their number.
@@ -168,26 +193,18 @@ def depth_bias(
     usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
     other = usual + (_FURTHER if usual < _GRAZING else -_FURTHER)
     axes = {
-        "off_nadir_deg": finite_array("angles_deg", sorted((usual, other)) if angles_deg is None else angles_deg),
-        "wind_speed": finite_array("winds", winds),
+        "off_nadir_deg": np.asarray(sorted((usual, other)) if angles_deg is None else angles_deg, float),
+        "wind_speed": np.asarray(winds, float),
         "water": np.asarray(waters, dtype=str),
-        "depth": finite_array("depths", depths),
+        "depth": np.asarray(depths, float),
     }
-    of_level = finite_array("ripples", ripples)
-    for name in ("off_nadir_deg", "wind_speed"):
-        if axes[name].size == 0 or np.any(np.diff(axes[name]) <= 0) or axes[name][0] < 0:
-            raise UserError(f"{name} = {axes[name].tolist()} must be numbers of at least 0 that ascend")
-    for name, values in (("depth", axes["depth"]), ("ripples", of_level)):
-        if values.size == 0 or np.any(np.diff(values, prepend=0.0) <= 0):
-            raise UserError(f"{name} = {values.tolist()} must be numbers above 0 that ascend")
+    of_level = np.asarray(ripples, float)
+    former = corrections_for(instrument, corrections) if isinstance(corrections, str) else corrections
     waves = axes["wind_speed"][axes["wind_speed"] > 0]
     if waves.size < axes["wind_speed"].size:
         axes["wind_speed"] = np.concatenate([np.zeros_like(of_level), waves])
         waves = np.concatenate([of_level, waves])
-    shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
-    seed = integer("seed", seed, 0, 2**31)
-    target_error = relative_error("target_error", target_error)
-    limit = RenderOptions(max_time=max_time).max_time or math.inf
+    limit = max_time or math.inf
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
     began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
     pixels: list[str] = []
@@ -224,7 +241,7 @@ def depth_bias(
                     raise KeyboardInterrupt(f"interrupted after {number} of {total} renders, and none is kept.")
                 recorded = detect_waveforms(rendered, receiver or instrument, records, seed)
                 _check_counts(recorded)
-                cells[place] = _cell(recorded, estimators, corrections)
+                cells[place] = _cell(recorded, estimators, former)
                 pixels = [str(name) for name in recorded["pixel"].values]
                 geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
         if progress is not None:

@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -16,12 +16,22 @@ from mitransient_lidar.analysis.detection import trials
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, integer, non_negative
+from mitransient_lidar.core.options import (
+    RECEIVERS,
+    BackgroundPower,
+    Numbers,
+    Option,
+    Scene,
+    Seed,
+    TargetId,
+    checked,
+    positive_option,
+)
+from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
@@ -32,23 +42,36 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
+@checked
 @alone
 def detect(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    receiver: ReceiverChain | str = "apd",
-    pfa: float = 1e-3,
-    pd: float = 0.9,
-    depths: Sequence[float] = (),
-    shots: int = 10_000,
-    clutter: int = 0,
-    renders: int = 4,
-    target_id: str = "target",
-    background_power_w: float = 0.0,
-    passes: int = 16,
-    max_time: float | None = None,
-    seed: int = 0,
+    receiver: Annotated[ReceiverChain | str, Option(RECEIVERS)] = "apd",
+    pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
+    pd: Annotated[
+        float, Option("Required probability of detection (above the probability of false alarm, below 1)")
+    ] = 0.9,
+    depths: Annotated[
+        Numbers, Option("Further depths of the target", 0, unit="m", above=True, ascending=True, form="N,N,...")
+    ] = (),
+    shots: Annotated[int, Option("Number of simulated shots with and without the target", 100, 100_000)] = 10_000,
+    clutter: Annotated[
+        int, Option("Number of seas whose differences count as noise, at least 4, or 0 for one known sea", 0, 1000)
+    ] = 0,
+    renders: Annotated[int, Option("Renders of one sea, whose spread gives the intervals", 3, 1000)] = 4,
+    target_id: TargetId = "target",
+    background_power_w: BackgroundPower = 0.0,
+    passes: Annotated[int, Option("Number of independent passes of each render", 16, 100_000)] = 16,
+    max_time: Annotated[
+        float | None,
+        positive_option(
+            "Begin no further depth of --depths after this many seconds, and leave it out; the scene's own depth is "
+            "always rendered"
+        ),
+    ] = None,
+    seed: Seed = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -56,12 +79,10 @@ def detect(
 
     Parameters
     ----------
-    scene, params, target_id, integrator
+    scene, params, integrator
         As for `target_signal.target_signal`, with at most 16 pixels.
     receiver
         Detector and electronics of every pixel, or a name in `physics.receiver.presets.RECEIVERS`.
-    pfa, pd
-        Required probabilities of false alarm, 1e-12 to 0.5, and of detection, above `pfa` and below 1.
     depths
         Further depths of the target to render [m], increasing: values of the parameter ``target_depth`` of the scene.
     shots
@@ -71,15 +92,9 @@ def detect(
         4 to 1000.
     renders
         Independent renders of the scene without clutter, 3 to 1000, from whose spread the intervals are estimated.
-    background_power_w
-        Steady power on each pixel [W], at least 0.
-    passes
-        Passes of each render, 16 to 100 000.
     max_time
         Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
         attribute ``depths_left_out`` has those that are left out as text, and a warning names them.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every render.
 
@@ -119,19 +134,13 @@ def detect(
     groups of renders or seas, and exact binomial ones for rates of random shots, given the rendered light and seas.
     """
     chain = receiver_of("receiver", receiver).default.chain
-    in_range("pfa", pfa, 1e-12, 0.5)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
-    shots = integer("shots", shots, 100, 100_000)
     if clutter != 0 and not 4 <= clutter <= 1000:
         raise UserError(f"clutter = {clutter} must be 0 or lie between 4 and 1000")
-    renders = int(clutter) or integer("renders", renders, 3, 1000)
-    seed = integer("seed", seed, 0, 2**53)
-    sky = non_negative("background_power_w", background_power_w)
-    if list(depths) != sorted(set(depths)) or any(not (math.isfinite(d) and d > 0) for d in depths):
-        raise UserError(f"depths = {list(depths)} must be above 0 m and increase")
+    renders, depths, sky = clutter or renders, list(depths), background_power_w
     if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
-    limit = RenderOptions(max_time=max_time).max_time or math.inf
+    limit = max_time or math.inf
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(scene, params)

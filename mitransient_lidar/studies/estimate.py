@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer
+from mitransient_lidar.core.options import Instrument, Option, Scene, Seed, checked
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
@@ -58,25 +59,22 @@ _BELOW_ONE = np.float32(1 - 2**-24)
 _ORIGINS = ("surface", "water", "bottom")
 
 
+@checked
 @alone
 def estimate(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    instrument: str | None = None,
-    paths: int = 2**13,
-    seed: int = 0,
+    instrument: Instrument = None,
+    paths: Annotated[int, Option("Number of paths of the light", 64, _MOST_PATHS)] = 2**13,
+    seed: Seed = 0,
 ) -> xr.Dataset:
     """Estimate the waveforms of a scene in about a second, as a first look and a second opinion.
 
     Parameters
     ----------
-    scene, params, instrument
+    scene, params
         As for `rendering.render.render`.
-    paths
-        Number of paths, 64 to 2^22.
-    seed
-        Seed of the random numbers, at least 0.
 
     Returns
     -------
@@ -102,7 +100,6 @@ def estimate(
     result is the mean over seas. In the turbid layers of ``fig15_2x2``, c of 0.9 and 0.5, the bottom had 3 to 13 % too
     little.
     """
-    paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.transport.probe import Probe

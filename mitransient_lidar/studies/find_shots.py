@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.core.options import Option, Scene, checked, positive_option
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
@@ -53,26 +55,33 @@ class RenderedShots:
     pixel_count: int
 
 
+@checked
 @alone
 def find_shots(
-    scene: Any, params: Mapping[str, Any] | None = None, *, slope_sigmas: float = 2.0, count: int = 1
-) -> list[Shot]:
-    """Find places of each kind of slope on the sea of a scene, within 256 m of its origin.
+    scene: Scene,
+    params: Mapping[str, Any] | None = None,
+    *,
+    at: Annotated[Sequence[tuple[float, float]], Option("A place, instead of a search", unit="m", form="X,Y")] = (),
+    slope_sigmas: Annotated[float, positive_option("Slopes to find, in standard deviations")] = 2.0,
+    count: Annotated[int, Option("Places of each kind", 1, 100)] = 1,
+    waveforms: Annotated[bool, Option("Also render the shots")] = True,
+    max_time: Annotated[
+        float | None, positive_option("Stop before this many seconds, with fewer passes or waveforms")
+    ] = None,
+    progress: ProgressCallback | None = None,
+) -> RenderedShots:
+    """Find places of each kind of slope on the sea of a scene, within 256 m of its origin, and render them.
 
     Where the lidar's aim is more than 250 m from the origin, they are about the aim.
 
     Parameters
     ----------
-    scene, params
-        As for `rendering.render.render`.
-    slope_sigmas
-        Required slopes in standard deviations of the mean slope over a footprint, greater than 0.
-    count
-        Places of each kind, 1 to 100.
+    scene, params, waveforms, max_time, progress
+        As for `render_found_shots`.
 
     Returns
     -------
-    list of Shot
+    RenderedShots
         Shots by kind, those with the nearest slopes first.
 
     Raises
@@ -80,19 +89,23 @@ def find_shots(
     UserError
         If the scene is invalid or has no waves, a number is out of range, or the sea has no such slopes.
     """
-    slope_sigmas, count = positive("slope_sigmas", slope_sigmas), integer("count", count, 1, 100)
     loaded = open_scene(scene, params).scene
     sea = SeaMap.of_scene(loaded)
-    apart = 4 * footprint(transmitter_of(loaded))[1]
-    return [shot for kind in SLOPE_KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
+    if len(at):
+        shots = [Shot(f"shot {number}", x, y, *sea.slope_at(x, y)) for number, (x, y) in enumerate(at, start=1)]
+    else:
+        apart = 4 * footprint(transmitter_of(loaded))[1]
+        shots = [shot for kind in SLOPE_KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
+    return render_found_shots(scene, shots, params, waveforms=waveforms, max_time=max_time, progress=progress)
 
 
-@alone
-def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[str, Any] | None = None) -> list[Shot]:
-    """Return shots at given places (x, y) [m] of the sea of a scene; raises as `find_shots`."""
-    loaded = open_scene(scene, params).scene
-    sea = SeaMap.of_scene(loaded)
-    return [Shot(f"shot {number}", x, y, *sea.slope_at(x, y)) for number, (x, y) in enumerate(places, start=1)]
+def describe_found_shots(rendered: RenderedShots) -> list[str]:
+    """Return the lines of a table of places and slopes."""
+    lines = [f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}"]
+    for shot in rendered.shots:
+        along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
+        lines.append(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
+    return lines
 
 
 @alone

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -24,13 +24,14 @@ from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Instrument, Option, checked, positive_option
 from mitransient_lidar.core.parameters.water import LAYERED_WATER
-from mitransient_lidar.core.validation import integer, shown
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.rendering.options import MOST_PASSES, RenderOptions
+from mitransient_lidar.rendering.options import MOST_PASSES
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
 
@@ -46,24 +47,53 @@ _BIN_WIDTH = "bin_width_ns"
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
 
 
+@checked
 def fit(
     source: xr.Dataset | str | os.PathLike[str],
-    scene: str | os.PathLike[str] | Callable[[Mapping[str, float]], xr.Dataset] | None = None,
-    free: Sequence[str] = (),
+    scene: Annotated[
+        str | os.PathLike[str] | Callable[[Mapping[str, float]], xr.Dataset] | None,
+        Option("Name or XML file of the scene; by default that of the result"),
+    ] = None,
+    free: Annotated[
+        Sequence[str], Option("Free parameters of the scene, and bandwidth_mhz of a receiver", form="NAME,NAME,...")
+    ] = (),
     *,
     params: Mapping[str, Any] | None = None,
-    instrument: str | None = None,
-    start: Mapping[str, float] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    free_scale: bool | None = None,
-    free_time: bool | None = None,
-    noise: float | None = None,
-    receiver: str | os.PathLike[str] | ReceiverChain | None = None,
-    scale_errors: bool = False,
-    passes: int | None = None,
-    seed: int | None = None,
-    most_renders: int = 60,
-    max_time: float | None = None,
+    instrument: Instrument = None,
+    start: Annotated[
+        Mapping[str, float] | None, Option("Start of a free parameter. Repeatable", form="NAME=VALUE")
+    ] = None,
+    bounds: Annotated[
+        Mapping[str, tuple[float, float]] | None, Option("Bounds of a free parameter. Repeatable", form="NAME=LOW:HIGH")
+    ] = None,
+    free_scale: Annotated[
+        bool | None,
+        Option("Fit the scale of the waveforms, as by default of CSV files", flag="--free-scale/--fixed-scale"),
+    ] = None,
+    free_time: Annotated[
+        bool | None, Option("Fit the time offset, as by default of CSV files", flag="--free-time/--fixed-time")
+    ] = None,
+    noise: Annotated[
+        float | None, positive_option("Standard deviation of every sample, in the unit of the waveforms")
+    ] = None,
+    receiver: Annotated[
+        str | os.PathLike[str] | ReceiverChain | None,
+        Option(
+            "Receiver of a signal, by default the one that it names. Of a CSV file, the one whose response and noise "
+            "the model gets: a preset, an instrument or a .toml file"
+        ),
+    ] = None,
+    scale_errors: Annotated[bool, Option("Multiply the covariance by the reduced chi-squared")] = False,
+    passes: Annotated[
+        int | None, Option("Passes of each render, by default by the errors of the waveforms", 2, MOST_PASSES)
+    ] = None,
+    max_time: Annotated[
+        float | None, positive_option("Try no step after this many seconds, so that the fit may not converge")
+    ] = None,
+    seed: Annotated[
+        int | None, Option("Seed of all renders, by default not that of the result", -(2**63), 2**63 - 1)
+    ] = None,
+    most_renders: Annotated[int, Option("Renders after which the fit ends without convergence", 2, 10_000)] = 60,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Fit parameters of a scene to waveforms by weighted nonlinear least squares.
@@ -88,20 +118,14 @@ def fit(
     free_scale, free_time
         Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
         file, whose unit and time zero are unknown.
-    noise
-        Standard deviation of every sample, above 0, in the unit of the waveforms, instead of their own errors.
     receiver
         Receiver of a recorded signal, by default the one that it names; or of a CSV file, whose response and noise the
         model gets (`analysis.information.measured.measured`).
-    scale_errors
-        Whether to multiply the covariance by the reduced chi-squared.
     passes
         Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
         a tenth of that of the waveforms, 16 to 256.
     seed
         Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
-    most_renders
-        Renders after which the fit ends without convergence, 2 to 10000.
     max_time
         Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
         warning. The start is always rendered.
@@ -120,7 +144,7 @@ def fit(
         If the waveforms, the scene, a parameter or an option is invalid; or the seed is that of the result, whose noise
         the model would repeat.
     """
-    limit, began = RenderOptions(max_time=max_time).max_time or math.inf, time.perf_counter()
+    limit, began = max_time or math.inf, time.perf_counter()
     names = _names(free)
     if unknown := [name for name in start or {} if name not in (*names, SCALE, TIME_OFFSET)]:
         raise UserError(f"start of {unknown[0]}: it is not one of the free parameters {', '.join(names)}")
@@ -144,7 +168,7 @@ def fit(
         problem = WaveformFit(found, own, starts, bounds, **options)
         problem.approach(most_renders=most_renders, until=began + limit)
         return _run(problem, began, limit, most_renders, scale_errors)
-    given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)
+    given = passes
     attributes = source.attrs if isinstance(source, xr.Dataset) else {}
     coarse = min(given or _FEWEST_PASSES, _COARSE_PASSES)
     model = _RenderedModel(

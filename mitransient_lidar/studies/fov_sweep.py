@@ -7,16 +7,16 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.core.options import Numbers, Option, Scene, Seed, checked, positive_option
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone
@@ -25,7 +25,6 @@ from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, ope
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 
 if TYPE_CHECKING:
@@ -35,17 +34,27 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
+@checked
 @alone
 def fov_sweep(
-    scene: Any,
-    fov_mrad: npt.ArrayLike,
+    scene: Scene,
+    fov_mrad: Annotated[
+        Numbers, Option("Full angles of the fields of view", 0, unit="mrad", above=True, form="N,N,...")
+    ] = (2, 5, 10, 20, 50, 100),
     params: Mapping[str, Any] | None = None,
     *,
-    min_depth: float = 1.0,
-    max_depth: float = 5.0,
-    passes: int = 48,
-    max_time: float | None = None,
-    seed: int = 0,
+    min_depth: Annotated[
+        float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
+    ] = 1.0,
+    max_depth: Annotated[
+        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
+    ] = 5.0,
+    passes: Annotated[int, Option("Number of independent passes of each render", 4, 10_000)] = 48,
+    max_time: Annotated[
+        float | None,
+        positive_option("Stop before this many seconds, without the widest fields of view, but with the narrowest one"),
+    ] = None,
+    seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Measure the attenuation of the column signal as a function of the field of view.
@@ -55,17 +64,11 @@ def fov_sweep(
     scene, params
         As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
         ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
-    fov_mrad
-        Full angles of the circles [mrad], above 0, in any order.
     min_depth, max_depth
         Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
-    passes
-        Independent passes for each field of view, 4 to 10 000.
     max_time
         Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
         out, with a warning; the narrowest one is always rendered.
-    seed
-        Seed of the random numbers, at least 0.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -105,11 +108,7 @@ def fov_sweep(
     the noise. Errors of neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
     which include the correlation of the bins.
     """
-    passes, seed = integer("passes", passes, 4, 10_000), integer("seed", seed, 0, 2**53)
-    limit = RenderOptions(max_time=max_time).max_time
-    fields = np.unique(finite_array("fov_mrad", fov_mrad))
-    if fields.size == 0 or fields[0] <= 0:
-        raise UserError(f"fov_mrad = {fields.tolist()} must hold at least one angle, each greater than 0")
+    fields = np.unique(fov_mrad)
     session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -118,7 +117,7 @@ def fov_sweep(
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
     water = _water(lidar, float(min_depth), float(max_depth))
     _check_solids(lidar, geometry, edge, float(max_depth))
-    energy, log = _render(session, fields, Goal(passes=passes, max_time=limit), seed, progress)
+    energy, log = _render(session, fields, Goal(passes=passes, max_time=max_time), seed, progress)
     left_out = ", ".join(f"{field:g}" for field in fields[len(energy) :])
     if left_out:
         logger.warning("fields of view of %s mrad are left out: their passes are not complete", left_out)

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.validation import integer
+from mitransient_lidar.core.options import FewerPasses, Option, Scene, Seed, checked
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
 
 _REVERSALS = ("one", "several")
 
 
+@checked
 @alone
 def scattering_orders(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    orders: int = 8,
-    passes: int = 32,
-    max_time: float | None = None,
-    seed: int = 0,
+    orders: Annotated[int, Option("Number of orders to separate", 1, MOST_ORDERS)] = 8,
+    passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 32,
+    max_time: FewerPasses = None,
+    seed: Seed = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -44,12 +44,6 @@ def scattering_orders(
         As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
-    passes
-        Number of passes, 2 to 100 000.
-    seed
-        Seed of the random numbers, 0 to 2^53.
-    max_time
-        Time after which no pass begins [s], above 0; at least two passes are made.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -67,9 +61,6 @@ def scattering_orders(
     UserError
         If the scene or a parameter is invalid or out of range.
     """
-    orders = integer("orders", orders, 1, MOST_ORDERS)
-    passes, options = integer("passes", passes, 2, 100_000), RenderOptions(max_time=max_time)
-    seed = integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
@@ -87,7 +78,7 @@ def scattering_orders(
         power.add(waveform(histogram, axis.bin_width_ns, kernel))
         return record.edge_loss
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=options.max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {

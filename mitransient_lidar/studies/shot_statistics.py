@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,40 +10,20 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer
-from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import lidar_geometry
-
-_PASSES = 8
 
 #: Half width of the gates about the echoes of a level sea [ns].
 _HALF_GATE_NS = 10.0
 
 
-def shot_statistics(
-    scene: Any,
-    params: Mapping[str, Any] | None = None,
-    *,
-    count: int = 200,
-    seed: int = 1,
-    max_time: float | None = None,
-    progress: ProgressCallback | None = None,
-) -> xr.Dataset:
-    """Render shots at random places of one sea and measure their echoes.
+def shot_statistics(series: xr.Dataset) -> xr.Dataset:
+    """Measure the echoes of shots at places of one sea, for their dependence on its slopes.
 
     Parameters
     ----------
-    scene, params
-        An XML scene with the parameters ``aim_x`` and ``aim_y``.
-    count
-        Number of shots, 2 to 100 000.
-    seed
-        Seed of the places, at least 0.
-    max_time
-        Time after which no shots begin [s], above 0; the result has fewer shots then.
-    progress
-        Called with a `passes.Progress` after every shot.
+    series
+        A result of `rendering.shots.series.render_shots` of a scene with the parameter ``bottom_depth``.
 
     Returns
     -------
@@ -57,10 +36,8 @@ def shot_statistics(
     Raises
     ------
     UserError
-        If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
+        If the scene has no bottom, or the record lacks an echo.
     """
-    count, seed = integer("count", count, 2, 100_000), integer("seed", seed, 0, 2**53)
-    series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, max_time=max_time, progress=progress)
     times = _echo_times(series)
     rows: list[dict[str, Any]] = []
     for number in range(series.sizes["shot"]):
@@ -85,7 +62,7 @@ def _echo_times(shot: xr.Dataset) -> dict[str, float]:
     """Return the times of surface and bottom echo of a level sea [ns]."""
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
-        raise UserError("shot-statistics needs a scene with a sea and the parameter bottom_depth")
+        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
     geometry = lidar_geometry(shot.attrs)
     return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 
@@ -169,6 +146,12 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
         "sideways": (across, (surface[:, 1] - surface[:, 0]).values),
         "depth": (along, deeper),
     }
+
+
+def describe_statistics(shots: xr.Dataset) -> list[str]:
+    """Return a line for each of the `slope_correlations`; raises as `slope_effects`."""
+    found = slope_correlations(shots).items()
+    return [f"correlation of {name} with the slope: {value:+.3f}" for name, value in found]
 
 
 def slope_correlations(shots: xr.Dataset) -> dict[str, float]:

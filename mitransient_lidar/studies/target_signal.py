@@ -5,20 +5,20 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.core.options import FewerPasses, Option, Scene, TargetId, checked, positive_option
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.transport.solids import shape_groups
 
@@ -29,20 +29,28 @@ _HALF_GATE = 1.0
 _GROUPS = 16
 
 
+@checked
 @alone
 def target_signal(
-    scene: Any,
+    scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    target_id: str = "target",
-    passes: int = 64,
-    max_time: float | None = None,
-    seed: int = 0,
+    target_id: TargetId = "target",
+    grid: Annotated[int, Option("Places of the target along each axis", 1, 15)] = 1,
+    max_offset: Annotated[float, positive_option("Largest offset of these places along each axis", "m")] = 2.0,
+    passes: Annotated[int, Option("Number of independent passes of each render", _GROUPS, 100_000)] = 64,
+    max_time: Annotated[
+        float | None,
+        positive_option(
+            "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more"
+        ),
+    ] = None,
+    seed: Annotated[int, Option("Seed of the random numbers", -(2**63), 2**63 - 1)] = 0,
     integrator: Any = None,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render a scene with and without a target, and measure their difference.
+    """Render a scene with and without a target, and measure their difference; with a `grid`, at many places.
 
     Both renders use the same random numbers: paths that do not meet the target are equal, so that the difference has
     much smaller errors than either record. It is the echo of the target, and behind it the shadow in the water and on
@@ -50,14 +58,11 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, seed, integrator
+    scene, params, integrator
         As for `rendering.render.render`.
-    target_id
-        Id of the target's shape.
-    passes
-        Number of passes of each render, 16 to 100 000.
-    max_time
-        Time after which no pass begins [s], above 0; at least 16 passes are made.
+    grid, max_offset
+        Places of the target along each axis, and their largest offset from that in the scene, for the result of
+        `target_map` on a square.
     axis
         Time bins instead of automatic ones.
     progress
@@ -86,7 +91,12 @@ def target_signal(
     sum(w E) / sqrt(sum(w^2 B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of
     detectabilities are ratios of signal-to-noise ratios for every detector.
     """
-    passes, options = integer("passes", passes, _GROUPS, 100_000), RenderOptions(max_time=max_time, seed=seed)
+    if grid > 1:
+        offsets = np.linspace(-max_offset, max_offset, grid).tolist()
+        options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed, "integrator": integrator}
+        return target_map(
+            scene, params, x=offsets, y=offsets, max_time=max_time, axis=axis, progress=progress, **options
+        )
     session = open_scene(scene, params)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
@@ -104,7 +114,7 @@ def target_signal(
         pairs.append((records[0].histogram.energy(), records[1].histogram.energy()))
         return records[0].edge_loss
 
-    goal = Goal(passes=passes, max_time=options.max_time)
+    goal = Goal(passes=passes, max_time=max_time)
     log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)
     result = _measure(np.array(pairs), lidar.axis, kernel, pulse.fwhm_ns)
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
@@ -112,6 +122,7 @@ def target_signal(
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 
+@checked
 @alone
 def target_map(
     scene: Any,
@@ -119,7 +130,7 @@ def target_map(
     *,
     x: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
     y: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
-    max_time: float | None = None,
+    max_time: FewerPasses = None,
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> xr.Dataset:
@@ -157,11 +168,11 @@ def target_map(
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
     places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
     cells: list[xr.Dataset] = []
-    limit, began = RenderOptions(max_time=max_time).max_time, time.perf_counter()
+    began = time.perf_counter()
     for place_x, place_y in itertools.product(*places):
         moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
-        if limit is not None:
-            left = max(limit - (time.perf_counter() - began), 1e-3)
+        if max_time is not None:
+            left = max(max_time - (time.perf_counter() - began), 1e-3)
             options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
         cell = target_signal(scene, moved, **options).drop_dims("time")
         if cell.attrs.get("interrupted"):
@@ -173,12 +184,6 @@ def target_map(
     lines = [xr.concat(row, "target_y", combine_attrs="drop_conflicts") for row in rows]
     maps = xr.concat(lines, "target_x", combine_attrs="drop_conflicts")
     return maps.assign_coords(target_x=places[0], target_y=places[1])
-
-
-def grid_offsets(count: int, max_offset: float) -> list[float]:
-    """Return evenly spaced offsets [m] for `target_map`, `count` (1 to 15) from -`max_offset` to `max_offset`."""
-    count, reach = integer("grid", count, 1, 15), positive("max_offset", max_offset)
-    return np.linspace(-reach, reach, count).tolist() if count > 1 else [0.0]
 
 
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
@@ -287,8 +292,10 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
 def describe_target(result: xr.Dataset) -> list[str]:
     """Return the lines of a table of a result of `target_signal`: gate, heading, pixels, and combinations of pixels.
 
-    The relative SNR is the detectability over that of the sum.
+    The relative SNR is the detectability over that of the sum. Of a map: shares, contrasts and gain by place.
     """
+    if "target_x" in result.dims:
+        return _describe_map(result)
     attributes = result.attrs
     sum_echo, sum_snr = (float(result[f"combined_{name}"][0]) for name in ("echo", "detectability"))
     lines = [
@@ -312,8 +319,7 @@ def describe_target(result: xr.Dataset) -> list[str]:
     return lines
 
 
-def describe_map(maps: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `target_map`: shares, contrasts and gain of the weights by place."""
+def _describe_map(maps: xr.Dataset) -> list[str]:
     names = [str(name) for name in maps["pixel"].values]
     share = 100 * maps["echo"] / maps["combined_echo"].sel(combination="sum")
     snr = maps["combined_detectability"]

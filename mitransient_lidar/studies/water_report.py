@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 from xml.sax.saxutils import quoteattr
 
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water import seawater, water_types
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_water
@@ -44,13 +46,28 @@ _TITLES = {
 }
 
 
+@checked
 def describe_water(
-    kind: str,
-    value: str | None,
-    wavelength_nm: float,
-    temperature: float,
-    salinity: float,
-    tolerance: float = DEFAULT_TOLERANCE,
+    kind: Annotated[
+        str, Option("jerlov, chlorophyll, kd, secchi, petzold, profile or pure", form="KIND", is_argument=True)
+    ],
+    value: Annotated[
+        str | None,
+        Option(
+            "Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m], Petzold's clear, coastal or turbid, or a "
+            "profile's file: .csv, .txt, .dat, .tsv or .nc",
+            form="VALUE",
+            is_argument=True,
+        ),
+    ] = None,
+    wavelength_nm: Annotated[
+        float, Option("Wavelength, with less of Jerlov's and Petzold's waters", 400, 700, "nm", flag="--wavelength")
+    ] = 532.0,
+    temperature: Annotated[float, Option("Temperature, for the indices", 0, 30, "degrees Celsius")] = 20.0,
+    salinity: Annotated[float, Option("Salinity, for the indices", 0, 40, "per mille")] = 35.0,
+    tolerance: Annotated[
+        float, Option("Largest relative error of layers that replace a profile", 1e-5, 0.5)
+    ] = DEFAULT_TOLERANCE,
 ) -> list[str]:
     """Return lines with the properties of a water and the parameters to render it.
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.target_signal import describe_map, describe_target, target_map, target_signal
+from mitransient_lidar.studies.target_signal import describe_target, target_map, target_signal
 
 NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
@@ -82,7 +82,7 @@ def test_map_moves_the_target():
     assert np.all(far.sel(target_x=2.0) > far.sel(target_x=0.0) + 0.2)
     left = maps["echo"].sel(pixel=["red", "blue"]).sum("pixel") / maps["combined_echo"].sel(combination="sum")
     assert np.all(left.sel(target_y=1.0) > left.sel(target_y=-1.0) + 0.3)
-    assert len(describe_map(maps)) == 5
+    assert len(describe_target(maps)) == 5
 
 
 @pytest.mark.long

@@ -49,7 +49,7 @@ def campaign(tmp_path_factory):
 def quick(campaign, tmp_path_factory):
     """Store of the quick campaign, rendered in two shards."""
     path = tmp_path_factory.mktemp("campaign") / "quick.zarr"
-    from mitransient_lidar.campaigns.sweep import sweep
+    from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 
-    sweep(campaign, path, workers=1, shard_size=6)
+    run_campaign(campaign, path, workers=1, shard_size=6)
     return path

@@ -26,7 +26,8 @@ from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
-from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
+from mitransient_lidar.campaigns.sweep import campaign as run_campaign
+from mitransient_lidar.campaigns.sweep import render_row, resume
 from mitransient_lidar.campaigns.versions import FILES, check_versions
 from mitransient_lidar.core.errors import UserError
 
@@ -54,7 +55,7 @@ def test_everything_that_can_be_kept(tmp_path):
     told = []
     path = tmp_path / "full.zarr"
     campaign = write_toml(tmp_path / "full.toml", {"scene": str(few_paths("fig13_2x2", tmp_path)), **FULL})
-    data = sweep(campaign, path, workers=1, progress=told.append).load()
+    data = run_campaign(campaign, path, workers=1, progress=told.append).load()
     assert (told[-1].done, told[-1].planned, told[-1].failed, told[-1].unit) == (3, 3, 1, "run")
     assert data["status"].values.tolist() == [DONE, FAILED, DONE]
     assert data["error"].values.tolist()[::2] == ["", ""]
@@ -98,11 +99,11 @@ def test_everything_that_can_be_kept(tmp_path):
         np.testing.assert_array_equal(alone["waveform"].values.astype(np.float32), stored.values)
     assert float(alone.attrs["scene.attenuation"]) == 0.35
     # Analysis commands read it, also from the campaign's file.
-    out = run("sweep", campaign, "--row", 2, "-o", tmp_path / "run.nc", "-q")
+    out = run("campaign", campaign, "--row", 2, "-o", tmp_path / "run.nc", "-q")
     assert out.exit_code == 0, out.stderr
     np.testing.assert_array_equal(results.open(tmp_path / "run.nc")["waveform"], alone["waveform"])
-    assert run("waveforms", tmp_path / "run.nc", "--table").exit_code == 0
-    out = run("sweep", path, "--show", "-o", tmp_path / "run.png")
+    assert run("echoes", tmp_path / "run.nc", "--table").exit_code == 0
+    out = run("campaign", path, "--show", "-o", tmp_path / "run.png")
     assert out.exit_code == 0, out.stderr
     assert "3 runs: 2 done, 1 failed, 0 planned\nfailed 1, the first run 1: wind_speed = -6" in out.stdout
     assert (tmp_path / "run.png").stat().st_size > 20_000
@@ -123,8 +124,8 @@ def test_opening_needs_no_consolidated_metadata(quick):
 
 @pytest.mark.long
 def test_same_bits_whatever_shards_workers_and_order(campaign, tmp_path):
-    first = sweep(campaign, tmp_path / "first.zarr", workers=2, shard_size=6).load()
-    other = sweep(campaign, tmp_path / "other.zarr", workers=1, shard_size=17).load()
+    first = run_campaign(campaign, tmp_path / "first.zarr", workers=2, shard_size=6).load()
+    other = run_campaign(campaign, tmp_path / "other.zarr", workers=1, shard_size=17).load()
     for name in first.variables:
         np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))
 
@@ -133,7 +134,7 @@ def test_same_bits_whatever_shards_workers_and_order(campaign, tmp_path):
 def test_a_complete_campaign_is_left_as_it_is(campaign, quick):
     before = files_of(quick)
     resume(quick, workers=1)
-    sweep(campaign, quick, workers=1)
+    run_campaign(campaign, quick, workers=1)
     assert files_of(quick) == before
 
 
@@ -141,7 +142,7 @@ def test_a_complete_campaign_is_left_as_it_is(campaign, quick):
 def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(campaign, quick, tmp_path):
     path = tmp_path / "killed.zarr"
     file = write_toml(tmp_path / "quick.toml", campaign)
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-o", str(path)]
+    command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-o", str(path)]
     command += ["--workers", "1", "--shard-size", "6"]
     mark = {"MARK_OF_TEST": str(tmp_path)}
     with subprocess.Popen(
@@ -164,7 +165,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(campaign, qu
     finished = [one for one in Store(path).shards if (status[Store(path).runs_of(one)] == DONE).all()]
     chunks = [path / "waveform" / "c" / str(one) / "0" / "0" for one in finished]
     written = [chunk.stat().st_mtime_ns for chunk in chunks]
-    out = run("sweep", path, "--workers", 2, "-q")
+    out = run("campaign", path, "--workers", 2, "-q")
     assert out.exit_code == 0, out.stderr
     assert [chunk.stat().st_mtime_ns for chunk in chunks] == written
     if significance.seed_shift == 0:
@@ -189,7 +190,7 @@ def shard_processes(mark):
 @pytest.mark.long
 def test_interruption_keeps_what_is_written(campaign, tmp_path):
     path, file = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", campaign)
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-o", str(path)]
+    command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-o", str(path)]
     with subprocess.Popen(
         [*command, "--workers", "1", "--shard-size", "3"], start_new_session=True, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -216,7 +217,7 @@ def watch(state):
         pressed.append(state.done)
         os.kill(os.getpid(), signal.SIGINT)
 try:
-    mitransient_lidar.sweep(json.loads(sys.argv[1]), sys.argv[2], workers=1, shard_size=500, progress=watch)
+    mitransient_lidar.campaign(json.loads(sys.argv[1]), sys.argv[2], workers=1, shard_size=500, progress=watch)
 except KeyboardInterrupt as error:
     print(pressed[0], error)
 """
@@ -245,11 +246,11 @@ def test_failed_runs_end_with_exit_code_1(quick, tmp_path):
     store = Store(path)
     store.array("status")[2:4] = np.array([FAILED, FAILED], dtype=np.uint8)
     store.array("error")[2:4] = np.array(["wind_speed = -6 is too small", "another reason"])
-    out = run("sweep", path, "-q")
+    out = run("campaign", path, "-q")
     assert out.exit_code == 1
     assert out.stderr == "2 of 12 runs failed, the first, run 2, so: wind_speed = -6 is too small\n"
     assert out.stdout == f"{path}\n"
-    assert run("sweep", quick, "-q").exit_code == 0
+    assert run("campaign", quick, "-q").exit_code == 0
 
 
 @pytest.mark.slow
@@ -303,26 +304,26 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
         (changed(parameters={"bottom_depth": [-3, -2]}), [], "all fail"),
         (changed(fixed={"aim_x": 3}, design={**QUICK["design"], "shots": 2}), [], "leave out aim_x"),
         (changed(scene="table9"), [], "table9"),
-        (changed(), ["--scheduler", "nonsense://a"], "scheduler = 'nonsense://a' cannot be reached"),
-        (changed(), ["--workers", "0"], "workers = 0 must lie between 1 and 1024"),
+        (changed(), ["--scheduler", "nonsense://a"], "--scheduler = 'nonsense://a' cannot be reached"),
+        (changed(), ["--workers", "0"], "--workers = 0 must lie between 1 and 1024"),
         (changed(), ["--workers", "2", "--row", "1"], "--workers and --row are alternatives"),
-        (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "row = 12 must lie between 0 and 11"),
+        (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "--row = 12 must lie between 0 and 11"),
     ]
     for given_campaign, options, message in cases:
         given = [] if "-o" in options else ["-o", out]
         file = write_toml(tmp_path / "campaign.toml", given_campaign)
-        assert_refused(run("sweep", file, *given, *options, "-q"), message)
+        assert_refused(run("campaign", file, *given, *options, "-q"), message)
         assert not out.exists()
-    assert_refused(run("sweep", tmp_path / "none.toml", "-o", out), "none.toml")
+    assert_refused(run("campaign", tmp_path / "none.toml", "-o", out), "none.toml")
     (tmp_path / "text.toml").write_text("scene : table1")
-    assert_refused(run("sweep", tmp_path / "text.toml", "-o", out), "text.toml is not a TOML file")
-    assert_refused(run("sweep", tmp_path, "-q"), "is no store of a campaign")
+    assert_refused(run("campaign", tmp_path / "text.toml", "-o", out), "text.toml is not a TOML file")
+    assert_refused(run("campaign", tmp_path, "-q"), "is no store of a campaign")
     before = files_of(quick)
     other = write_toml(tmp_path / "other.toml", {**campaign, "target_error": 0.2})
-    assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
-    assert_refused(run("sweep", quick, "-o", out, "-q"), "--output is fixed in the store")
+    assert_refused(run("campaign", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
+    assert_refused(run("campaign", quick, "-o", out, "-q"), "--output is fixed in the store")
     same = write_toml(tmp_path / "same.toml", campaign)
-    assert_refused(run("sweep", same, "-o", quick, "--shard-size", 5, "-q"), "shard_size = 5 must be that of", "6")
+    assert_refused(run("campaign", same, "-o", quick, "--shard-size", 5, "-q"), "--shard-size = 5 must be that of", "6")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
@@ -332,7 +333,7 @@ def test_disk_that_is_full(quick, tmp_path):
     """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
     path = planned_copy(quick, tmp_path / "full.zarr")
     done = subprocess.run(
-        [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--workers", "1", "-q"],
+        [sys.executable, "-m", "mitransient_lidar", "campaign", str(path), "--workers", "1", "-q"],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
         capture_output=True,
         text=True,

@@ -21,7 +21,8 @@ from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
-from mitransient_lidar.campaigns.sweep import resume, sweep
+from mitransient_lidar.campaigns.sweep import campaign as run_campaign
+from mitransient_lidar.campaigns.sweep import resume
 from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError
 
@@ -69,12 +70,12 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler, end):
                 os.killpg(nodes[0].pid, end)
 
         address = json.loads(file.read_text())["address"]
-        data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
+        data = run_campaign(campaign, path, scheduler=address, shard_size=2, progress=watch)
         if end == signal.SIGKILL:
             assert nodes[0].wait(10) == -signal.SIGKILL
         assert (data["status"] == DONE).all()
         assert seen[-1] == 12
-        alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
+        alone = run_campaign(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
         assert files_of(path) == files_of(tmp_path / "alone.zarr")
         assert np.array_equal(data["waveform"], alone["waveform"])
     finally:
@@ -89,7 +90,7 @@ def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
     process, file = scheduler
     path = planned_copy(quick, tmp_path / "lost.zarr")
     address = json.loads(file.read_text())["address"]
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--scheduler", address]
+    command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(path), "--scheduler", address]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as client:
         assert "the scheduler has no workers: the campaign waits" in client.stderr.readline()
         process.kill()
@@ -137,7 +138,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
 def test_scheduler_that_does_not_answer(campaign, tmp_path):
     """A quarter of a minute passes until it is given up."""
     out, file = tmp_path / "out.zarr", write_toml(tmp_path / "campaign.toml", campaign)
-    done = run("sweep", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
+    done = run("campaign", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
     assert_refused(done, "scheduler = 'tcp://127.0.0.1:9' cannot be reached")
     assert not out.exists()
 
@@ -289,9 +290,9 @@ def test_other_servers_than_schedulers(campaign, tmp_path, kind):
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=serve, daemon=True).start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-q", "--scheduler", address]
+        command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-q", "--scheduler", address]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-    text = f"scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
+    text = f"--scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
     assert (done.returncode, done.stderr) == (2, text)
 
 
@@ -304,4 +305,4 @@ def test_a_scheduler_that_stops_while_it_starts(monkeypatch, tmp_path):
 
     monkeypatch.setattr(distributed.Client, "__init__", stops)
     with pytest.raises(UserError, match="cannot be reached: give its address"):
-        sweep({"scene": "table1"}, tmp_path / "out.zarr", scheduler="tcp://127.0.0.1:1")
+        run_campaign({"scene": "table1"}, tmp_path / "out.zarr", scheduler="tcp://127.0.0.1:1")

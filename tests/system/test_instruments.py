@@ -90,16 +90,16 @@ def test_a_result_names_its_instrument_and_gives_the_same_bits():
 
 
 def test_listing():
-    listed = run("instruments").stdout.splitlines()
+    listed = run("scenes", "instruments").stdout.splitlines()
     assert [line.split()[0] for line in listed] == instruments.instrument_names()
     czmil = next(line for line in listed if line.startswith("teledyne_czmil"))
     assert czmil.endswith("; 8 channels")
-    shown = run("instruments", "teledyne_czmil").stdout
+    shown = run("scenes", "instruments", "teledyne_czmil").stdout
     assert "channels: shallow1, shallow2" in shown
     assert "[1] G. Mandlburger" in shown
     assert re.search(r"^pulse_energy_mj +4  \[1\]$", shown, re.MULTILINE)
     assert re.search(r"^deep_view_mrad +40  assumed: ", shown, re.MULTILINE)
-    xml = run("instruments", "riegl_vq840g", "--xml").stdout
+    xml = run("scenes", "instruments", "riegl_vq840g", "--xml").stdout
     assert xml == instruments.instrument_text("riegl_vq840g")
 
 
@@ -115,8 +115,8 @@ def test_the_command_render_takes_an_instrument(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
-        (["instruments", "--xml"], "--xml needs the name of an instrument"),
+        (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
+        (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
         (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
         (
             ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],

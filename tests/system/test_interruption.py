@@ -48,11 +48,12 @@ app.main()
 
 #: The command line, with files of limited size after the render.
 DISK_FULL = """
-import resource, sys
+import functools, resource, sys
 limit = int(sys.argv.pop(1))
 from mitransient_lidar.rendering import render
 from mitransient_lidar.cli import app
 original = render.render
+@functools.wraps(original)  # whose options the command has
 def and_fill_the_disk(*arguments, **options):
     dataset = original(*arguments, **options)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))

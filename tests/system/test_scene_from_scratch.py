@@ -33,7 +33,7 @@ def test_every_line_of_the_text_is_in_the_scenes():
         for line in map(words, snippet.splitlines()):
             assert line in quoted
     commands = re.findall(r"^mitransient-lidar (\S+)", text, flags=re.MULTILINE)
-    assert commands == ["render", "waveforms", "render", "shots", "retrieve", "record", "waveforms", "render", "gates"]
+    assert commands == ["render", "echoes", "render", "shots", "retrieve", "record", "echoes", "render", "gates"]
 
 
 @pytest.mark.slow
@@ -53,7 +53,7 @@ def test_commands_measure_its_bottom(tmp_path):
     done = run("render", SCENE, "-D", "spectrum=flat", "--passes", 2, "--seed", 3, "-o", tmp_path)
     assert done.exit_code == 0, done.output
     assert "warning" not in done.output.lower()
-    table = run("waveforms", tmp_path / "survey_lidar.nc")
+    table = run("echoes", tmp_path / "survey_lidar.nc")
     assert len(re.findall("bottom", table.output)) == 7
     done = run("retrieve", tmp_path / "survey_lidar.nc")
     assert done.exit_code == 0, done.output

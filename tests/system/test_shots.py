@@ -41,7 +41,7 @@ def test_slopes_are_means_over_the_footprint(sea):
 
 @pytest.mark.slow
 def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
-    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3)
+    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3, waveforms=False).shots
     assert [shot.kind for shot in found] == [kind for kind in shots.SLOPE_KINDS for _ in range(3)]
     spread = sea.along.std(), sea.across.std()
     for shot in found:
@@ -69,7 +69,7 @@ def test_an_interrupted_search_draws_the_shots_that_were_rendered(tmp_path, monk
     assert done.exit_code == 130, done.stderr
     assert picture.is_file()
     assert seen["max_time"] == 500
-    assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["shot"] * 3
+    assert [line.split()[0] for line in done.stdout.splitlines()[2:5]] == ["shot"] * 3
 
 
 @pytest.mark.slow
@@ -91,9 +91,10 @@ def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
     options = [part for name, value in WAVES.items() for part in ("-D", f"{name}={value}")]
     target = tmp_path / "out" / "survey.png"
     scene = few_paths("fig09_2x2", tmp_path)
-    done = run("shot-statistics", scene, *options, "--count", 5, "-q", "-o", target)
+    series = tmp_path / "out" / "shots.nc"
+    done = run("shots", scene, *options, "--count", 5, "-q", "-o", series, "--figure", target)
     assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[:2] == [str(target), str(target.with_suffix(".nc"))]
+    assert done.stdout.splitlines()[:3] == [str(series), str(target), str(target.with_suffix(".nc"))]
     assert "correlation of strength with the slope" in done.stdout
     with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
         assert dict(found.sizes) == {"shot": 5, "pixel": 4}
@@ -110,11 +111,14 @@ def test_invalid_input_is_refused(tmp_path):
     with pytest.raises(UserError, match="every shot on a flat sea is the same"):
         shots.find_shots("fig09_2x2", {"spectrum": "flat"})
     with pytest.raises(UserError, match="must hold 14"):
-        shot_statistics.shot_statistics(few_paths("fig09_2x2", tmp_path), {**WAVES, "bin_count": 40}, count=2)
+        shot_statistics.shot_statistics(
+            shots.render_shots(few_paths("fig09_2x2", tmp_path), {**WAVES, "bin_count": 40}, count=2)
+        )
     for arguments, message in (
         (["find-shots", "fig09_2x2", "--at", "3;4"], "--at = '3;4' must hold numbers only"),
-        (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "slope_sigmas = -1 must be"),
-        (["shot-statistics", "fig09_2x2", "-o", "survey.txt"], "must end in"),
+        (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "--slope-sigmas = -1 must be"),
+        (["shots", "fig09_2x2", "--figure", "survey.txt"], "must end in"),
+        (["shots", "fig09_2x2", "--figure", "output/shots.png"], "which holds the shots: give it another name"),
         (["find-shots", "fig09_2x2", "-o", "shots.txt"], "must end in"),
     ):
         assert_refused(run(*arguments), message)
@@ -126,6 +130,7 @@ def test_shots_command_lists_places(tmp_path):
     done = run("find-shots", "fig09_2x2", "-D", "wind_speed=6", *places)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
-    assert lines[0].split()[:3] == ["kind", "aim_x", "aim_y"]
-    assert lines[1].split()[:4] == ["shot", "1", "1.50", "-2.00"]
-    assert lines[3:] == [str(tmp_path / "shots.png")]
+    assert lines[0] == str(tmp_path / "shots.png")
+    assert lines[1].split()[:3] == ["kind", "aim_x", "aim_y"]
+    assert lines[2].split()[:4] == ["shot", "1", "1.50", "-2.00"]
+    assert len(lines) == 4

@@ -142,7 +142,7 @@ def test_files_and_records_have_the_bits_of_those_alone(result, tmp_path):
             with pytest.raises(UserError, match="damaged"):
                 mitransient_lidar.open(damaged)
         recorded = mitransient_lidar.record(result, "published_airborne", seed=case % 2)
-        return [*found, recorded, mitransient_lidar.waveforms(recorded)]
+        return [*found, recorded, mitransient_lidar.echoes(recorded)]
 
     expected = [use(case) for case in range(2)]
     for case, found in enumerate(in_threads(4, use, range(4))):

@@ -2,6 +2,7 @@
 
 import inspect
 import pydoc
+import re
 from pathlib import Path
 
 import jedi
@@ -22,6 +23,9 @@ def test_every_function_has_a_signature_and_documentation(name):
     assert not any(one.kind is one.VAR_KEYWORD for one in parameters if name != "render")
     assert len(inspect.getdoc(function)) > 40
     assert "self" not in inspect.signature(function).parameters
+    described = re.findall(r"^\S.*$", inspect.getdoc(function), flags=re.MULTILINE)
+    if "Parameters" in described:
+        assert set(inspect.signature(function).parameters) <= {*re.findall(r"\w+", " ".join(described))} | {"others"}
 
 
 def test_citations_name_the_version():
@@ -37,9 +41,15 @@ def test_unknown_functions_are_attribute_errors():
         _ = mitransient_lidar.rendr
 
 
+def test_former_names_are_refused_with_the_new_one():
+    for old, new in (("waveforms", "echoes"), ("sweep", "campaign"), ("depth_uncertainty", "tpu")):
+        with pytest.raises(AttributeError, match=f"^mitransient_lidar.{old} is now {new}$"):
+            getattr(mitransient_lidar, old)
+
+
 def test_help_lists_the_options_of_a_render():
     text = pydoc.plain(pydoc.render_doc(mitransient_lidar.render))
-    for option in ("target_error: 'float | None' = None", "max_time", "components", "Returns", "Longest time"):
+    for option in ("target_error: float | None = None", "max_time", "components", "Returns", "Longest time"):
         assert option in text
 
 

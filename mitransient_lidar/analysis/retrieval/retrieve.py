@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.geometry import (
@@ -405,13 +406,28 @@ def water(
     return _labelled(dataset, table, np.shape(decay))
 
 
+@checked
 def retrieve(
     dataset: xr.Dataset,
     *,
-    wind_speed: float | None = None,
-    wind_direction_deg: float | None = None,
-    slope_deviation: tuple[float, float] | None = None,
-    efficiency: float | None = None,
+    slope_deviation: Annotated[
+        tuple[float, float] | None,
+        Option(
+            "Standard deviations of the slopes of an unknown sea, by default those of a series",
+            0,
+            above=True,
+            form="ALONG,ACROSS",
+        ),
+    ] = None,
+    wind_speed: Annotated[
+        float | None, Option("Wind speed over the sea, by default that of the scene", 1, 30, "m/s")
+    ] = None,
+    wind_direction_deg: Annotated[
+        float | None, Option("Direction that the wind blows towards, from +x [degrees], any angle")
+    ] = None,
+    efficiency: Annotated[
+        float | None, Option("Two-way efficiency of optics and air, by default that of the scene", 0, 1)
+    ] = None,
 ) -> xr.Dataset:
     """Return the estimates of `surface_slopes`, `bottom` and, if the view is wide enough, `water`; NaN where unknown.
 

@@ -1,4 +1,4 @@
-"""Tables of echoes as flat rows, and as CSV files."""
+"""Tables of echoes as flat rows, as printed lines, and as CSV files."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.files import replacing
+
+#: Most lines of a printed table, and most waveforms whose layers are printed.
+_MOST_LINES, _MOST_WAVEFORMS = 200, 16
 
 NUMBERS = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
 
@@ -82,3 +85,78 @@ def _cell(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return "" if math.isnan(value) else f"{value:.9g}"
+
+
+def describe_echoes(found: xr.Dataset) -> list[str]:
+    """Return the lines of a table of the echoes, and the properties of the columns."""
+    from rich.console import Console
+    from rich.table import Table
+
+    names, lines = rows(found)
+    labels = [name for name in names[: names.index("echo") + 1] if name != "estimator" or found.sizes["estimator"] > 1]
+    unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
+    heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
+    heads |= {name: f"{name} ({of})" if of else name for name, of in unit.items()}
+    table = Table(box=None, padding=(0, 1), header_style=None)
+    for name in labels:
+        table.add_column(name)
+    for name in NUMBERS:
+        table.add_column(heads[name], justify="right")
+    table.add_column("flags")
+    table.add_column("depth unknown")
+    left_out = 0
+    for line in lines:
+        cells = dict(zip(names, line, strict=True))
+        # Of missing echoes, only surface and bottom are listed.
+        if "no_echo" in cells["flags"] and cells["echo"] not in ("surface", "bottom"):
+            continue
+        if table.row_count >= _MOST_LINES:
+            left_out += 1
+            continue
+        # The printed error of a depth includes that of the method.
+        cells["depth_m_stderr"] = math.hypot(cells["depth_m_stderr"], cells["depth_m_method_error"])
+        numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in NUMBERS]
+        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"])
+    # A fixed width keeps the lines unfolded.
+    console = Console(highlight=False, width=240, markup=False)
+    with console.capture() as printed:
+        console.print(table)
+    listed = printed.get().splitlines()
+    if left_out:
+        listed.append(f"{left_out} more lines: write them all with --csv OUT.")
+    return listed + _columns(found)
+
+
+def _columns(found: xr.Dataset) -> list[str]:
+    """Return lines on attenuations, and the changes in the columns if tested for."""
+    listed = []
+    values = found["attenuation"].values.ravel()
+    if np.isfinite(values).any():
+        text = f"attenuation of the column (1/m): median {np.nanmedian(values):.4f}"
+        if values.size > 1:
+            text += f", from {np.nanmin(values):.4f} to {np.nanmax(values):.4f}"
+        listed.append(text)
+    if "layer" not in found.dims or values.size > _MOST_WAVEFORMS:
+        return listed
+    layers: Any = found[["layer_depth_m", "layer_p_value", "layer_step"]]
+    dims = list(found["attenuation"].dims)
+    for place in np.ndindex(*(found.sizes[dim] for dim in dims)):
+        one = layers.isel(dict(zip(dims, place, strict=True)))
+        label = " ".join(str(found[dim].values[index]) for dim, index in zip(dims, place, strict=True))
+        for depth, chance, step in zip(*(one[name].values for name in one.data_vars), strict=True):
+            if np.isfinite(depth):
+                change = f"signal {100 * np.expm1(step):+.0f} %, p = {max(chance, 1e-99):.1e}"
+                listed.append(f"{label}: change at {depth:.2f} m, {change}")
+    return listed
+
+
+def _with_error(value: float, error: float) -> str:
+    """Return a number with its standard error, or a dash."""
+    if math.isnan(value):
+        return "-"
+    if not math.isfinite(error) or error <= 0:
+        return f"{value:.5g}"
+    small = abs(value) < 1e-3 or abs(value) >= 1e6
+    if small:
+        return f"{value:.3e} +- {error:.0e}"
+    return f"{value:.{min(max(1 - math.floor(math.log10(error)), 0), 3)}f} +- {error:.2g}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
@@ -63,17 +64,27 @@ _PER_WAVEFORM = {
 }
 
 
+@checked
 def extract(
     dataset: xr.Dataset,
-    estimators: str | Sequence[str] = "gaussian",
+    estimators: Annotated[
+        str | Sequence[str],
+        Option(
+            "threshold, leading_edge, peak, centroid, gaussian (the default) or deconvolution; repeat it for several",
+            form="NAME",
+            flag="--estimator",
+        ),
+    ] = "gaussian",
     *,
     pulse: Pulse | None = None,
     noise: float | npt.ArrayLike | None = None,
-    threshold: float = 5.0,
-    contrast: float = 0.05,
+    threshold: Annotated[float, positive_option("Standard deviations of the noise above which a signal counts")] = 5.0,
+    contrast: Annotated[
+        float, Option("Share of the signal that an echo in the water must add (at least 0, below 1)")
+    ] = 0.05,
     echo_fwhm_ns: float | None = None,
     saturation_level: float | None = None,
-    layers: int = 0,
+    layers: Annotated[int, Option("Number of changes in the column to test for", 0, 8)] = 0,
     depth_from: Literal["echo", "mean"] = "echo",
     iterations: int = 50,
     block: int = 2048,
@@ -102,14 +113,10 @@ def extract(
         echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over a pulse
         to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
         ``signal_mean_stderr``, so that errors of a render are no echoes.
-    threshold, contrast
-        As for `echo_detection.find_echoes`.
     echo_fwhm_ns : float, optional
         Expected full width of an echo [ns]. By default, that of pulse, response and the beam's spread over the surface.
     saturation_level : float, optional
         Smallest saturated sample, as recorded, in addition to the variable ``saturated``.
-    layers : int
-        Number of changes in the column to test for, 0 to 8; see `column_fits.change_points`.
     depth_from : {'echo', 'mean'}
         Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
     iterations : int

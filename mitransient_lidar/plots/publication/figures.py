@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
-from mitransient_lidar.core.validation import positive
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
@@ -68,14 +68,17 @@ class Publication:
     interrupted: bool = False
 
 
+@checked
 @alone
 def figures(
-    names: Sequence[str] | None = None,
+    names: Annotated[
+        Sequence[str] | None, Option("Figures, as fig09; all by default", form="[NAME]...", is_argument=True)
+    ] = None,
     output: str | os.PathLike[str] = "output/figures",
     *,
-    target_error: float = 0.01,
-    max_time: float | None = None,
-    seed: int = 0,
+    target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
+    max_time: Annotated[float | None, positive_option("Begin no further figure after this many seconds")] = None,
+    seed: Annotated[int, Option("Seed of the random numbers", 0, 10**6)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
     """Make the figures of the multipixel lidar model of FOI (Tulldahl 2006), and the table of its statements.
@@ -90,10 +93,6 @@ def figures(
     target_error
         Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
         warning.
-    max_time
-        Time after which no further figure is begun [s], greater than 0; by default all are made.
-    seed
-        Seed of all random numbers and of the other places, 0 to 10^6.
     progress
         Called with a `passes.Progress` after every batch of shots.
 
@@ -111,7 +110,7 @@ def figures(
         If a file cannot be written.
     """
     chosen = check_names(names)
-    limit = math.inf if max_time is None else positive("max_time", max_time)
+    limit = max_time or math.inf
     began = time.perf_counter()
     renders = Renders(target_error, seed, progress)
     folder = Path(output)

@@ -22,7 +22,7 @@ _ORDER_COLOURS = ("#1a7f37", "#8fd19e", "#f2c14e", "#e07a2f", "#b3261e", "0.9")
 def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the total vertical uncertainty at 95 % against depth, one panel a water, with the orders of S-44.
 
-    `found` is a result of `studies.depth_uncertainty` at one altitude and angle. Lines with full markers are of
+    `found` is a result of `studies.tpu.tpu` at one altitude and angle. Lines with full markers are of
     corrected depths, or of measured ones without corrections; open markers of depths as measured.
     """
     waters = found["water"].values
@@ -57,7 +57,7 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
 def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the strictest order of S-44 that is met by wind and water, one panel a depth.
 
-    `found` is a result of `studies.depth_uncertainty` at one altitude and angle; corrected depths count where there
+    `found` is a result of `studies.tpu.tpu` at one altitude and angle; corrected depths count where there
     are any. Cells of seas that were left out are empty.
     """
     depths = found["depth"].values

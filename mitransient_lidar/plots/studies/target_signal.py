@@ -13,10 +13,12 @@ _DASHES = (0, (4, 2))
 
 
 def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the power in every pixel with and without the target, and the signal of the target alone.
+    """Draw the power in every pixel with and without the target, and the signal of the target alone; or a map.
 
     `result` is that of `studies.target_signal.target_signal`.
     """
+    if "target_x" in result.dims:
+        return plot_target_map(result, path)
     figure = drawing.new_figure(path, 9.6, 7.0)
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = result["time"].values

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +17,15 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.options import Components, RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
@@ -31,7 +33,6 @@ from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordi
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.rendering.shots.batches import ShotRecord
 
 _LOG = logging.getLogger(__name__)
@@ -61,26 +62,35 @@ def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(low, high, (count, 2))
 
 
+@checked
 @alone
 def render_shots(
-    scene: Any,
+    scene: SceneOrResult,
     params: Mapping[str, Any] | None = None,
     *,
-    count: int = 200,
-    positions: Sequence[tuple[float, float]] | npt.ArrayLike | None = None,
-    move_target: bool = False,
-    passes: int | None = None,
-    target_error: float | None = None,
-    max_time: float | None = None,
+    count: Annotated[int, Option("Number of shots at random places; 20 by default in the command", 2, 100_000)] = 200,
+    positions: Annotated[
+        Any, Option("Place of a shot [m], instead of random ones. Repeatable", form="X,Y", flag="--at")
+    ] = None,
+    move_target: Annotated[bool, Option("Keep the target's place relative to the aim of each shot")] = False,
+    passes: Annotated[
+        int | None, Option("Most passes of each shot, 8 by default, 400 with a target error", 2, 10_000)
+    ] = None,
+    target_error: Annotated[
+        float | None, Option("Relative standard error of the median bin, instead of full passes", 0, 1, above=True)
+    ] = None,
+    max_time: Annotated[
+        float | None, positive_option("Stop before this many seconds for all shots, with fewer passes or shots")
+    ] = None,
     pass_share: float | None = None,
-    seed: int = 1,
+    seed: Annotated[int, Option("Seed of random places, 1 by default", 0, 2**53)] = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
     shot_passes: npt.ArrayLike | None = None,
-    components: bool | None = None,
+    components: Components = None,
     derivatives: Sequence[str] | str | None = None,
-    instrument: str | None = None,
-    sensor: str | None = None,
+    instrument: Instrument = None,
+    sensor: Sensor = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -111,8 +121,6 @@ def render_shots(
         Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
         needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
         signal by about 0.3 %.
-    seed
-        Seed of random places, at least 0.
     first_seed
         Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
     axis
@@ -120,14 +128,8 @@ def render_shots(
         twentieth of the record.
     shot_passes
         Most passes of each shot, shape (shots,), 2 to `passes`, as the coordinate of a series that is rendered again.
-    components
-        Whether to separate the light by its origin, by default not, as for `rendering.render.render`.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
-    instrument
-        Name of the instrument whose laser and receiver replace those of the scene.
-    sensor
-        Id of a receiver of the scene, by default the first one.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     progress
@@ -160,9 +162,8 @@ def render_shots(
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
-    passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
+    passes = usual[0] if passes is None else passes
     share = options.pass_share or usual[1]
-    seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")

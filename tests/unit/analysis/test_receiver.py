@@ -345,7 +345,7 @@ def changed(value):
             "optical_density = 'auto' finds no filter",
         ),
         (lambda: detect_waveforms(make(), CHAIN, seed=-1), "seed = -1"),
-        (lambda: detect_waveforms(make(), CHAIN, background_power=-1.0), "background = -1 must not be negative"),
+        (lambda: detect_waveforms(make(), CHAIN, background_power=-1.0), "background_power = -1 must not be negative"),
         (lambda: detect_waveforms(make(), CHAIN, background_power=[1e-9, 1e-9]), r"shape \(2,\); .* \(4,\)"),
         (lambda: detect_waveforms(make(), CHAIN, background_power="sun"), "background_power = 'sun'"),
         (

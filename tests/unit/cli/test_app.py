@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import rich.console
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import assert_refused, run, stub
 
 from mitransient_lidar import __version__, results
 from mitransient_lidar.cli import messages
@@ -62,10 +62,7 @@ def calls(monkeypatch):
             attributes=attributes | extra,
         )
 
-    module = ModuleType("mitransient_lidar.rendering.render")
-    module.render = render
-    monkeypatch.setitem(sys.modules, "mitransient_lidar.rendering.render", module)
-    monkeypatch.setattr("mitransient_lidar.rendering.render", module, raising=False)
+    stub(monkeypatch, "render", render)
     seen_and_extra = ModuleType("calls")
     seen_and_extra.seen, seen_and_extra.extra = seen, extra
     return seen_and_extra
@@ -140,9 +137,10 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     logger = logging.getLogger("mitransient_lidar")
     before = logger.propagate, logger.level, [*logger.handlers]
     monkeypatch.setattr("mitransient_lidar.results.open", lambda _: logger.warning("early") or xr.Dataset())
-    for name in ("detect_waveforms", "encoding", "describe_recording"):
+    stub(monkeypatch, "record", lambda *_, **__: ())
+    for name in ("encoding", "describe_recording"):
         monkeypatch.setattr(f"mitransient_lidar.analysis.receiver.{name}", lambda *_, **__: ())
-    monkeypatch.setattr("mitransient_lidar.cli.results.write_netcdf", lambda *_: logger.warning("late"))
+    monkeypatch.setattr("mitransient_lidar.cli.analysis.write_netcdf", lambda *_: logger.warning("late"))
     done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
     assert done.exit_code == 0, done.output
     assert ("early" in done.stderr, caplog.messages) == ((False, []) if quiet else (True, ["early", "late"]))
@@ -173,11 +171,12 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     name = command.replace("-", "_")
     study = f"mitransient_lidar.studies.{name}"
     interrupted = xr.Dataset(attrs={"interrupted": 1, "passes": 3})
-    monkeypatch.setattr(f"{study}.{name}", lambda *_, **__: interrupted)
+    stub(monkeypatch, command, lambda **_: interrupted)
     monkeypatch.setattr(f"{study}.{describe}", lambda _: ["lines"])
-    monkeypatch.setattr("mitransient_lidar.cli.studies.write_figure", lambda *_: None)
+    monkeypatch.setattr(f"mitransient_lidar.plots.studies.{name}.plot_{name}", lambda *_: None)
     depths = ["--depths", "3"] if command == "beam-spread" else []
     done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
+    assert done.stdout.splitlines() == [str(tmp_path / "out.nc"), "lines"]
     assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept.\n")
 
 
@@ -225,8 +224,8 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--target-error", "nan"], "target_error = nan must be finite"),
-        (["--max-time", "inf"], "max_time = inf must be finite"),
+        (["--target-error", "nan"], "--target-error = nan must be finite"),
+        (["--max-time", "inf"], "--max-time = inf must be finite"),
         (["-D", "wind"], "-D wind is not of the form name=value."),
         (["-D", "=3"], "-D =3 is not of the form name=value."),
     ],
@@ -267,16 +266,16 @@ def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):
 @pytest.mark.slow
 def test_plot(scene, calls, tmp_path):
     run("render", scene, "-o", tmp_path, "--no-plot", "--quiet")
-    result = run("plot", tmp_path / "fig09.exr")
+    result = run("view", "--plot", tmp_path / "fig09.exr")
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.png'}\n")
     both = (tmp_path / "fig09.png").read_bytes()
     for option in ("--log", "--linear"):
-        result = run("plot", tmp_path / "fig09.nc", option, "-o", tmp_path / "b.png")
+        result = run("view", "--plot", tmp_path / "fig09.nc", option, "-o", tmp_path / "b.png")
         assert result.exit_code == 0, result.output
         # One panel is less high than two; the height stands in bytes 20 to 24.
         assert (tmp_path / "b.png").read_bytes()[20:24] < both[20:24]
-    assert_refused(run("plot", tmp_path / "missing.nc"), "missing.nc", "No such file")
-    assert_refused(run("plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
+    assert_refused(run("view", "--plot", tmp_path / "missing.nc"), "missing.nc", "No such file")
+    assert_refused(run("view", "--plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
 
 
 def test_scenes(scene, tmp_path):
@@ -311,10 +310,10 @@ def test_water(tmp_path):
 def test_info_and_bench(monkeypatch):
     seen = []
     monkeypatch.setattr(variants, "describe", lambda: {"mitsuba": "3.9.1", "LLVM": "none"})
-    monkeypatch.setattr(bench, "run", lambda **options: seen.append(options))
+    stub(monkeypatch, "bench", lambda **options: seen.append(options))
     assert run("info").stdout == "mitsuba  3.9.1\nLLVM     none\n"
     assert run("bench", "--quick", "--case", "clear", "--target-error", "0.02").exit_code == 0
-    assert seen == [{"quick": True, "json": False, "case": "clear", "target_error": 0.02}]
+    assert seen == [{"quick": True, "json": False, "case": "clear", "target_error": 0.02, "max_time": None}]
 
 
 def test_time_of_a_benchmark(monkeypatch):

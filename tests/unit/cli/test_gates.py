@@ -165,6 +165,6 @@ def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path):
 
 @pytest.mark.usefixtures("no_ffmpeg")
 def test_a_movie_that_cannot_be_is_refused_before_the_render(tmp_path, monkeypatch):
-    monkeypatch.setattr("mitransient_lidar.rendering.render.render", lambda *_, **__: pytest.fail("rendered"))
+    command_line.stub(monkeypatch, "render", lambda *_, **__: pytest.fail("rendered"))
     result = command_line.run("render", "gated_waves", "-o", tmp_path / "out", "--mp4")
     assert_no_movie(result, tmp_path / "out")

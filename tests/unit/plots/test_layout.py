@@ -113,7 +113,7 @@ def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     drawn = []
     for suffix in (".nc", ".exr"):
         results.save(result(**attributes), tmp_path / f"a{suffix}")
-        done = run("plot", tmp_path / f"a{suffix}", "--layout", "--overwrite")
+        done = run("view", tmp_path / f"a{suffix}", "--layout", "--overwrite")
         assert done.exit_code == 0
         assert done.stdout.splitlines() == [
             str(tmp_path / "a_layout.png"),
@@ -147,6 +147,6 @@ def test_invalid_results_are_rejected(tmp_path):
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
         plot_layout(result(), tmp_path / "a.txt")
     results.save(result(), tmp_path / "a.nc")
-    done = run("plot", tmp_path / "a.nc", "--layout", "--log")
+    done = run("view", tmp_path / "a.nc", "--layout", "--log")
     assert done.exit_code == 2
     assert "--layout does not go with --log or --linear" in done.output

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import assert_refused, run, stub
 from few_paths import few_paths
 from same_bits import assert_same_bits
 
@@ -396,7 +396,7 @@ def test_command_mounts_an_instrument(monkeypatch, tmp_path):
     def asked(scene, **options):
         raise UserError(f"instrument {options.get('instrument')}")
 
-    monkeypatch.setattr(shot_series, "render_shots", asked)
+    stub(monkeypatch, "shots", asked)
     assert_refused(run("shots", "table1", "--instrument", "riegl_vq840gl", "-o", tmp_path / "a.nc"), "riegl_vq840gl")
     assert_refused(run("shots", "table1", "-o", tmp_path / "a.nc"), "instrument None")
 

@@ -27,11 +27,11 @@ def spread():
 @pytest.mark.parametrize(
     ("depths", "message"),
     [
-        (0.0, "depths = 0 m must be greater than 0"),
-        ([3, -2], "depths = -2 m must be greater than 0"),
+        (0.0, "depths = [0.0] must be numbers (greater than 0)"),
+        ([3, -2], "depths = [3.0, -2.0] must be numbers (greater than 0)"),
         ([3, np.nan], "depths holds nan but every value must be finite"),
-        ("deep", "depths = 'deep' must hold numbers only"),
-        ([], "depths must hold at least one depth in metres"),
+        ("deep", "depths = 'deep' must hold numbers only, separated by commas"),
+        ([], "depths = [] must hold at least one number"),
         ([3, 8.5], "depths = 8.5 m must not lie below the bottom, at 8 m"),
     ],
 )

@@ -224,10 +224,10 @@ def test_command_writes_figure_data_and_table(rendered, tmp_path):
 
 
 def test_values_with_commas_are_separated_by_semicolons():
-    from mitransient_lidar.cli.bounds import _values
+    from mitransient_lidar.cli.options import name_and_values
 
-    assert _values("layer_tops=0,2;0,3") == ("layer_tops", ["0,2", "0,3"])
-    assert _values("layout = 1x1, 2x2") == ("layout", ["1x1", "2x2"])
+    assert name_and_values("--over", "layer_tops=0,2;0,3") == ("layer_tops", ["0,2", "0,3"])
+    assert name_and_values("--over", "layout = 1x1, 2x2") == ("layout", ["1x1", "2x2"])
 
 
 @pytest.mark.parametrize(

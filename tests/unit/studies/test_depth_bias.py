@@ -7,7 +7,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.studies import depth_bias as study
-from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
+from mitransient_lidar.studies.tpu import tpu
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_seas_after_the_time_are_nan_and_named(rendered, clock, monkeypatch, cap
     assert table.attrs["seas_left_out"] == 2
     assert "max_time = 2.5 s ended after 4 of 6 seas" in caplog.text
     assert len(study.describe_depth_bias(table)) == 1 + 4
-    found = depth_uncertainty("riegl_vq840g", altitudes=[100, 200, 300], waters=["IB"], depths=[3], max_time=2.5)
+    found = tpu("riegl_vq840g", altitudes=[100, 200, 300], waters=["IB"], depths=[3], corrections=None, max_time=2.5)
     assert found["altitude"].values.tolist() == [100]
     assert found.attrs["seas_left_out"] == 3 * 5 - 3
 
@@ -151,17 +151,20 @@ def test_a_table_needs_a_depth_below_the_waves(rendered):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"depths": [0.0, 3.0]}, r"depth = \[0\.0, 3\.0\] must be numbers above 0 that ascend"),
-        ({"winds": [5.0, 3.0]}, r"wind_speed = \[5\.0, 3\.0\] must be numbers of at least 0 that ascend"),
-        ({"altitudes": [300.0, 300.0]}, r"altitudes = \[300\.0, 300\.0\] must be numbers above 0 that ascend"),
-        ({"altitudes": [-1.0]}, "must be numbers above 0"),
+        ({"depths": [0.0, 3.0]}, r"depths = \[0\.0, 3\.0\] must be numbers \(greater than 0, ascending\)"),
+        ({"winds": [5.0, 3.0]}, r"winds = \[5\.0, 3\.0\] must be numbers \(at least 0, ascending\)"),
+        (
+            {"altitudes": [300.0, 300.0]},
+            r"altitudes = \[300\.0, 300\.0\] must be numbers \(greater than 0, ascending\)",
+        ),
+        ({"altitudes": [-1.0]}, r"must be numbers \(greater than 0"),
         ({"estimator": "eye"}, "estimator = 'eye' must be one of threshold"),
         ({"params": {"altitude": "high"}}, "altitude = 'high' must be a number"),
     ],
 )
 def test_uncertainty_refuses_wrong_input_before_it_renders(options, message, rendered):
     with pytest.raises(UserError, match=message):
-        depth_uncertainty("riegl_vq840g", **options)
+        tpu("riegl_vq840g", **options)
     assert not rendered
 
 
@@ -191,12 +194,16 @@ def test_uncertainty_reports_the_cells_of_all_altitudes(monkeypatch):
         }
         return xr.Dataset(data, {**coords, "estimator": ["gaussian"], "pixel": ["single"]}, attributes)
 
-    monkeypatch.setattr("mitransient_lidar.studies.depth_uncertainty.depth_bias", table)
+    monkeypatch.setattr("mitransient_lidar.studies.tpu.depth_bias", table)
     states = []
-    found = depth_uncertainty("riegl_vq840g", altitudes=[100, 400], progress=states.append)
+    errors = {"pointing_mrad": 0.0, "position_m": 2.0, "height_m": 5.0}
+    found = tpu("riegl_vq840g", altitudes=[100, 400], corrections=None, **errors, progress=states.append)
     assert heights == [100, 400]
     assert [(state.done, state.planned) for state in states] == [(done, 6) for done in range(1, 7)]
     assert states[-1].remaining_s == 0
     vertical = found["subaqueous_vertical"].isel(correction=0, depth=0)
     np.testing.assert_allclose(vertical.values.ravel(), np.hypot([0.01, 0.04], [0.01, 0.04]))
     assert "altitude" not in found.attrs
+    # The height counts in the vertical, the position in the horizontal.
+    np.testing.assert_allclose(found["tvu"].isel(correction=0, depth=0), 1.96 * np.hypot(5, vertical), rtol=1e-3)
+    assert found["thu"].min() > 2.4 * 2

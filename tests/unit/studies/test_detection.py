@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import assert_refused, run, stub
 from PIL import Image
 from scipy.stats import norm, t
 from significance import largest_z
@@ -224,7 +224,7 @@ def test_table_lists_all(result):
 @pytest.mark.slow
 def test_command_writes_and_prints(result, tmp_path, monkeypatch):
     asked = {}
-    monkeypatch.setattr(detection, "detect", lambda scene, params, **options: asked.update(options) or result)
+    stub(monkeypatch, "detect", lambda **options: asked.update(options) or result)
     plot = tmp_path / "new" / "detection.png"
     done = run("detect", "fig13_2x2", "--depths", "4,8", "--pfa", 0.01, "-o", plot, "-q")
     assert done.exit_code == 0, done.stderr
@@ -359,7 +359,7 @@ def test_invalid_options_end_with_one_sentence(arguments, message):
     ("scene", "params", "options", "message"),
     [
         ("fig13_2x2", {}, {"depths": (8, 14), "progress": pytest.fail}, r"below the bottom, up to z = -14 m"),
-        ("fig13_2x2", {}, {"depths": (8, 4)}, r"depths = \[8, 4\] must be above 0 m and increase"),
+        ("fig13_2x2", {}, {"depths": (8, 4)}, r"depths = \[8\.0, 4\.0\] must be numbers \(greater than 0, ascending\)"),
         ("fig09_2x2", {}, {"depths": (4, 8)}, "scene fig09_2x2 has no parameter target_depth, which depths needs"),
         ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
         ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),

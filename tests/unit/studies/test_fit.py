@@ -68,6 +68,21 @@ def test_starts_are_those_of_the_scene_and_seeds_differ_from_the_result(renders)
         mitransient_lidar.fit(data, "table1", NAMES, seed=5)
 
 
+def test_options_change_the_fit(renders):
+    """Errors by the residuals are the stated ones times the root of chi-squared; a free time is a further parameter."""
+    data = noisy(0.01, np.random.default_rng(4), pixels=("red",))
+    plain, scaled, timed = (
+        mitransient_lidar.fit(data, "table1", NAMES, **one)
+        for one in ({}, {"scale_errors": True}, {"free_time": True, "free_scale": False})
+    )
+    assert plain["parameter"].values.tolist() == NAMES
+    assert timed["parameter"].values.tolist() == [*NAMES, "time_offset_ns"]
+    np.testing.assert_array_equal(plain["value"], scaled["value"])
+    ratio = (scaled["stderr"] / plain["stderr"]).values
+    assert ratio[0] == pytest.approx(ratio[1])
+    assert abs(ratio[0] - 1) > 1e-3
+
+
 @pytest.mark.parametrize(("deviation", "passes"), [(0.01, 16), (0.003, 40), (0.0005, 256)])
 def test_passes_make_the_error_of_the_model_small_against_the_data(deviation, passes, renders, caplog):
     """A variance of (0.006)^2 / passes is at most a tenth of that of the data, up to 256 passes."""
@@ -193,7 +208,8 @@ def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path
     ("options", "message"),
     [
         (["--free", "depth"], "parameter 'depth' is not one of the scene"),
-        (["--free", ""], "must name one or more parameters"),
+        (["--free", ""], "--free = '' has an empty entry"),
+        ([], "--free = [] must name one or more parameters"),
         (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
         (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
         (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),

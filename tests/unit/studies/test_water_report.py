@@ -139,7 +139,7 @@ def test_profile_line_is_xml_for_a_medium(station):
 def test_tolerance_out_of_range(station):
     done = run("water", "profile", str(station), "--tolerance", "2")
     assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr == "tolerance = 2 must lie between 1e-05 and 0.5\n"
+    assert done.stderr == "--tolerance = 2 must lie between 1e-05 and 0.5\n"
 
 
 @pytest.mark.slow

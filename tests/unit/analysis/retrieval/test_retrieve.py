@@ -31,7 +31,7 @@ from synthetic_shots import (
 )
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
+from mitransient_lidar.analysis.retrieval import retrieval_table, retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import retrieval
 from mitransient_lidar.rendering.shots import series as shot_series
@@ -325,15 +325,15 @@ def shots_with_truth():
 
 def test_estimates_of_a_series_are_compared_with_its_truth(shots_with_truth):
     found = retrieve.retrieve(shots_with_truth, slope_deviation=(1e-4, 1e-4))
-    listed = {one.head: one for one in retrieval.estimates(found)}
+    listed = {one.head: one for one in retrieval_table.estimates(found)}
     np.testing.assert_allclose(listed["height (m)"].values, listed["height (m)"].truth, atol=0.02)
     np.testing.assert_allclose(listed["depth (m)"].values, listed["depth (m)"].truth, atol=0.05)
-    made = retrieval.Estimate(
+    made = retrieval_table.Estimate(
         "depth (m)", np.array([1.0, 2.0, 3.0, np.nan]), np.full(4, 0.5), np.array([1.0, 1.0, 2, 3])
     )
     text = "depth (m): bias +0.667, rms error 0.816, correlation +0.87, rms of error / standard error 1.63, 3 shots"
-    assert retrieval.truth_statistics(made) == text
-    assert retrieval.truth_statistics(made._replace(truth=None)) == ""
+    assert retrieval_table.truth_statistics(made) == text
+    assert retrieval_table.truth_statistics(made._replace(truth=None)) == ""
     figure = retrieval.plot_retrieval(found)
     # The truth of the reflectance is not known, and nothing is drawn.
     assert [ax.get_ylabel() for ax in figure.axes] == [f"estimated {head}" for head in listed if head != "reflectance"]

@@ -202,7 +202,7 @@ def test_the_pulse_may_be_given():
 @pytest.mark.slow
 def test_csv_and_command(tmp_path):
     results.save(result(), tmp_path / "shot.nc")
-    done = run("waveforms", tmp_path / "shot.nc", "--csv", tmp_path / "echoes.csv", "--layers", 1)
+    done = run("echoes", tmp_path / "shot.nc", "--csv", tmp_path / "echoes.csv", "--layers", 1)
     assert done.exit_code == 0, done.output
     assert "attenuation of the column (1/m): median" in done.output
     assert done.output.count("bottom") == 4
@@ -230,20 +230,20 @@ def test_csv_and_command(tmp_path):
 )
 def test_invalid_options(tmp_path, options, sentence):
     results.save(result(), tmp_path / "shot.nc")
-    assert_refused(run("waveforms", tmp_path / "shot.nc", *options), sentence)
+    assert_refused(run("echoes", tmp_path / "shot.nc", *options), sentence)
 
 
 def test_command_reads_what_a_receiver_recorded(tmp_path):
     """Shots hold a signal and no result's variables; other files are rejected."""
     shots = recorded(np.stack([waveform()]), 3, 0.01)
     shots.to_netcdf(tmp_path / "shots.nc", engine="h5netcdf")
-    done = run("waveforms", tmp_path / "shots.nc", "--no-table", "--csv", tmp_path / "echoes.csv")
+    done = run("echoes", tmp_path / "shots.nc", "--no-table", "--csv", tmp_path / "echoes.csv")
     assert done.exit_code == 0, done.output
     with (tmp_path / "echoes.csv").open() as file:
         found = [float(line["depth_m"]) for line in csv.DictReader(file) if line["echo"] == "bottom"]
     assert found == pytest.approx([70 * PER_NS] * 3, abs=0.05)
     shots.rename(signal="sound").to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    assert_refused(run("waveforms", tmp_path / "other.nc"), "holds neither a signal nor a waveform over time.")
+    assert_refused(run("echoes", tmp_path / "other.nc"), "holds neither a signal nor a waveform over time.")
 
 
 def drop(name):

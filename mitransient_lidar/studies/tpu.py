@@ -5,22 +5,34 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS, TrajectoryErrors, sounding_uncertainty
-from mitransient_lidar.analysis.waveforms.depth_correction import AXES
+from mitransient_lidar.analysis.waveforms.depth_correction import AXES, corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite, finite_array
+from mitransient_lidar.core.options import Numbers, Option, checked
+from mitransient_lidar.core.validation import finite
 from mitransient_lidar.loading.instruments import read_instrument
-from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.studies.depth_bias import depth_bias
+from mitransient_lidar.studies.depth_bias import (
+    Depths,
+    InstrumentName,
+    OwnReceiver,
+    Places,
+    Records,
+    SeaScene,
+    SeaSeed,
+    SeaTime,
+    Waters,
+    Winds,
+    depth_bias,
+)
 
 #: Wind whose ripples a level sea has [m/s].
 RIPPLES = 5.0
@@ -31,42 +43,63 @@ _LOG = logging.getLogger(__name__)
 WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
 
 
-def depth_uncertainty(
-    instrument: str,
+@checked
+def tpu(
+    instrument: InstrumentName,
     params: Mapping[str, Any] | None = None,
     *,
-    altitudes: Sequence[float] | None = None,
-    angles_deg: Sequence[float] | None = None,
-    winds: Sequence[float] = WINDS,
-    waters: Sequence[str] = WATERS,
-    depths: Sequence[float] = DEPTHS,
-    trajectory: TrajectoryErrors | None = None,
-    scene: str = "table1",
-    receiver: str | None = None,
-    estimator: str = "gaussian",
-    shots: int = 12,
-    records: int = 4,
-    seed: int = 1,
-    corrections: xr.Dataset | None = None,
-    max_time: float | None = None,
+    altitudes: Annotated[
+        Numbers | None,
+        Option(
+            "Heights of the lidar above the sea; the instrument's by default",
+            *(0, None, "m"),
+            above=True,
+            ascending=True,
+            form="N,N,...",
+        ),
+    ] = None,
+    angles_deg: Annotated[
+        Numbers | None,
+        Option(
+            "Angles from nadir; the instrument's by default",
+            *(0, None, "degrees"),
+            ascending=True,
+            form="N,N,...",
+            flag="--angles",
+        ),
+    ] = None,
+    winds: Winds = WINDS,
+    waters: Waters = WATERS,
+    depths: Depths = DEPTHS,
+    scene: SeaScene = "table1",
+    receiver: OwnReceiver = None,
+    estimator: Annotated[str, Option("Estimator of depths, as of echoes")] = "gaussian",
+    shots: Places = 12,
+    records: Records = 4,
+    corrections: Annotated[
+        xr.Dataset | str | None,
+        Option("Table of depth-bias to also correct the depths by, auto for the shipped one, or none", form="FILE"),
+    ] = "auto",
+    pointing_mrad: Annotated[float, Option("Standard deviation of the beam's direction, each axis", 0)] = 0.1,
+    position_m: Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)] = 0.05,
+    height_m: Annotated[float, Option("Standard deviation of the height of the sea surface", 0)] = 0.05,
+    max_time: SeaTime = None,
+    seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Determine the uncertainties of an instrument's soundings by altitude, angle, wind, water and depth.
 
     Parameters
     ----------
-    instrument, params, waters, depths, scene, receiver, shots, records, seed, corrections
+    params, scene
         As of `depth_bias.depth_bias`.
-    altitudes
-        Heights of the lidar above the sea [m], above 0, ascending; by default that of the instrument.
-    angles_deg
-        Angles from nadir [degree], ascending; by default that of the instrument.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
-    trajectory
-        Errors of the survey's trajectory.
-    estimator
-        An estimator of `echo_table.extract`.
+    corrections
+        A table of `depth_bias.depth_bias` to also correct the depths by, its file, ``auto`` for the shipped one, or
+        None.
+    pointing_mrad, position_m, height_m
+        Errors of the survey's trajectory; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
         Time after which no sea is rendered [s], above 0. The uncertainties of seas that are left out are NaN; altitudes
         of which none is rendered are left out. The attribute ``seas_left_out`` has the number of both.
@@ -88,10 +121,10 @@ def depth_uncertainty(
         raise UserError(f"estimator = {estimator!r} must be one of {', '.join(ESTIMATORS)}")
     given = dict(params or {})
     own = [finite("altitude", given.get("altitude", usual["altitude"]))]
-    heights = finite_array("altitudes", own if altitudes is None else altitudes)
-    if heights.size == 0 or np.any(np.diff(heights, prepend=0.0) <= 0):
-        raise UserError(f"altitudes = {heights.tolist()} must be numbers above 0 that ascend")
-    limit = RenderOptions(max_time=max_time).max_time
+    heights = np.asarray(own if altitudes is None else altitudes, float)
+    if isinstance(corrections, str):
+        corrections = None if corrections == "none" else corrections_for(instrument, corrections)
+    trajectory, limit = TrajectoryErrors(pointing_mrad, position_m, height_m), max_time
     angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
     began = time.perf_counter()
     found: list[xr.Dataset] = []
@@ -134,8 +167,8 @@ def depth_uncertainty(
     return joined.assign_coords(altitude=rendered).assign_attrs(estimator=estimator, seas_left_out=left_out)
 
 
-def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `depth_uncertainty`, one for each water and wind.
+def describe_tpu(found: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a result of `tpu`, one for each water and wind.
 
     TVU at 95 % of each depth [cm], corrected if there are corrections, with the order met, and a [cm] and b [%] of the
     fit at one standard deviation, with the root mean square of its residuals [cm].

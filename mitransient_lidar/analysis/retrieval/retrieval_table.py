@@ -1,88 +1,80 @@
-"""The command that retrieves slopes, bottom and water from a result."""
+"""Lines that show what `retrieve` has found: of a single shot, and of a series beside the truth."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
-import typer
+import numpy as np
+import xarray as xr
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
-from mitransient_lidar.cli.messages import name_subject
-from mitransient_lidar.cli.options import pair
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.analysis.retrieval.bottom_errors import REASONS, ReflectanceFlag
+from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
+from mitransient_lidar.core.validation import FloatArray
 
-_MOST_SHOTS = 200  # of a printed table
+_MOST_SHOTS = 200  # of a table
 _WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd"}
 
 
-def retrieve(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series of shots.")
-    ],
-    slope_deviation: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ALONG,ACROSS",
-            help="Standard deviations of the slopes of an unknown sea, greater than 0; by default those of a series.",
-        ),
-    ] = None,
-    wind_speed: Annotated[
-        float | None,
-        typer.Option(metavar="M/S", help="Wind speed over the sea, 1 to 30; by default that of the scene."),
-    ] = None,
-    wind_direction_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Direction that the wind blows towards, from +x, any angle."),
-    ] = None,
-    efficiency: Annotated[
-        float | None, typer.Option(help="Two-way efficiency of optics and air, 0 to 1; by default that of the scene.")
-    ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
-    figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
-    ] = None,
-) -> None:
-    """Retrieve slopes, bottom and water from a result.
+def describe_retrieval(found: xr.Dataset) -> list[str]:
+    """Return the lines of a result of `analysis.retrieval.retrieve.retrieve`."""
+    return _table(found) if "shot" in found.dims else _lines(found)
 
-    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of FILE;
-    of a series, those of each shot beside the truth.
+
+class Estimate(NamedTuple):
+    """An estimate over the shots of a series: heading with unit, values, standard errors and truth, if known."""
+
+    head: str
+    values: FloatArray
+    errors: FloatArray
+    truth: FloatArray | None
+
+
+def estimates(found: xr.Dataset) -> list[Estimate]:
+    """Return slopes, heights, depths and reflectances of a result of `analysis.retrieval.retrieve.retrieve`.
+
+    The result is over ``shot``. Depths are those below the mean sea level through the slope of the shot, reflectances
+    those by the ratio to the column.
     """
-    deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
-    if output is not None:
-        check_suffix("--output", output, ".nc")
-    check_figure(figure, option="--figure")
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
+    through_slope = found.sel(correction="slope")
+    columns = {
+        "slope along": ("slope_along", "true_slope_along"),
+        "slope across": ("slope_across", "true_slope_across"),
+        "height (m)": ("surface_height", "true_surface_height"),
+        "depth (m)": ("depth_m", "true_bottom_depth"),
+    }
 
-    dataset = results.open(file)
-    if figure is not None and "true_slope_along" not in dataset.coords:
-        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
-    found = retrieve_from(
-        dataset,
-        wind_speed=wind_speed,
-        wind_direction_deg=wind_direction_deg,
-        slope_deviation=deviations,
-        efficiency=efficiency,
-    )
-    name_subject(file, dataset.attrs)
-    for line in _table(found) if "shot" in found.dims else _lines(found):
-        typer.echo(line)
-    if output is not None:
-        write_netcdf(found, output)
-    if figure is not None:
-        from mitransient_lidar.plots.retrieval import plot_retrieval
+    listed = [
+        Estimate(
+            head,
+            through_slope[name].values,
+            through_slope[f"{name}_stderr"].values,
+            through_slope[truth].values if truth in through_slope else None,
+        )
+        for head, (name, truth) in columns.items()
+    ]
+    by_column = found.sel(correction="column")
+    values, errors = (by_column[name].values for name in ("reflectance", "reflectance_stderr"))
+    return [*listed, Estimate("reflectance", values, errors, None)]
 
-        figure.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
-            plot_retrieval(found, figure)
+
+def truth_statistics(one: Estimate) -> str:
+    """Return a line with bias and scatter of an estimate about the truth; empty for fewer than 2 known shots."""
+    if one.truth is None:
+        return ""
+    known = np.isfinite(one.values) & np.isfinite(one.truth)
+    if np.count_nonzero(known) < 2:
+        return ""
+    error = one.values[known] - one.truth[known]
+    text = f"{one.head}: bias {error.mean():+.3f}, rms error {np.sqrt(np.mean(error**2)):.3f}"
+    if np.ptp(one.truth[known]) > 0 and np.ptp(one.values[known]) > 0:
+        text += f", correlation {np.corrcoef(one.values[known], one.truth[known])[0, 1]:+.2f}"
+    text += f", rms of error / standard error {np.sqrt(np.mean((error / one.errors[known]) ** 2)):.2f}"
+    return f"{text}, {np.count_nonzero(known)} shots"
 
 
 def _table(found: Any) -> list[str]:
     """Return a line for each shot of a series, with the truth if known, and lines that compare both."""
-    from mitransient_lidar.plots.retrieval import estimates, truth_statistics
-
     columns = estimates(found)
     numbers = found["shot"].values if "shot" in found.coords else range(found.sizes["shot"])
     line = f"{'shot':>5}"
@@ -131,16 +123,12 @@ def _lines(found: Any) -> list[str]:
         f"{name} {_with_error(value[key], value[f'{key}_stderr'], '.3g')}" for name, key in _WATER.items()
     )
     low, high = value["attenuation_low"], value["attenuation_high"]
-    from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
-
     least, most = BACKSCATTER_RATIOS
     c = f"c {value['attenuation']:.3g}, {low:.2g} to {high:.2g} for particles of bb/b from {most:g} to {least:g}"
     return [*lines, f"water (1/m): {water}", f"attenuation (1/m): {c}"]
 
 
 def _bottom_lines(found: Any) -> list[str]:
-    from mitransient_lidar.analysis.retrieval.bottom_errors import REASONS, ReflectanceFlag
-
     depth, error = found["depth_m"].values, found["depth_m_stderr"].values
     flags = int(found["reflectance_flags"])
     reasons = ", ".join(text for flag, text in REASONS.items() if flags & flag)

@@ -1,0 +1,209 @@
+"""Commands that compute from a result: signals, echoes, estimates and fits."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
+from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
+from mitransient_lidar.cli.options import OUTPUT, Quiet
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.interruption import DeferredInterrupt
+
+_REFUSED = 1  # exit code of a fit that is refused
+
+
+def _record(
+    call: Call,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Record the waveforms of a file, and write the signals."""
+    target = output or file.with_name(f"{file.stem}_recorded.nc")
+    check_suffix("--output", target, ".nc")
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis import receiver as analysis
+
+    with reporting(quiet):
+        result = results.open(file)
+    recorded = call(result)
+    name_subject(file, result.attrs, quiet)
+    write_netcdf(recorded, target, analysis.encoding(recorded))
+    for line in analysis.describe_recording(recorded):
+        typer.echo(line)
+
+
+def _echoes(
+    call: Call,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
+    ],
+    table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
+    output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
+    mean_surface: Annotated[
+        bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
+    ] = False,
+    correct: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="Subtract the mean errors of a table of depth-bias from the depths; auto for the shipped one of the "
+            "result's instrument.",
+        ),
+    ] = None,
+    wind_speed: Annotated[
+        float | None,
+        typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Print and write the echoes."""
+    if output is not None:
+        check_suffix("--csv", output, ".csv")
+    elif not table:
+        raise UserError("--no-table leaves nothing to do: give --csv OUT as well.")
+    if correct is not None and mean_surface:
+        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
+    if wind_speed is not None and correct is None:
+        raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, records
+
+    dataset = records.open_waveforms(file)
+    instrument = str(dataset.attrs.get("instrument", ""))
+    corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
+    estimators = call.arguments["estimators"] or ["gaussian"]
+    found = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
+    if corrections is not None:
+        found = depth_correction.correct_depths(found, corrections, wind_speed)
+    name_subject(file, dataset.attrs, quiet)
+    if table:
+        typer.echo("\n".join(csv_tables.describe_echoes(found)))
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with announced():
+            csv_tables.save_csv(found, output)
+
+
+def _retrieve(
+    call: Call,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series of shots.")
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Print, write and draw the estimates."""
+    if output is not None:
+        check_suffix("--output", output, ".nc")
+    check_figure(figure, option="--figure")
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis.retrieval.retrieval_table import describe_retrieval
+
+    dataset = results.open(file)
+    if figure is not None and "true_slope_along" not in dataset.coords:
+        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
+    found = call(dataset)
+    name_subject(file, dataset.attrs, quiet)
+    typer.echo("\n".join(describe_retrieval(found)))
+    if output is not None:
+        write_netcdf(found, output)
+    if figure is not None:
+        from mitransient_lidar.plots.retrieval import plot_retrieval
+
+        figure.parent.mkdir(parents=True, exist_ok=True)
+        with announced():
+            plot_retrieval(found, figure)
+
+
+def _fit(
+    call: Call,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Result or recorded signal (.nc, .exr), or a CSV file with the column time_ns and one for each pixel.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    quiet: Quiet = False,
+) -> None:
+    """Fit, print and write."""
+    targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
+    check_targets(output, targets, str(file))
+    from mitransient_lidar.plots.studies.fit import plot_fit
+    from mitransient_lidar.studies import fit as study
+
+    with DeferredInterrupt(at_once=False):
+        fitted = call(file)
+        output.mkdir(parents=True, exist_ok=True)
+        heading, rows = study.table_rows(fitted)
+        with announced():
+            write_netcdf(fitted, targets[0])
+            with replacing(targets[1]) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+                csv.writer(stream).writerows([heading, *rows])
+            plot_fit(fitted, targets[2])
+    typer.echo("\n".join(study.describe_fit(fitted)))
+    exit_if_interrupted(fitted)
+    if fitted.attrs["refused"]:
+        raise typer.Exit(_REFUSED)
+
+
+COMMANDS = {
+    "record": Command(
+        "Analyse results",
+        "analysis.receiver:detect_waveforms",
+        _record,
+        """Record the waveforms of a result with a receiver.
+
+        Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
+        is saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
+        gain or the filter is chosen so that nothing is saturated.
+        """,
+    ),
+    "echoes": Command(
+        "Analyse results",
+        "analysis.waveforms.echo_table:extract",
+        _echoes,
+        """Measure the echoes in the waveforms of a result.
+
+        Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
+        are those by noise, of depths also by the method.
+        """,
+        defaults={"estimators": None},
+    ),
+    "retrieve": Command(
+        "Analyse results",
+        "analysis.retrieval.retrieve:retrieve",
+        _retrieve,
+        """Retrieve slopes, bottom and water from a result.
+
+        Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
+        FILE; of a series, those of each shot beside the truth.
+        """,
+    ),
+    "fit": Command(
+        "Analyse results",
+        "studies.fit:fit",
+        _fit,
+        """Fit parameters of a scene to waveforms.
+
+        Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc
+        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times
+        the expected one is refused, or, where the noise is unknown, one that leaves 10 % of the squares of the samples:
+        it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it prints and writes
+        (exit code 130).
+        """,
+    ),
+}

@@ -1,0 +1,227 @@
+"""Commands made of the signatures of public functions, whose modules are imported when a command is used."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+from typer.core import TyperCommand
+
+from mitransient_lidar.cli.messages import reporting, silenced
+from mitransient_lidar.cli.options import (
+    Define,
+    limits,
+    name_and_deviation,
+    name_and_value,
+    name_and_values,
+    names,
+    number_or_auto,
+    numbers,
+    pair,
+    parameters,
+)
+from mitransient_lidar.cli.overwriting import keeping
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, declared
+
+#: Readers of texts, by their forms; those of options that are given once, and those of options that are repeated.
+_ONCE: dict[str, Callable[[str, str], Any]] = {
+    "N,N,...": numbers,
+    "NAME,NAME,...": names,
+    "ALONG,ACROSS": pair,
+    "NUMBER|auto": number_or_auto,
+}
+_REPEATED: dict[str, Callable[[str, str], Any]] = {
+    "X,Y": pair,
+    "NAME": lambda _, text: text,
+    "NAME=VALUE": name_and_value,
+    "NAME=LOW:HIGH": limits,
+    "NAME=V1,V2,...": name_and_values,
+    "NAME[=STD]": name_and_deviation,
+}
+
+#: Types that are read as they are.
+_PLAIN = (float, int, bool, Path, str)
+
+
+def function_at(place: str) -> Callable[..., Any]:
+    """Return the function at ``module:name`` of the package as it is now, and import its module for that."""
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(f"mitransient_lidar.{module}"), name)
+    return found
+
+
+@dataclass(frozen=True)
+class Call:
+    """The public function of a command, with the arguments that were given."""
+
+    function: Callable[..., Any]
+    arguments: Mapping[str, Any]
+    quiet: bool
+    takes_progress: bool
+    flags: Mapping[str, str]
+
+    def __call__(self, *given: Any, **more: Any) -> Any:
+        """Call the function with further arguments, show progress, and name options in its sentences."""
+        with reporting(self.quiet) as progress, self.named():
+            shown = {"progress": progress} if self.takes_progress else {}
+            return self.function(*given, **{**self.arguments, **shown, **more})
+
+    @contextlib.contextmanager
+    def named(self) -> Iterator[None]:
+        """Let sentences of errors name options where they state parameters with values, or begin with one."""
+        try:
+            yield
+        except UserError as error:
+            text = re.sub(
+                r"\b\w+(?= = )|^\w+(?= (must|holds|is) )", lambda word: self.flags.get(word[0], word[0]), str(error)
+            )
+            error.args = (text,)
+            raise
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: heading and text of its help, public function as ``module:name``, and what is done with it.
+
+    `body` takes the `Call`, then options of the command itself, such as the output. `defaults` are those of the command
+    where they differ from the function's. Without a function, `body` takes its own options alone.
+    """
+
+    heading: str
+    function: str
+    body: Callable[..., None]
+    help: str
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+
+    def callback(self, name: str) -> Callable[..., None]:
+        """Return the function that Typer calls, with a signature of all options."""
+        own = list(inspect.signature(self.body, eval_str=True).parameters.values())
+        if not self.function:
+            return _decorated(name, lambda **given: self.body(**given), own)
+        function = function_at(self.function)
+        known, options = inspect.signature(function).parameters, declared(function)
+        defaults = {key: self.defaults.get(key, known[key].default) for key in options}
+        flags = {key: flag(key, option) for key, (_, option) in options.items() if not option.is_argument}
+
+        def run(**given: Any) -> None:
+            arguments = {
+                key: _read(option, flags.get(key, key), given.pop(key), defaults[key])
+                for key, (_, option) in options.items()
+            }
+            if "params" in known:
+                arguments["params"] = parameters(given.pop("define"))
+            quiet = bool(given.get("quiet"))
+            self.body(Call(function_at(self.function), arguments, quiet, "progress" in known, flags), **given)
+
+        listed = [_parameter(key, kind, option, defaults[key]) for key, (kind, option) in options.items()]
+        if "params" in known:
+            listed.insert(sum(option.is_argument for _, option in options.values()), _keyword("define", None, Define))
+        return _decorated(name, run, [*listed, *own[1:]])
+
+
+def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Parameter]) -> Callable[..., None]:
+    """Return a function as Typer takes it, that keeps files of others and is silent where it is asked to be."""
+    listed = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in listed]
+    run.__name__, run.__annotations__ = name.replace("-", "_"), {}
+    run.__signature__ = inspect.Signature(listed)  # type: ignore[attr-defined]
+    return keeping(silenced(run))
+
+
+class LazyCommand(TyperCommand):
+    """A command of a table, whose options are made when they are needed."""
+
+    def __init__(self, name: str, row: Command, example: str | None = None) -> None:
+        self._row, self._made = row, None  # type: tuple[Command, Any]
+        text = inspect.cleandoc(row.help) + (f"\n\nExample: mitransient-lidar {name} {example}" if example else "")
+        super().__init__(name, help=text, rich_help_panel=row.heading, rich_markup_mode=None)
+
+    def _full(self) -> Any:
+        if self._made is None:
+            app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
+            app.command(self.name, help=self.help)(self._row.callback(str(self.name)))
+            self._made = typer.main.get_command(app)
+        return self._made
+
+    @property
+    def params(self) -> list[Any]:
+        """Return arguments and options, to which Click adds the one for help."""
+        found: list[Any] = self._full().params
+        return found
+
+    @params.setter
+    def params(self, _none: object) -> None:
+        pass
+
+    @property
+    def callback(self) -> Any:
+        """Return the function that runs the command."""
+        return self._full().callback
+
+    @callback.setter
+    def callback(self, _none: object) -> None:
+        pass
+
+
+def flag(name: str, option: Option) -> str:
+    """Return the name of an option."""
+    return option.flag or f"--{name.replace('_', '-')}"
+
+
+def typed(kind: Any, option: Option) -> Any:
+    """Return the type that Typer reads."""
+    parts = {kind, *get_args(kind)}
+    if option.form in _REPEATED:
+        return list[str] | None
+    plain = next((one for one in _PLAIN if one in parts), str) if option.form not in _ONCE else str
+    if Sequence[str] in parts and option.is_argument:
+        return list[str] | None
+    return plain | None if type(None) in parts else plain
+
+
+def _typer(name: str, option: Option, default: Any) -> Any:
+    """Return the declaration of an argument or option for Typer."""
+    if option.is_argument:
+        return typer.Argument(metavar=option.form or None, help=option.help())
+    given = flag(name, option)
+    return typer.Option(
+        given if default is not True else f"{given}/--no-{given.removeprefix('--')}",
+        metavar=option.form or None,
+        help=option.help(),
+    )
+
+
+def _parameter(name: str, kind: Any, option: Option, default: Any) -> inspect.Parameter:
+    """Return a parameter of the callback, with the default as Typer shows it."""
+    annotation: Any = Annotated[typed(kind, option), _typer(name, option, default)]
+    if isinstance(default, (tuple, list)):
+        text = [f"{one:g}" if isinstance(one, (int, float)) else str(one) for one in default]
+        default = ",".join(text) if text and option.form not in _REPEATED else None
+    return _keyword(name, default, annotation)
+
+
+def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _read(option: Option, name: str, given: Any, default: Any) -> Any:
+    """Return an argument of the function, from what Typer has read."""
+    if given is None or given == []:
+        return None if default is inspect.Parameter.empty else default
+    if option.form in _ONCE:
+        return _ONCE[option.form](name, given)
+    if option.form in _REPEATED:
+        found = [_REPEATED[option.form](name, text) for text in given]
+        if "=" not in option.form:
+            return found
+        if len(dict(found)) < len(found):
+            raise UserError(f"{name} names a parameter twice: give all its values in one option")
+        return dict(found)
+    return given

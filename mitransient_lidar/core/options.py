@@ -1,0 +1,232 @@
+"""What the parameters of public functions mean and allow: checked in calls, and shown as options of commands."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+import textwrap
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import (
+    FloatArray,
+    in_range,
+    integer,
+    non_negative,
+    number_list,
+    positive,
+    relative_error,
+)
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+#: Numbers in a list or an array, shape (N,).
+Numbers = Sequence[float] | FloatArray
+
+#: A number, or the word for one that is chosen.
+NumberOrAuto = float | Literal["auto"] | None
+
+
+@dataclass(frozen=True)
+class Option:
+    """Meaning and range of a parameter, in the annotation of a public function.
+
+    Attributes
+    ----------
+    meaning
+        Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
+    low, high
+        Limits of a number, or of each number of a list; None where there is none. `low` itself is excluded if `above`.
+    unit
+        Unit of numbers.
+    ascending
+        Whether the numbers of a list must increase.
+    form
+        Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
+        they are.
+    flag
+        Name of the option of commands, where it is not that of the parameter.
+    is_argument
+        Whether commands take it by its place.
+    """
+
+    meaning: str
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    above: bool = False
+    ascending: bool = False
+    form: str = ""
+    flag: str = ""
+    is_argument: bool = False
+
+    def range(self) -> str:
+        """Return the allowed numbers as text, empty without limits."""
+        if self.low is None:
+            return ""
+        if self.above:
+            text = f"greater than {_number(self.low)}" + (
+                "" if self.high is None else f", at most {_number(self.high)}"
+            )
+        else:
+            text = (
+                f"at least {_number(self.low)}" if self.high is None else f"{_number(self.low)} to {_number(self.high)}"
+            )
+        return text + ", ascending" * self.ascending
+
+    def help(self) -> str:
+        """Return meaning, unit and range as a sentence."""
+        limits, clause = self.range(), re.split("(?=[,;.])", self.meaning, maxsplit=1)
+        meaning = f"{clause[0]} [{self.unit}]{''.join(clause[1:])}" if self.unit else self.meaning
+        return f"{meaning}{f' ({limits})' if limits else ''}."
+
+    def check(self, name: str, value: Any, kind: Any) -> Any:
+        """Return a value of a type as a number or a list of numbers; raise `UserError` if it is out of range."""
+        kinds = _parts(kind)
+        if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
+            return value
+        if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
+            return self._check_list(name, value)
+        if int in kinds:
+            assert isinstance(self.low, int)
+            assert isinstance(self.high, int)
+            return integer(name, value, self.low, self.high)
+        if self.above:
+            return positive(name, value) if self.high is None else relative_error(name, value)
+        if self.high is None:
+            return non_negative(name, value)
+        return in_range(name, value, self.low, self.high)
+
+    def _check_list(self, name: str, values: Any) -> list[float]:
+        numbers, low = number_list(name, values), np.float64(-np.inf if self.low is None else self.low)
+        inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
+        if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
+            raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")
+        return list(values) if isinstance(values, (list, tuple)) else [float(number) for number in numbers]
+
+
+def positive_option(meaning: str, unit: str = "") -> Option:
+    """Return the declaration of a number greater than 0."""
+    return Option(meaning, 0, unit=unit, above=True)
+
+
+#: Arguments and options of several functions.
+Scene = Annotated[Any, Option("Name of a shipped scene, or path of a Mitsuba XML file", form="SCENE", is_argument=True)]
+SceneOrResult = Annotated[
+    Any,
+    Option(
+        "Name of a shipped scene, path of a Mitsuba XML file, or a result (.nc, .exr) to render again, with its own "
+        "options unless others are given",
+        form="SCENE",
+        is_argument=True,
+    ),
+]
+Seed = Annotated[int, Option("Seed of the random numbers", 0, 2**53)]
+FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
+TargetId = Annotated[str, Option("Id of the shape that is the target")]
+BackgroundPower = Annotated[float, Option("Power of the daylight on each pixel", 0, unit="W")]
+Instrument = Annotated[str | None, Option("Instrument instead of the scene's lidar, from the list of instruments")]
+Sensor = Annotated[str | None, Option("Receiver of a scene that has several, by its id, instead of the first one")]
+
+#: Beginning of the meaning of a receiver.
+RECEIVERS = (
+    "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
+    "file"
+)
+
+
+def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
+    """Return types and `Option` of those parameters of a function, or fields of a class, that have one."""
+    found: dict[str, tuple[Any, Option]] = {}
+    hinted: Any = inspect.unwrap(function)
+    if not isinstance(function, type):  # whose type of the result may be known to checkers alone
+        annotations = {name: one for name, one in hinted.__annotations__.items() if name != "return"}
+        hinted = types.SimpleNamespace(__annotations__=annotations, __globals__=hinted.__globals__)
+    for name, hint in get_type_hints(hinted, include_extras=True).items():
+        if get_origin(hint) is Annotated:
+            kind, *others = get_args(hint)
+            found.update((name, (kind, one)) for one in others if isinstance(one, Option))
+    return found
+
+
+def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return a function that checks its arguments by the `Option` of their annotations; None may stay where allowed.
+
+    Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
+    Python.
+
+    Raises
+    ------
+    UserError
+        If a number is out of range; the sentence names the parameter.
+    """
+    signature, options = inspect.signature(function), declared(function)
+
+    @functools.wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        given = signature.bind(*args, **kwargs)
+        for name, value in given.arguments.items():
+            if name in options and not is_unset(value, signature.parameters[name].default):
+                kind, option = options[name]
+                given.arguments[name] = option.check(name, value, kind)
+        return function(*given.args, **given.kwargs)
+
+    shown = [
+        one.replace(annotation=options[name][0]) if name in options else one
+        for name, one in signature.parameters.items()
+    ]
+    run.__signature__ = signature.replace(parameters=shown)  # type: ignore[attr-defined]
+    run.__doc__ = _documented(function.__doc__ or "", {name: option for name, (_, option) in options.items()})
+    return run
+
+
+def _documented(text: str, options: Mapping[str, Option]) -> str:
+    """Return a documentation whose section of parameters has all options; those that it describes stay."""
+    beginning, heading, rest = text.partition("Parameters\n    ----------\n")
+    described, blank, end = rest.partition("\n\n")
+    known = {name for line in described.splitlines() if line[4:5].strip() for name in re.findall(r"\w+", line)}
+    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in options.items() if name not in known]
+    return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
+
+
+def _indented(text: str) -> str:
+    return textwrap.fill(text, 120, initial_indent=" " * 8, subsequent_indent=" " * 8)
+
+
+def is_unset(value: Any, default: Any) -> bool:
+    """Return whether a value is a default that needs no check: None, or an empty list."""
+    return (value is None and default is None) or (isinstance(default, tuple) and not default and len(value) == 0)
+
+
+def _is_list(kinds: tuple[Any, ...]) -> bool:
+    """Return whether one of the types is that of a list or an array."""
+    origins = [get_origin(one) for one in kinds]
+    return any(isinstance(one, type) and issubclass(one, Sequence | np.ndarray) for one in origins)
+
+
+def _parts(kind: Any) -> tuple[Any, ...]:
+    """Return the types of a union, and the words of a literal."""
+    if get_origin(kind) in (Union, types.UnionType, Literal):
+        return tuple(part for one in get_args(kind) for part in _parts(one))
+    return (kind,)
+
+
+def _number(value: float) -> str:
+    """Return a limit as text: 100 000, 10^9, 2^53, 2^63 - 1, 1/512, 0.01 or 1e-12."""
+    if isinstance(value, int):
+        size, sign = abs(value), "-" * (value < 0)
+        if size > 10**6 and (power := len(str(size)) - 1) and size == 10**power:
+            return f"{sign}10^{power}"
+        if size > 10**6 and (bits := (size + 1).bit_length() - 1) and size in (2**bits - 1, 2**bits):
+            return f"{sign}2^{bits}{' - 1' if size < 2**bits else ''}"
+        return f"{value:,}".replace(",", " ") if size >= 10**4 else str(value)
+    if 0 < value < 0.01 and (1 / value).is_integer() and int(1 / value).bit_count() == 1:
+        return f"1/{1 / value:g}"
+    return f"{value:g}".replace("e-0", "e-")
