@@ -56,6 +56,8 @@ def _view(
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
     if components and (log or linear or layout):
         raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales.")
+    if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise UserError(f"--output {output} must end in .png, .pdf or .svg, or .html for a page.")
     target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
     draws_again(file)
     check_figure(target)

@@ -50,7 +50,7 @@ def test_target_on_a_grid(scene, tmp_path):
         (("scattering-orders", "fig09_2x2", "-o", "a.txt"), "must end in .png"),
         (
             ("target-signal", "fig09_2x2", "-q"),
-            "target_id = 'target' must be the id of a shape of the scene: surface, bottom",
+            "--target-id = 'target' must be the id of a shape of the scene: surface, bottom",
         ),
     ],
 )

@@ -72,7 +72,9 @@ def test_the_command_opens_a_page(result, opened, tmp_path):
 
 def test_the_command_refuses_what_it_cannot_show(result, opened, tmp_path):
     results.save(result, tmp_path / "shot.nc")
-    assert_refused(run("view", tmp_path / "shot.nc", "-o", tmp_path / "shot.png"), "--output", "must end in .html")
+    assert_refused(
+        run("view", tmp_path / "shot.nc", "-o", tmp_path / "shot.txt"), "must end in .png, .pdf or .svg, or .html"
+    )
     assert_refused(run("view", tmp_path / "shot.nc", "--shot", 2), "--shot 2 needs a series of shots")
     result.drop_vars(list(result.data_vars)).to_netcdf(tmp_path / "empty.nc", engine="h5netcdf")
     assert_refused(run("view", tmp_path / "empty.nc"), "empty.nc")
