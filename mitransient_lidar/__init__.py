@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -139,15 +140,66 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_FUNCTIONS})
 
 
-def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect
-    """Read a result from an EXR stack or a NetCDF file, signals of a receiver, or the store of a campaign.
+def open(path: str | os.PathLike[str]) -> xarray.Dataset:
+    """Read any file or folder that this package writes.
 
-    See :func:`mitransient_lidar.results.dataset.open` and :func:`mitransient_lidar.campaigns.store.open_campaign`.
+    Parameters
+    ----------
+    path : path
+        An EXR or NetCDF file: waveforms of a render, gates, images by daylight, signals of a receiver, or a table of a
+        study. Or a folder: the store of a campaign, whose arrays are read when they are needed, a flight, or a sequence
+        of gates.
+
+    Returns
+    -------
+    xarray.Dataset
+        What was written; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
+        :func:`mitransient_lidar.campaigns.store.open_campaign`.
+
+    Raises
+    ------
+    UserError
+        If nothing of this package is there, or it is damaged.
     """
-    if Path(path).is_dir():
-        from mitransient_lidar.campaigns.store import open_campaign
+    from mitransient_lidar.results.files import checked_path
+    from mitransient_lidar.results.files import open as open_file
 
-        return open_campaign(path)
-    from mitransient_lidar.results.dataset import open as open_result
+    place = checked_path("path", path)
+    for store in (place, place / "flight.zarr"):
+        if (store / "zarr.json").exists():
+            from mitransient_lidar.campaigns.store import open_campaign
 
-    return open_result(path, signals=True)
+            return open_campaign(store)
+    return open_file(place)
+
+
+def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write any dataset of this package to a file, whose suffix is its format; an existing file is replaced.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The dataset.
+    path : path
+        ``.nc`` is NetCDF-4, of any dataset; ``.exr`` OpenEXR, of waveforms, gates or images by daylight; ``.csv`` a
+        text table of echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
+        :func:`mitransient_lidar.results.files.save`.
+
+    Raises
+    ------
+    UserError
+        If the suffix is another one, the format cannot store the dataset, or the file cannot be written.
+    """
+    from mitransient_lidar.results.files import checked_path, dataset_of
+    from mitransient_lidar.results.files import save as save_file
+
+    if checked_path("path", path).suffix.lower() != ".csv":
+        save_file(dataset, path)
+    elif "bound" in dataset_of("dataset", dataset, "echoes", "bounds"):
+        from mitransient_lidar.studies.bounds import write_table
+
+        write_table(dataset, path)
+    else:
+        from mitransient_lidar.analysis.waveforms.csv_tables import save_csv
+
+        save_csv(dataset, path)

@@ -16,7 +16,6 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
-from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
@@ -402,23 +401,6 @@ def receiver_of(parameter: str, given: ReceiverChannels | ReceiverChain | str | 
         raise UserError(
             f"{parameter}{text.removeprefix('receiver')}" if text.startswith("receiver =") else text
         ) from None
-
-
-def encoding(recorded: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the encoding of a record in a file: signals behind a converter as its integer codes.
-
-    ``scale_factor`` and ``add_offset`` turn them into volts.
-    """
-    names = ("receiver.digitiser.bits", "receiver.digitiser.full_scale_v", "receiver.digitiser.low_v")
-    if not set(names) <= set(recorded.attrs):
-        return {}
-    bits, full_scale, low = (recorded.attrs[name] for name in names)
-    digitiser = Digitiser(int(bits), float(full_scale), float(low))
-    # The highest number of the type, which no code has, is the one for missing values.
-    kind = np.dtype("uint16" if digitiser.bits < 16 else "uint32")
-    codes = {"dtype": kind, "scale_factor": digitiser.step_v, "add_offset": digitiser.low_v}
-    codes["_FillValue"] = int(np.iinfo(kind).max)
-    return {"signal": codes}
 
 
 def _waveform(dataset: xr.Dataset) -> tuple[tuple[str, ...], FloatArray]:

@@ -34,7 +34,6 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
-from mitransient_lidar.results.formats import picture_order
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,11 +61,6 @@ _SEALED, _SEAL = ("campaign", "flight", "scene", "record", "runs", "shard_size",
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, MemoryError)
 
 _WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
-
-#: Attribute with the order of pixels in layouts, which stores of versions up to 0.1 lack: they have right before left.
-_ORDER = ("pixel_order", "far to near, left to right")
-
-_ON_AXIS = 1e-3  # largest angle of pixels that are on the axis [mrad]
 
 _STATUS = {
     "units": "1",
@@ -109,7 +103,7 @@ class Store:
             with zarr.config.set(_WRITING):
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
-            #: What the store is of, and that as JSON; stores of versions up to 0.1 are of campaigns.
+            #: What the store is of, and that as JSON.
             self.kind = "flight" if "flight" in self.attributes else "campaign"
             self.text = str(self.attributes[self.kind])
             self._renderer_type().check(self.text)
@@ -120,8 +114,7 @@ class Store:
         except _DAMAGE as error:
             raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
         if self.attributes.get(_SEAL) != seal(self.attributes):
-            reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
-            raise UserError(f"{path} cannot be used: {reason}.")
+            raise UserError(f"{path} cannot be used: its attributes have changed.")
         self._arrays: dict[str, zarr.Array[Any]] = {}
         self._check_arrays()
 
@@ -179,16 +172,6 @@ class Store:
             SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
-
-    def check_pixel_order(self) -> None:
-        """Raise `UserError` if runs that are rendered now would have their pixels in another order than the store."""
-        if _ORDER[0] in self.attributes or "angle_y" not in self._group:
-            return
-        if np.any(np.abs(self.stored("angle_y", slice(None))) > _ON_AXIS):
-            raise UserError(
-                f"{self.path} was begun by an earlier version, whose pixels are in order from right to left: it can be "
-                "read but not completed; choose another place"
-            )
 
     @property
     def unit(self) -> str:
@@ -405,7 +388,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     with _reading(path, "a coordinate"):
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
     dataset["status"] = dataset["status"].copy(data=store.status())
-    return picture_order(dataset)
+    return dataset
 
 
 def _fill(
@@ -473,7 +456,6 @@ def _fill(
         "variables": list(arrays),
         "arrays": sorted(group.array_keys()),
         "coordinates": " ".join(name for name in secondary if name in group),
-        _ORDER[0]: _ORDER[1],
         **versions(),
         "versions": own_versions(),
         **attributes,

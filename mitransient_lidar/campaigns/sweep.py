@@ -208,7 +208,6 @@ def complete(
         wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
         if shards:
-            store.check_pixel_order()
             check_versions(store.path, store.attributes)
             few = min(number, len(shards))
             if client is None:

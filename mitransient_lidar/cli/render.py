@@ -87,7 +87,6 @@ def render(
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
     from mitransient_lidar import results
-    from mitransient_lidar.results import gate_files
 
     if target.suffix == ".exr":
         try:
@@ -97,7 +96,7 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
         except UserError as error:
             typer.echo(f"no EXR file: {error}", err=True)
     elif target.suffix == ".nc":
-        (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+        results.save(dataset, target)
     elif target.stem.endswith("_components"):
         from mitransient_lidar.plots.waveforms import plot_components
 
@@ -156,7 +155,7 @@ def passive(
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.render import render_again
-    from mitransient_lidar.results.radiance import save_radiance
+    from mitransient_lidar.results import save
 
     series = {"sensor": sensor, "frames": frames, "frame_step_s": frame_step, "filter_width_nm": filter_width_nm}
     options |= {option: value for option, value in series.items() if value is not None}
@@ -173,7 +172,7 @@ def passive(
         with announced():
             for target in targets:
                 if target.suffix != ".gif" or "row" in image.dims:
-                    writers.get(target.suffix, save_radiance)(image, target)
+                    writers.get(target.suffix, save)(image, target)
     if not quiet:
         typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
         if "background_power" in image:

@@ -48,11 +48,11 @@ def plot(
     target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
     draws_again(file)
     check_figure(target)
-    from mitransient_lidar.analysis.waveforms.records import open_waveforms
+    from mitransient_lidar import results
     from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_components, plot_waveforms
 
-    dataset = open_waveforms(file)
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     if layout:
@@ -86,10 +86,11 @@ def view(
     """
     if output is not None:
         check_suffix("--output", output, ".html")
+    from mitransient_lidar import results
     from mitransient_lidar.plots.viewer import view as page_of
 
     with reporting(quiet):
-        dataset = _open_any(file)
+        dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates")
         page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=_PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -97,20 +98,6 @@ def view(
         path = page.save(output)
     if browser and not webbrowser.open(path.resolve().as_uri()):
         typer.echo("no browser was found: open the page in one.", err=True)
-
-
-def _open_any(path: Path) -> xr.Dataset:
-    """Read a result, a gate stack or recorded signals."""
-    from mitransient_lidar.analysis.waveforms.records import open_waveforms
-    from mitransient_lidar.results.gate_files import open_stack
-
-    try:
-        return open_waveforms(path)
-    except UserError as error:
-        try:
-            return open_stack(path)
-        except UserError:
-            raise error from None
 
 
 def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
@@ -169,10 +156,10 @@ def record(
     from mitransient_lidar.analysis import receiver as analysis
 
     with reporting(quiet):
-        result = results.open(file)
+        result = results.dataset_of("FILE", file, "result")
         recorded = analysis.detect_waveforms(result, receiver, shots, seed, background_power_w, **chosen)
     name_subject(file, result.attrs, quiet)
-    write_netcdf(recorded, target, analysis.encoding(recorded))
+    write_netcdf(recorded, target)
     for line in analysis.describe_recording(recorded):
         typer.echo(line)
 
@@ -192,7 +179,7 @@ def compare(
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
     check_figure(target)
-    datasets = results.open(first), results.open(second)
+    datasets = results.dataset_of("FILE", first, "result"), results.dataset_of("OTHER", second, "result")
     outcome = comparison.compare(*datasets)
     with announced():
         plot_comparison(*datasets, outcome, target)

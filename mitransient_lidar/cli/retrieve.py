@@ -56,7 +56,7 @@ def retrieve(
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
 
-    dataset = results.open(file)
+    dataset = results.dataset_of("FILE", file, "result")
     if figure is not None and "true_slope_along" not in dataset.coords:
         raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
     found = retrieve_from(

@@ -69,10 +69,11 @@ def waveforms(
         raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
     if wind_speed is not None and correct is None:
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
-    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, records
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
     from mitransient_lidar.analysis.waveforms import echo_table as measuring
 
-    dataset = records.open_waveforms(file)
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
     instrument = str(dataset.attrs.get("instrument", ""))
     corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
     found = measuring.extract(

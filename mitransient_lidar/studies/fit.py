@@ -124,10 +124,6 @@ def fit(
     names = _names(free)
     if unknown := [name for name in start or {} if name not in (*names, SCALE, TIME_OFFSET)]:
         raise UserError(f"start of {unknown[0]}: it is not one of the free parameters {', '.join(names)}")
-    if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in (".nc", ".exr"):
-        from mitransient_lidar import results
-
-        source = results.open(source, signals=True)
     found = measured(source, noise=noise, receiver=receiver)
     if BANDWIDTH in names:
         if found.receiver is not None:

@@ -11,7 +11,7 @@ import xarray as xr
 
 import mitransient_lidar
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.results.netcdf import dump
+from mitransient_lidar.results import save
 
 
 @pytest.mark.parametrize("name", sorted(set(mitransient_lidar.__all__) - {"__version__"}))
@@ -56,6 +56,6 @@ def test_open_reads_signals_of_a_receiver(tmp_path):
     waveform = xr.DataArray(np.full((2, 40), 1e-7), dims=("pixel", "time"), coords={"time": time, "pixel": ["a", "b"]})
     attributes = {"time_start_ns": 0.0, "bin_width_ns": 1.0}
     recorded = detect_waveforms(xr.Dataset({"waveform": waveform}, attrs=attributes), "apd", shots=3)
-    dump(recorded, tmp_path / "signals.nc", {})
+    save(recorded, tmp_path / "signals.nc")
     found = mitransient_lidar.open(tmp_path / "signals.nc")
-    np.testing.assert_array_equal(found["signal"], recorded["signal"])
+    np.testing.assert_allclose(found["signal"], recorded["signal"], rtol=1e-6)

@@ -162,8 +162,8 @@ def measured(
     """
     given = None if noise is None else positive("noise", noise)
     is_table = not isinstance(source, xr.Dataset) and Path(source).suffix.lower() not in (".nc", ".exr")
-    if not isinstance(source, xr.Dataset) and not is_table:
-        source = results.open(source, signals=True)
+    if not is_table:
+        source = results.dataset_of("source", source, "waveforms", "signals")
     if isinstance(source, xr.Dataset) and "signal" in source:
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 
+from mitransient_lidar import results
 from mitransient_lidar.cli.app import app
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.results import netcdf
 
 #: The reference compiles one kernel, merging three.
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
@@ -162,8 +162,8 @@ def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
     table = tmp_path / "table.nc"
     options = [*few, "--ripples", 5, "-D", "altitude=120", "--angles", 20, "-o", table]
     check(run("depth-bias", "riegl_vq840g", *options), tmp_path)
-    bias = netcdf.read_netcdf(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
-    found = netcdf.read_netcdf(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
+    bias = results.open(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
+    found = results.open(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
     vertical = np.hypot(bias["bias"], bias["spread"]).where(bias["found"] >= 0.5)
     assert np.isfinite(vertical.sel(water="IB")).all()
     np.testing.assert_allclose(found["subaqueous_vertical"].sel(correction="none"), vertical)

@@ -124,9 +124,9 @@ def result(tmp_path_factory):
     """File of a result of four pixels; it and tables of corrections are read once, as that takes half of the time."""
     path = tmp_path_factory.mktemp("result") / "result.nc"
     results.save(synthetic_shots.result(), path)
-    once = functools.cache(netcdf.read_netcdf)
+    once = functools.cache(netcdf.read)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(netcdf, "read_netcdf", lambda given: once(given).copy())
+        patched.setattr(netcdf, "read", lambda given: (once(given)[0].copy(), once(given)[1]))
         yield path
 
 
