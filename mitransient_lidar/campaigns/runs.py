@@ -23,6 +23,7 @@ from mitransient_lidar.loading.scenes import open_scene, read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.results.variables import described
 
 #: Half of the side of the square of the places of a sea [m].
 _REACH = 256.0
@@ -225,11 +226,10 @@ class RunRenderer:
 
     def _stored(self, number: int, values: Mapping[str, Any], series: xr.Dataset) -> dict[str, Array]:
         found = dict(self._arrays(number, series))
-        error = "relative standard error of the median bin"
-        found["error_median"] = _number(series.attrs["error_median"], np.float32, error)
-        found["passes"] = _number(series.attrs["passes"], np.int32, "number of passes")
+        found["error_median"] = _number("error_median", series.attrs, np.float32)
+        found["passes"] = _number("passes", series.attrs, np.int32)
         if _SEA in (own := self.inputs(number, values)) and _SEA not in values:
-            found[_SEA] = _number(own[_SEA], np.int64, "parameter surface_seed of the scene")
+            found[_SEA] = _number(_SEA, own, np.int64)
         if self.campaign.design.shots > 1:
             return found
         return {name: _of_one_shot(array) for name, array in found.items()}
@@ -248,11 +248,8 @@ class RunRenderer:
             yield name, _single(series[name].assign_attrs(about))
         if recorded is not None:
             yield "signal", _single(_renamed_time(recorded["signal"], series))
-            yield "gain", _number(recorded.attrs["gain"], np.float64, "factor of the amplifier's transimpedance")
-            yield (
-                "optical_density",
-                _number(recorded.attrs["optical_density"], np.float64, "optical density of the filter"),
-            )
+            for name in ("gain", "optical_density"):
+                yield name, _number(name, recorded.attrs, np.float64)
         if "truth" in keep:
             for name, values in _truth(series).items():
                 yield name, Array(tuple(map(str, values.dims)), values.values, dict(values.attrs))
@@ -276,7 +273,7 @@ class RunRenderer:
         if recorded is not None and (time := _renamed_time(recorded["signal"], series)).dims[-1] != "time":
             found["signal_time"] = Array(("signal_time",), time["signal_time"].values, _plain(series["time"].attrs))
         if "echoes" in self.campaign.keep:
-            found["echo"] = Array(("echo",), np.array(ECHOES), {"long_name": "kind of echo"})
+            found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         return found
 
     def _random(self, number: int) -> np.random.Generator:
@@ -370,9 +367,9 @@ def _single(values: xr.DataArray) -> Array:
     return Array(tuple(map(str, ordered.dims)), np.asarray(ordered, dtype=np.float32), _plain(ordered.attrs))
 
 
-def _number(value: float, dtype: npt.DTypeLike, text: str) -> Array:
+def _number(name: str, values: Mapping[str, Any], dtype: npt.DTypeLike) -> Array:
     """Return a number of each run."""
-    return Array((), np.asarray(value, dtype=dtype), {"units": "1", "long_name": text})
+    return Array((), np.asarray(values[name], dtype=dtype), described(name))
 
 
 def _renamed_time(signal: xr.DataArray, series: xr.Dataset) -> xr.DataArray:

@@ -34,6 +34,7 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
+from mitransient_lidar.results.variables import described
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,12 +63,7 @@ _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError,
 
 _WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
 
-_STATUS = {
-    "units": "1",
-    "long_name": "state of the run",
-    "flag_values": [0, 1, 2],
-    "flag_meanings": "planned done failed",
-}
+_STATUS = {**described("status"), "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
 
 
 #: Module and class of the renderer, and name of a run, by the kind of a store.
@@ -429,17 +425,16 @@ def _fill(
     named = {"units": "1", "long_name": f"number of the {renderer.unit}"}
     make("run", Array(("run",), numbers, named), numbers, chunk=LARGEST_SHARD)
     for name, column in columns.items():
-        described = renderer.describe_input(name, column)
-        make(inputs[name], Array(("run",), column, described), column, chunk=LARGEST_SHARD)
+        like = Array(("run",), column, renderer.describe_input(name, column))
+        make(inputs[name], like, column, chunk=LARGEST_SHARD)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
-    make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
+    make("error", Array((), np.array("", dtype=object), described("error", "campaign")))
     for name, found in arrays.items():
         make(name, found)
     dims = {dim for found in arrays.values() for dim in found.dims}
     if "shot" in dims:
         shots = np.arange(renderer.shots)
-        number = {"units": "1", "long_name": "number of the shot over the sea of the run"}
-        make("shot", Array(("shot",), shots, number), shots)
+        make("shot", Array(("shot",), shots, described("shot", "campaign")), shots)
     axis, time = renderer.axis, coordinates["time"].values
     secondary = [name for name in (*coordinates, *inputs.values(), "surface_seed") if name not in dims]
     about: dict[str, Any] = {

@@ -1,7 +1,7 @@
 """Registry of the variables of all datasets: unit and long name (CF-1.11) of each, in one place.
 
-`label` describes the variables of a dataset by their names. Standard errors follow from what they are of. A name of
-several meanings has an entry for each kind of dataset, ``kind.name``.
+`label` describes the variables of a dataset by their names. Standard errors and limits follow from what they are of. A
+name of several meanings has an entry for each kind of dataset, ``kind.name``.
 """
 
 from __future__ import annotations
@@ -62,6 +62,9 @@ VARIABLES: dict[str, tuple[str, str]] = {
     "information": ("1/(unit of one parameter x unit of the other)", "Fisher information"),
     "correlation": ("1", "correlation of the estimates"),
     "lost_samples": ("1", "share of samples that saturate"),
+    "measured": ("", "measured waveform"),
+    "fitted": ("", "fitted waveform"),
+    "fitted_stderr": ("", "standard error of the fitted waveform by Monte Carlo"),
     "ratio": ("1", "bound over that of the first design"),
     "remarks": ("", "what a record does not determine"),
     "residual": ("1", "measured less fitted, in standard deviations"),
@@ -174,8 +177,22 @@ VARIABLES: dict[str, tuple[str, str]] = {
     "horizontal_a": ("m", "constant part a of the fit a + b d to subaqueous_horizontal"),
     "horizontal_b": ("1", "part b by depth of the fit a + b d to subaqueous_horizontal"),
     # retrieval
-    "slope_along": ("1", "slope of the surface in the plane of incidence, positive for a face towards the lidar"),
-    "slope_across": ("1", "slope of the surface across, positive for a rise to the left"),
+    "slope_along": ("1", "slope of the surface along the lidar's azimuth, positive for a face towards the lidar"),
+    "slope_across": ("1", "slope of the surface across the lidar's azimuth, positive for a rise to the left"),
+    "slope_deg": ("degree", "angle of the surface from the horizontal"),
+    "slope_direction_deg": ("degree", "direction of the rise from the lidar's azimuth"),
+    "surface_range": ("m", "distance to the surface along the axis"),
+    "surface_height": ("m", "height of the surface above the mean sea level"),
+    "plane_misfit": ("ns", "deviation of the echoes from a plane"),
+    "slope_refused": ("1", "1 where a slope is steeper than the sea"),
+    "bottom_energy": ("J", "energy of the bottom echo"),
+    "column_attenuation": ("1/m", "attenuation of the column's signal along the path"),
+    "absorption": ("1/m", "absorption coefficient"),
+    "backscattering": ("1/m", "backscattering coefficient"),
+    "kd": ("1/m", "diffuse attenuation coefficient"),
+    "water.attenuation": ("1/m", "beam attenuation coefficient for the typical bb/b"),
+    "attenuation_low": ("1/m", "smallest beam attenuation coefficient"),
+    "attenuation_high": ("1/m", "largest beam attenuation coefficient"),
     "reflectance": ("1", "reflectance of the bottom"),
     "reflectance_stderr": ("1", "error of the reflectance by the sea, noise and method"),
     "reflectance_corrected": ("", "correction of the reflectance applied"),
@@ -209,6 +226,42 @@ VARIABLES: dict[str, tuple[str, str]] = {
     "within_radius": ("1", "share of the light within a radius of the centroid"),
     "within_shift": ("1", "share of the light that scattering has shifted by at most a radius"),
     "within_delay": ("1", "share of the light that scattering has delayed by at most a delay"),
+    # signals of targets, and their detection
+    "background": ("W", "received power without the target"),
+    "difference": ("W", "received power of the target less what it hides"),
+    "target.echo": ("J", "energy of the difference in the gate"),
+    "backscatter": ("J", "energy of the background in the gate"),
+    "shadow": ("J", "negative energy of the difference after the gate"),
+    "contrast": ("1", "echo over backscatter"),
+    "weight": ("1", "best weight of the pixel in a sum"),
+    "detectability": ("J^(1/2)", "echo over the root of the backscatter"),
+    "combined_echo": ("J", "energy of the difference in the gate, of pixels together"),
+    "combined_contrast": ("1", "echo over backscatter, of pixels together"),
+    "combined_detectability": ("J^(1/2)", "echo over the root of the backscatter, of pixels together"),
+    "deflection": ("1", "deflection of the full signal"),
+    "needed_target": ("1", "share of the target's signal that detection needs"),
+    "needed_energy": ("1", "share of the pulse energy that detection needs"),
+    "needed_at_depth": ("1", "share of the target's signal that detection needs"),
+    "gain_target": ("1", "needed share over that of one detector for all pixels"),
+    "gain_energy": ("1", "needed energy over that of one detector for all pixels"),
+    "detection": ("1", "probability of detecting the full signal"),
+    "pixel_detection": ("1", "probability of detecting the full signal with the pixel alone"),
+    "false_alarm": ("1", "probability of false alarm"),
+    "expected_detection": ("1", "probability of detection in closed form"),
+    "expected_area": ("1", "area below the ROC curve in closed form"),
+    "area": ("1", "area below the ROC curve of random shots"),
+    "drawn_false_alarm": ("1", "share of random shots without the target that raise an alarm"),
+    "drawn_detection": ("1", "share of random shots with the target that are detected"),
+    "depth_bias": ("m", "mean error of the depth of the full echo"),
+    "depth_spread": ("m", "standard deviation of the depth of the full echo"),
+    "depth_gain": ("1", "spread over that of one detector for all pixels"),
+    "depth_bound": ("m", "least standard deviation of the depth of the full echo"),
+    "detectable_depth": ("m", "depth down to which the target is detected"),
+    # highest points of shots
+    "surface_peak": ("W", "highest power of the surface echo"),
+    "bottom_peak": ("W", "highest power of the bottom echo"),
+    "highest.surface_time": ("ns", "time of the highest power of the surface echo"),
+    "bottom_time": ("ns", "time of the highest power of the bottom echo"),
     # flights
     "pulse": ("1", "number of the pulse in the flight"),
     **{f"origin_{axis}": ("m", f"position of the scanner, {axis}") for axis in "xyz"},
@@ -242,6 +295,7 @@ VARIABLES: dict[str, tuple[str, str]] = {
     "true_z": ("m", "height of the surface in the beam or of a solid"),
     "true_target": ("1", "whether the highest solid is a target"),
     # campaigns
+    "surface_seed": ("1", "parameter surface_seed of the scene"),
     "status": ("1", "state of the run"),
     "campaign.error": ("", "why the run failed"),
     "error_median": ("1", "relative standard error of the median bin"),
@@ -272,7 +326,8 @@ def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, A
     Parameters
     ----------
     name
-        Name of the variable; with ``_stderr`` after that of another one, its standard error.
+        Name of the variable; with ``_stderr``, ``_low`` or ``_high`` after that of another one, its standard error or
+        a limit of its interval.
     kind
         Kind of dataset, whose entry ``kind.name`` goes first.
     unit
@@ -284,8 +339,9 @@ def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, A
             own = own if unit is None else unit
             down = {"positive": "down"} if name in _DOWN and kind != "points" else {}
             return {**({"units": own} if own else {}), "long_name": text, **down}
-    if name.endswith("_stderr") and (of := described(name.removesuffix("_stderr"), kind, unit)):
-        return {**of, "long_name": f"standard error of the {of['long_name']}"}
+    for end, what in (("_stderr", "standard error"), ("_low", "lower limit"), ("_high", "upper limit")):
+        if name.endswith(end) and (of := described(name.removesuffix(end), kind, unit)):
+            return {**of, "long_name": f"{what} of the {of['long_name']}"}
     return {}
 
 

@@ -26,6 +26,7 @@ from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
+from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
@@ -188,22 +189,17 @@ def _compared(
         # Nothing is compared with a first design that has no bound.
         ratio = joined["bound"].values / np.where(np.isfinite(first), first, np.nan)
         errors = [_ratio_errors(one, found[0]) for one in found]
-    one_each = {"units": "1"}
     joined = joined.assign(
-        ratio=(("design", "parameter"), ratio, {**one_each, "long_name": "bound over that of the first design"}),
-        ratio_stderr=(("design", "parameter"), errors, {**one_each, "long_name": "standard error of the ratio"}),
-        lost_samples=(
-            "design",
-            [float(one["lost_samples"].mean()) for one in found],
-            {**one_each, "long_name": "share of samples that saturate"},
-        ),
-        remarks=("design", [one.attrs["remarks"] for one in found], {"long_name": "what a record does not determine"}),
+        ratio=(("design", "parameter"), ratio),
+        ratio_stderr=(("design", "parameter"), errors),
+        lost_samples=("design", [float(one["lost_samples"].mean()) for one in found]),
+        remarks=("design", [one.attrs["remarks"] for one in found]),
     )
     values = np.stack([one["parameter_value"].values for one in found])
     coords: dict[str, Any] = {"design": labels, "parameter_value": (("design", "parameter"), values)}
     coords |= {f"design_{name}": ("design", [str(one[name]) for one in designs]) for name in designs[0]}
     joined = joined.assign_coords(coords)
-    return joined.assign_attrs(attributes)
+    return label(joined.assign_attrs(attributes))
 
 
 def _ratio_errors(one: xr.Dataset, first: xr.Dataset) -> list[float]:

@@ -20,6 +20,7 @@ from mitransient_lidar.core.validation import finite, finite_array
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.results.variables import described
 from mitransient_lidar.studies.depth_bias import depth_bias
 
 #: Wind whose ripples a level sea has [m/s].
@@ -130,7 +131,7 @@ def depth_uncertainty(
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
     seas = math.prod(found[0].sizes[axis] for axis in AXES)
     left_out = sum(one.attrs["seas_left_out"] for one in found) + (heights.size - len(found)) * seas
-    rendered = ("altitude", heights[: len(found)], {"units": "m"})
+    rendered = ("altitude", heights[: len(found)], described("altitude"))
     return joined.assign_coords(altitude=rendered).assign_attrs(estimator=estimator, seas_left_out=left_out)
 
 

@@ -23,6 +23,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
+from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -220,7 +221,7 @@ def detect(
         brightest=str(first[0]["pixel"].values[experiments[0].brightest]),
         pulse_fwhm_ns=pulse_fwhm_ns,
     )
-    return xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes)
+    return label(xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes), "detection")
 
 
 def _experiment(

@@ -27,6 +27,7 @@ from mitransient_lidar.physics.lidar.system_attenuation import system_attenuatio
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene
@@ -131,23 +132,16 @@ def fov_sweep(
     # Kd is above c for nearly isotropic scattering, where the fit is not defined.
     fit = system_attenuation(water.attenuation, min(water.kd, water.attenuation), 2 * np.hypot(radius, beam))
     per_field = {
-        "effective_attenuation": ([slope for slope, _ in slopes], "1/m", "attenuation coefficient of the column"),
-        "effective_attenuation_stderr": ([error for _, error in slopes], "1/m", "standard error of the attenuation"),
-        "spot_radius": (radius, "m", "radius of the circle that the receiver sees on the surface"),
-        "scaled_radius": (water.attenuation * radius, "1", "beam attenuation times spot radius"),
-        "system_attenuation": (fit, "1/m", "fit to Gordon's results"),
+        "effective_attenuation": [slope for slope, _ in slopes],
+        "effective_attenuation_stderr": [error for _, error in slopes],
+        "spot_radius": radius,
+        "scaled_radius": water.attenuation * radius,
+        "system_attenuation": fit,
     }
-    data: dict[str, Any] = {
-        key: ("field_of_view", np.asarray(values), {"units": units, "long_name": meaning})
-        for key, (values, units, meaning) in per_field.items()
-    }
+    data: dict[str, Any] = {key: ("field_of_view", np.asarray(values)) for key, values in per_field.items()}
     over_time = ("field_of_view", "time")
-    data["impulse_response"] = (over_time, mean, {"units": "J", "long_name": "received energy per bin"})
-    data["impulse_response_stderr"] = (over_time, stderr, {"units": "J", "long_name": "its standard error"})
-    coords = {
-        "field_of_view": ("field_of_view", fields, {"units": "mrad", "long_name": "full angle of the field of view"}),
-        "time": ("time", lidar.axis.centres_ns, {"units": "ns"}),
-    }
+    data |= {"impulse_response": (over_time, mean), "impulse_response_stderr": (over_time, stderr)}
+    coords = {"field_of_view": fields, "time": lidar.axis.centres_ns}
     attributes = session.attributes(
         lidar,
         seed=seed,
@@ -162,7 +156,7 @@ def fov_sweep(
         beam_radius=beam,
         left_out_mrad=left_out,
     )
-    return xr.Dataset(data, coords, attributes)
+    return label(xr.Dataset(data, coords, attributes))
 
 
 def describe_fov_sweep(found: xr.Dataset) -> list[str]:

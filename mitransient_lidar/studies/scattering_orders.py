@@ -15,6 +15,7 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import label
 from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
 
 _REVERSALS = ("one", "several")
@@ -91,22 +92,22 @@ def scattering_orders(
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {
-        "impulse_response": (dims, energy.mean.reshape(shape), {"units": "J", "long_name": "received energy per bin"}),
-        "impulse_response_stderr": (dims, energy.stderr.reshape(shape), {"units": "J"}),
-        "waveform": (dims, power.mean.reshape(shape), {"units": "W", "long_name": "received power"}),
-        "waveform_stderr": (dims, power.stderr.reshape(shape), {"units": "W"}),
+        "impulse_response": (dims, energy.mean.reshape(shape)),
+        "impulse_response_stderr": (dims, energy.stderr.reshape(shape)),
+        "waveform": (dims, power.mean.reshape(shape)),
+        "waveform_stderr": (dims, power.stderr.reshape(shape)),
         # Errors of sums are estimated from the passes, since bins of a pass share paths.
-        "energy": (dims[1:3], totals.mean, {"units": "J", "long_name": "received energy"}),
-        "energy_stderr": (dims[1:3], totals.stderr, {"units": "J"}),
+        "energy": (dims[1:3], totals.mean),
+        "energy_stderr": (dims[1:3], totals.stderr),
     }
     coords = {
         "pixel": list(pixels.names),
         "reversals": list(_REVERSALS),
-        "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
-        "time": ("time", axis.centres_ns, {"units": "ns"}),
+        "order": np.arange(orders + 1),
+        "time": axis.centres_ns,
     }
     attributes = session.attributes(lidar, chosen, **log.attributes(seed))
-    return xr.Dataset(data, coords=coords, attrs=attributes)
+    return label(xr.Dataset(data, coords=coords, attrs=attributes), "orders")
 
 
 def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:

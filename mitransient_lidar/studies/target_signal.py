@@ -20,6 +20,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -166,7 +167,7 @@ def target_map(
         cell = target_signal(scene, moved, **options).drop_dims("time")
         if cell.attrs.get("interrupted"):
             raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
-        cells.append(cell.assign(place_passes=((), cell.attrs["passes"], {"units": "1", "long_name": "passes"})))
+        cells.append(cell.assign(place_passes=((), cell.attrs["passes"], described("place_passes"))))
         if progress is not None:
             progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
@@ -253,8 +254,8 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
         statistics = PassStatistics()
         for one in values:
             statistics.add(one)
-        data[name] = (("pixel", "time"), statistics.mean, {"units": "W"})
-        data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr, {"units": "W"})
+        data[name] = (("pixel", "time"), statistics.mean)
+        data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr)
     summed = data["difference"][1].sum(axis=0)
     if not np.any(summed > 0):
         raise UserError("target: it returns no light within the record; check its place, and the start of the record")
@@ -273,15 +274,13 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
     total = power.sum(axis=0)
     means = gated(total / len(power))
     left_out = [gated((total - power[group].sum(axis=0)) / (len(power) - len(group))) for group in groups]
-    units = {"echo": "J", "backscatter": "J", "shadow": "J", "detectability": "J^(1/2)"}
     for name, value in means.items():
         error = np.sqrt((_GROUPS - 1) * np.mean([(other[name] - value) ** 2 for other in left_out], axis=0))
         dims = "combination" if name.startswith("combined") else "pixel"
-        unit = units.get(name.removeprefix("combined_"), "1")
-        data[name] = (dims, value, {"units": unit})
-        data[f"{name}_stderr"] = (dims, error, {"units": unit})
-    coords = {"time": ("time", time, {"units": "ns"}), "combination": ["sum", "best"]}
-    return xr.Dataset(data, coords=coords, attrs={"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak})
+        data |= {name: (dims, value), f"{name}_stderr": (dims, error)}
+    coords = {"time": time, "combination": ["sum", "best"]}
+    attributes = {"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak}
+    return label(xr.Dataset(data, coords=coords, attrs=attributes), "target")
 
 
 def describe_target(result: xr.Dataset) -> list[str]:

@@ -24,6 +24,7 @@ from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.results.variables import described
 
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
@@ -92,9 +93,8 @@ class Measured:
 
     def labelled(self, values: npt.ArrayLike, name: str) -> xr.DataArray:
         """Return values of shape (pixel, time) with the dimensions and coordinates of the waveforms."""
-        unit = self.template.attrs.get("units", "")
-        array = np.reshape(values, self.template.shape)
-        return self.template.copy(data=array).assign_attrs({"units": unit, "long_name": name})
+        about = {"units": self.template.attrs.get("units", ""), "long_name": name, **described(name)}
+        return self.template.copy(data=np.reshape(values, self.template.shape)).assign_attrs(about)
 
     def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
         """Return the scale of the samples of a model, of the same shape, by least squares with variances `noise`.

@@ -19,6 +19,7 @@ from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.results.files import dataset_of
 from mitransient_lidar.results.geometry import required_number
+from mitransient_lidar.results.variables import described
 
 #: Dimensions of a table that depths are interpolated in, in this order, before estimator and pixel.
 AXES = ("off_nadir_deg", "wind_speed", "water", "depth")
@@ -194,14 +195,13 @@ def correct_depths(
         # A pixel without light of the surface has the time of another one.
         error = (error**2 + rounding.max("pixel") ** 2).transpose(*correction.dims) ** 0.5
     behind = xr.DataArray([False, False, True, True], dims="echo") & correction.notnull()
-    described = {"units": "m", "long_name": "mean error that was subtracted from the depth"}
     stated = {
         "depth_m": found["depth_m"] - correction.fillna(0),
         "depth_m_stderr": found["depth_m_stderr"] * of_echoes(share).where(behind, 1.0),
         "depth_m_method_error": found["depth_m_method_error"].where(~behind | error.isnull(), error),
     }
     added = {name: values.assign_attrs(found[name].attrs) for name, values in stated.items()}
-    corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described)})
+    corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described("depth_correction_m"))})
     return corrected.assign_attrs(depth_corrections=table.attrs["instrument"])
 
 
