@@ -29,7 +29,7 @@ _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 
 def detect_waveforms(
-    dataset: xr.Dataset,
+    dataset: results.Given,
     chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
     shots: int = 1,
     seed: int = 0,
@@ -91,6 +91,7 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
+    dataset = results.dataset_of("dataset", dataset, "waveforms")
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     if len(groups) == 1:
         recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky)

@@ -27,6 +27,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import integer, require_memory, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.results.files import checked_path
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -89,11 +90,8 @@ def sweep(
     KeyboardInterrupt
         After Ctrl-C; processes write the runs that they have, which stay.
     """
-    return open_campaign(
-        complete(
-            lambda: _prepare(_campaign(campaign), Path(store), shard_size), workers, scheduler, retry_failed, progress
-        ).path
-    )
+    path, given = checked_path("store", store), (workers, scheduler, retry_failed, progress)
+    return open_campaign(complete(lambda: _prepare(_campaign(campaign), path, shard_size), *given).path)
 
 
 def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
@@ -154,7 +152,9 @@ def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> C
     """Return a campaign that may be given as a file or a dict."""
     if isinstance(given, Campaign):
         return given
-    return Campaign.of(given) if isinstance(given, Mapping) else Campaign.read(given)
+    if isinstance(given, Mapping):
+        return Campaign.of(given)
+    return Campaign.read(checked_path("campaign", given))
 
 
 def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:

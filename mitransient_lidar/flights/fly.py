@@ -19,6 +19,7 @@ from mitransient_lidar.flights.preparation import telling_errors_alone
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.results.files import checked_path
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -76,8 +77,8 @@ def fly(
     if isinstance(flight, Mapping):
         plan = FlightPlan.of(flight)
     else:
-        plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
-    folder = Path(folder)
+        plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(checked_path("flight", flight))
+    folder = checked_path("folder", folder)
     coordinate_system_wkt(plan.crs, plan.origin[:2])
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size, progress), workers, scheduler, False, progress)
     flown = Flown.of(store)

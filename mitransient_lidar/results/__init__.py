@@ -11,9 +11,10 @@ from mitransient_lidar.results.dataset import (
     record_dims,
     time_axis,
 )
-from mitransient_lidar.results.files import dataset_of, open, save
+from mitransient_lidar.results.files import Given, dataset_of, open, save
 
 __all__ = [
+    "Given",
     "add_batches",
     "add_components",
     "add_derivatives",

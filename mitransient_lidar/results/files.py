@@ -26,7 +26,7 @@ _KINDS = {
     "signals": ("signals of a receiver", ("signal",)),
     "gates": ("a gate stack", ("gate_energy", "gate_energy_stderr")),
     "radiance": ("images by daylight", ("radiance", "radiance_stderr")),
-    "echoes": ("a table of echoes", ("time_ns", "depth_m", "flags")),
+    "echoes": ("a table of echoes", ("depth_m", "flags")),
     "corrections": ("a table of depth errors", ("bias", "spread", "found", "noise_error", "attenuation")),
     "bounds": ("bounds of parameters", ("bound", "bound_known", "ratio")),
     "points": ("points of a flight", ("x", "y", "z", "kind")),

@@ -18,6 +18,7 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
+    corrections_for,
     summarize_depths,
     usual_attenuation,
 )
@@ -29,6 +30,7 @@ from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
@@ -80,7 +82,7 @@ def depth_bias(
     records: int = 5,
     target_error: float = 0.05,
     seed: int = 1,
-    corrections: xr.Dataset | None = None,
+    corrections: Given | None = None,
     max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -119,7 +121,7 @@ def depth_bias(
     seed
         Seed of places, seas and noise, at least 0.
     corrections
-        A former table, to correct the depths by.
+        A former table, its file, or ``auto`` for the shipped one of the instrument, to correct the depths by.
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
         out are NaN, and the attribute ``seas_left_out`` has their number.
@@ -148,6 +150,7 @@ def depth_bias(
         If a render was interrupted.
     """
     own = read_instrument(instrument)
+    corrections = None if corrections is None else corrections_for(instrument, corrections)
     usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
     other = usual + (_FURTHER if usual < _GRAZING else -_FURTHER)
     axes = {

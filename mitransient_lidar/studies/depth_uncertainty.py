@@ -20,6 +20,7 @@ from mitransient_lidar.core.validation import finite, finite_array
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 from mitransient_lidar.studies.depth_bias import depth_bias
 
@@ -48,7 +49,7 @@ def depth_uncertainty(
     shots: int = 12,
     records: int = 4,
     seed: int = 1,
-    corrections: xr.Dataset | None = None,
+    corrections: Given | None = None,
     max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:

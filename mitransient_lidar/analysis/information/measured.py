@@ -161,7 +161,7 @@ def measured(
         of range.
     """
     given = None if noise is None else positive("noise", noise)
-    is_table = not isinstance(source, xr.Dataset) and Path(source).suffix.lower() not in (".nc", ".exr")
+    is_table = isinstance(source, (str, os.PathLike)) and Path(source).suffix.lower() not in (".nc", ".exr", "")
     if not is_table:
         source = results.dataset_of("source", source, "waveforms", "signals")
     if isinstance(source, xr.Dataset) and "signal" in source:

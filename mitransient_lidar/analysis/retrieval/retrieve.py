@@ -31,6 +31,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
@@ -397,7 +398,7 @@ def water(
 
 
 def retrieve(
-    dataset: xr.Dataset,
+    dataset: Given,
     *,
     wind_speed: float | None = None,
     wind_direction_deg: float | None = None,
@@ -408,6 +409,7 @@ def retrieve(
 
     The arguments and errors are those of these functions. If no quantity can be estimated, `UserError` is raised.
     """
+    dataset = dataset_of("dataset", dataset, "waveforms")
     if "pixel" in dataset.dims and dataset.sizes["pixel"] == 1:
         slopes = _unknown_slopes(dataset)
     else:

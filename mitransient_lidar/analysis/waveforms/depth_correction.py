@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.resources
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_ec
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.results.files import dataset_of
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import required_number
 from mitransient_lidar.results.variables import described
 
@@ -37,13 +36,13 @@ _NEAR = 2.0  # largest error of a depth that counts [m]
 _LEVEL = 1e-6  # largest difference of the heights of a level sea [m]
 
 
-def corrections_for(instrument: str, given: xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
+def corrections_for(instrument: str, given: Given, name: str = "corrections") -> xr.Dataset:
     """Return a table of corrections, as of `studies.depth_bias`: itself, of a file, or with ``auto`` the shipped one.
 
     Raises
     ------
     UserError
-        If it cannot be read, there is none of the instrument, or it is no such table.
+        If it cannot be read, there is none of the instrument, or it is no such table; `name` is that of the parameter.
     """
     source = given
     if isinstance(given, str) and given == "auto":
@@ -57,7 +56,7 @@ def corrections_for(instrument: str, given: xr.Dataset | str | os.PathLike[str])
             raise UserError(
                 f"there are no shipped corrections of the instrument {instrument}: make them with depth-bias"
             )
-    table = dataset_of("corrections", source, "corrections")
+    table = dataset_of(name, source, "corrections")
     place = "the table of corrections" if isinstance(source, xr.Dataset) else source
     wanted = {*AXES, "estimator", "pixel"}
     known = "ripples" in table.coords and "instrument" in table.attrs
@@ -72,9 +71,7 @@ def corrections_for(instrument: str, given: xr.Dataset | str | os.PathLike[str])
     return table.transpose(*AXES, "estimator", "pixel")
 
 
-def correct_depths(
-    found: xr.Dataset, table: xr.Dataset, wind_speed: float | None = None, turn_deg: float = 0.0
-) -> xr.Dataset:
+def correct_depths(found: Given, table: Given, wind_speed: float | None = None, turn_deg: float = 0.0) -> xr.Dataset:
     """Subtract the mean errors of a table from the depths of bottoms and targets.
 
     Parameters
@@ -127,7 +124,9 @@ def correct_depths(
     and ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
     where no other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
-    instrument = found.attrs.get("instrument", "")
+    found = dataset_of("found", found, "echoes")
+    instrument = str(found.attrs.get("instrument", ""))
+    table = corrections_for(instrument, table, "table")
     if instrument != table.attrs["instrument"]:
         own = f"instrument {instrument}" if instrument else "no instrument"
         raise UserError(f"the corrections are of the instrument {table.attrs['instrument']}, but the result has {own}")

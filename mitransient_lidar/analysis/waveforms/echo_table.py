@@ -30,6 +30,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import flagged, label
 
@@ -51,7 +52,7 @@ _PER_WAVEFORM = (
 
 
 def extract(
-    dataset: xr.Dataset,
+    dataset: Given,
     estimators: str | Sequence[str] = "gaussian",
     *,
     pulse: Pulse | None = None,
@@ -190,6 +191,7 @@ def extract(
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
     attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
+    dataset = dataset_of("dataset", dataset, "waveforms", "signals")
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
     if not names or (unknown := [name for name in names if name not in ESTIMATORS]):
