@@ -53,7 +53,9 @@ _variants.limit_threads()
 if TYPE_CHECKING:
     import xarray
 
+    from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
     from mitransient_lidar.analysis.gates.cut import cut_gates
+    from mitransient_lidar.analysis.gates.range_images import depth_image
     from mitransient_lidar.analysis.receiver import detect_waveforms as record
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve
     from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths
@@ -62,8 +64,14 @@ if TYPE_CHECKING:
     from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+    from mitransient_lidar.loading.scenes import open_scene
+    from mitransient_lidar.physics.lidar.gate_train import GateTrain
+    from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
+    from mitransient_lidar.physics.water.profiles import read_profile
+    from mitransient_lidar.physics.water.water_types import water_of
     from mitransient_lidar.plots.publication.figures import figures
     from mitransient_lidar.plots.viewer import view
+    from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.studies.bounds import bounds
@@ -72,55 +80,78 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
     from mitransient_lidar.studies.fit import fit
+    from mitransient_lidar.studies.fov_sweep import fov_sweep
+    from mitransient_lidar.studies.scattering_orders import scattering_orders
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
+    "GateTrain": ("physics.lidar.gate_train", "GateTrain"),
+    "SURVEY_ORDERS": ("analysis.depth_uncertainty", "SURVEY_ORDERS"),
     "bounds": ("studies.bounds", "bounds"),
     "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
     "cut_gates": ("analysis.gates.cut", "cut_gates"),
     "depth_bias": ("studies.depth_bias", "depth_bias"),
+    "depth_image": ("analysis.gates.range_images", "depth_image"),
     "depth_uncertainty": ("studies.depth_uncertainty", "depth_uncertainty"),
     "detect": ("studies.detection", "detect"),
     "estimate": ("studies.estimate", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
+    "fov_sweep": ("studies.fov_sweep", "fov_sweep"),
     "instrument_names": ("loading.instruments", "instrument_names"),
+    "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
+    "open_scene": ("loading.scenes", "open_scene"),
     "read_instrument": ("loading.instruments", "read_instrument"),
+    "read_profile": ("physics.water.profiles", "read_profile"),
     "record": ("analysis.receiver", "detect_waveforms"),
     "render": ("rendering.render", "render"),
+    "render_passive": ("rendering.passive", "render_passive"),
     "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
+    "scattering_orders": ("studies.scattering_orders", "scattering_orders"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
     "sweep": ("campaigns.sweep", "sweep"),
     "view": ("plots.viewer", "view"),
+    "water_of": ("physics.water.water_types", "water_of"),
     "waveforms": ("analysis.waveforms.echo_table", "extract"),
 }
 
+#: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [
+    "SURVEY_ORDERS",
+    "GateTrain",
     "__version__",
     "bounds",
     "correct_depths",
     "cut_gates",
     "depth_bias",
+    "depth_image",
     "depth_uncertainty",
     "detect",
     "estimate",
     "figures",
     "fit",
     "fly",
+    "fov_sweep",
     "instrument_names",
-    "open",
+    "kelvin_wake",
+    "open_scene",
     "read_instrument",
+    "read_profile",
     "record",
     "render",
+    "render_passive",
     "render_shots",
     "retrieve",
+    "save",
+    "scattering_orders",
     "scene_names",
     "scene_parameters",
     "sweep",
     "view",
+    "water_of",
     "waveforms",
 ]
 
@@ -161,7 +192,7 @@ def open(path: str | os.PathLike[str]) -> xarray.Dataset:
     UserError
         If nothing of this package is there, or it is damaged.
     """
-    from mitransient_lidar.results.files import checked_path
+    from mitransient_lidar.core.files import checked_path
     from mitransient_lidar.results.files import open as open_file
 
     place = checked_path("path", path)
@@ -190,7 +221,8 @@ def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
     UserError
         If the suffix is another one, the format cannot store the dataset, or the file cannot be written.
     """
-    from mitransient_lidar.results.files import checked_path, dataset_of
+    from mitransient_lidar.core.files import checked_path
+    from mitransient_lidar.results.files import dataset_of
     from mitransient_lidar.results.files import save as save_file
 
     if checked_path("path", path).suffix.lower() != ".csv":

@@ -24,10 +24,10 @@ from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, PLAN
 from mitransient_lidar.campaigns.versions import check_versions
 from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import integer, require_memory, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.results.files import checked_path
 
 if TYPE_CHECKING:
     from distributed import Client

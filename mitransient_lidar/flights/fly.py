@@ -12,6 +12,7 @@ import xarray as xr
 from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import complete
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
@@ -19,7 +20,6 @@ from mitransient_lidar.flights.preparation import telling_errors_alone
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.results.files import checked_path
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -13,7 +13,7 @@ import xarray as xr
 
 from mitransient_lidar.core.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import open_file, replacing
+from mitransient_lidar.core.files import checked_path, open_file, replacing
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, netcdf, sum_errors
 from mitransient_lidar.results.dataset import LIGHT, check_axes
@@ -115,13 +115,6 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
         return exr.parts_of(images, path, "radiance")
     stored = _listed(("result", "gates", "radiance"))
     raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file.")
-
-
-def checked_path(name: str, path: object) -> Path:
-    """Return a path; raise `UserError` if it is no text or path, or empty."""
-    if not isinstance(path, (str, os.PathLike)) or not str(path):
-        raise UserError(f"{name} = {shown(path)} must be the path of a file or folder")
-    return Path(path)
 
 
 def is_exr(path: str | os.PathLike[str]) -> bool:

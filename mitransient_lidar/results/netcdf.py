@@ -52,7 +52,8 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     dataset = dataset.drop_encoding()
     attributes = {str(name): attribute(str(name), value) for name, value in dataset.attrs.items()}
     dataset.attrs = shown(attributes)
-    others = {name: value for name, value in attributes.items() if name not in dataset.attrs}
+    # All names, in their order: without a value, those that the file has itself.
+    others = {name: None if name in dataset.attrs else value for name, value in attributes.items()}
     dataset.attrs[OTHERS] = json.dumps(others)
     # No fill value: CF forbids it for coordinates, and a NaN in the data is a value.
     encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in dataset.variables}
@@ -125,12 +126,14 @@ def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
         dataset = file.load().drop_encoding()
         foreign = OTHERS not in dataset.attrs
         others = parse_json(dataset.attrs.pop(OTHERS, "{}"), f"the attribute {OTHERS} of {path}")
-        named = {str(name): value for name, value in dataset.attrs.items()} | dict(others)
+        own = {str(name): value for name, value in dataset.attrs.items()}
+        # Another program may have removed or added some since.
+        named = {name: own.get(name, value) for name, value in dict(others).items() if name in own or value is not None}
         for name, coordinate in dataset.coords.items():
             if coordinate.dtype.kind == "O":
                 dataset[name] = coordinate.astype(str)
     try:
-        dataset.attrs = {name: attribute(name, value) for name, value in named.items()}
+        dataset.attrs = {name: attribute(name, value) for name, value in {**named, **own}.items()}
     except ValueError as error:
         raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
     return dataset, foreign

@@ -405,9 +405,27 @@ def retrieve(
     slope_deviation: tuple[float, float] | None = None,
     efficiency: float | None = None,
 ) -> xr.Dataset:
-    """Return the estimates of `surface_slopes`, `bottom` and, if the view is wide enough, `water`; NaN where unknown.
+    """Estimate surface, bottom and, if the view is wide enough, water from the waveforms of the pixels.
 
-    The arguments and errors are those of these functions. If no quantity can be estimated, `UserError` is raised.
+    Parameters
+    ----------
+    dataset : xarray.Dataset or path
+        Waveforms of one shot or of a series.
+    wind_speed, wind_direction_deg, slope_deviation
+        Wind [m/s], its direction [degree], or standard deviations of the slopes [1] of the sea, as for
+        `surface_slopes`.
+    efficiency : float, optional
+        Efficiency of optics and atmosphere, 0 to 1, as for `bottom`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The variables of `surface_slopes`, `bottom` and `water`; NaN where unknown.
+
+    Raises
+    ------
+    UserError
+        If a number is out of range, the dataset lacks what these functions need, or no quantity can be estimated.
     """
     dataset = dataset_of("dataset", dataset, "waveforms")
     if "pixel" in dataset.dims and dataset.sizes["pixel"] == 1:

@@ -324,7 +324,10 @@ def changed(value):
     ("call", "message"),
     [
         (lambda: detect_waveforms(make(), "pmtt"), "chain = 'pmtt' must be .*apd"),
-        (lambda: detect_waveforms(make().drop_vars("waveform"), CHAIN), "no variable waveform"),
+        (
+            lambda: detect_waveforms(make().drop_vars("waveform"), CHAIN),
+            "another dataset, but must have waveforms",
+        ),
         (lambda: detect_waveforms(make().transpose("time", "pixel"), CHAIN), r"dimensions \('time', 'pixel'\)"),
         (lambda: detect_waveforms(make().drop_vars("time"), CHAIN), "no coordinate time"),
         (lambda: detect_waveforms(make().drop_vars("pixel"), CHAIN), "no coordinate pixel"),

@@ -187,9 +187,7 @@ def test_series_of_shots_from_end_to_end(scene, tmp_path):
     lines = echoes.read_text().splitlines()
     assert "true_surface_height" in lines[0]
     assert {line.split(",")[0] for line in lines[1:]} == {"0", "1"}
-    assert_refused(
-        run("retrieve", signals), "holds signals of a receiver; give the result that they were recorded from"
-    )
+    assert_refused(run("retrieve", signals), "holds signals of a receiver, but FILE must have waveforms of a render")
     check(run("retrieve", shots, "--figure", tmp_path / "slopes.png"), tmp_path)
     check(run("plot", shots), tmp_path)
     check(run("plot", signals, "--shot", 1), tmp_path)
