@@ -33,8 +33,8 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 @alone
 def render(
     scene: str | Path | Mapping[str, Any] | mi.Scene | LoadedScene | SceneRecord | xarray.Dataset,
-    *,
     params: Mapping[str, Any] | None = None,
+    *,
     instrument: str | None = None,
     sensor: str | None = None,
     integrator: str | Mapping[str, Any] | mi.Integrator | None = None,

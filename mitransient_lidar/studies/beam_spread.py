@@ -58,6 +58,7 @@ def beam_spread(
     depths: npt.ArrayLike,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     passes: int = 8,
     max_time: float | None = None,
     photons: int = 2**16,
@@ -68,7 +69,7 @@ def beam_spread(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`.
     depths
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
@@ -117,7 +118,7 @@ def beam_spread(
         raise UserError("depths must hold at least one depth in metres")
     if wanted[0] <= 0:
         raise UserError(f"depths = {wanted[0]:g} m must be greater than 0")
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

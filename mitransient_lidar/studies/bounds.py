@@ -41,6 +41,7 @@ def bounds(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     free: Sequence[str],
     over: Mapping[str, Sequence[Any]] | None = None,
     receiver: Any = None,
@@ -58,7 +59,7 @@ def bounds(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`.
     free
         Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
@@ -115,7 +116,7 @@ def bounds(
     receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render
-        session = open_scene(scene, {**(params or {}), **design})
+        session = open_scene(scene, {**(params or {}), **design}, instrument)
     began, found = time.perf_counter(), []
     for number, design in enumerate(designs):
         if number and time.perf_counter() - began > limit:
@@ -125,6 +126,7 @@ def bounds(
         for i in range(renders):
             # Seeds of a render are signed.
             options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
+            options["instrument"] = instrument
             results.append(render(scene, params={**(params or {}), **design}, **options))
             if results[-1].attrs.get("interrupted"):
                 raise KeyboardInterrupt("interrupted; bounds need all renders, and none is kept.")

@@ -38,6 +38,7 @@ def detect(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     receiver: ReceiverChain | str = "apd",
     pfa: float = 1e-3,
     pd: float = 0.9,
@@ -57,7 +58,7 @@ def detect(
 
     Parameters
     ----------
-    scene, params, target_id, integrator
+    scene, params, instrument, target_id, integrator
         As for `target_signal.target_signal`, with at most 16 pixels.
     receiver
         Detector and electronics of every pixel, or a name in `physics.receiver.presets.RECEIVERS`.
@@ -135,7 +136,7 @@ def detect(
     limit = RenderOptions(max_time=max_time).max_time or math.inf
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     for option, wanted, key in (("depths", depths, "target_depth"), ("clutter", clutter, "surface_seed")):
         if wanted and key not in session.parameters:
             raise UserError(f"scene {session.name} has no parameter {key}, which {option} needs")
@@ -146,7 +147,7 @@ def detect(
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render
-        find_target(open_scene(scene, {**(params or {}), "target_depth": depth}).scene, target_id)
+        find_target(open_scene(scene, {**(params or {}), "target_depth": depth}, instrument).scene, target_id)
     began, left_out = time.perf_counter(), ""
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []
@@ -157,13 +158,13 @@ def detect(
             _LOG.warning("max_time = %g s ended before the depths of %s m, which are left out", limit, left_out)
             break
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
-        fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
+        fixed = session.scene if place is None else open_scene(scene, moved, instrument).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
         axis: TimeAxis | None = None
         for i in range(renders):
             if clutter:
                 number = int(float(session.parameters["surface_seed"])) + 1 + i
-                sea = open_scene(scene, {**moved, "surface_seed": number})
+                sea = open_scene(scene, {**moved, "surface_seed": number}, instrument)
                 # The records of all seas have the bins of the first one.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
             found.append(

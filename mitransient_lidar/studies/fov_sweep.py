@@ -42,6 +42,7 @@ def fov_sweep(
     fov_mrad: npt.ArrayLike,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     min_depth: float = 1.0,
     max_depth: float = 5.0,
     passes: int = 48,
@@ -53,7 +54,7 @@ def fov_sweep(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
         ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
     fov_mrad
@@ -111,7 +112,7 @@ def fov_sweep(
     fields = np.unique(finite_array("fov_mrad", fov_mrad))
     if fields.size == 0 or fields[0] <= 0:
         raise UserError(f"fov_mrad = {fields.tolist()} must hold at least one angle, each greater than 0")
-    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
+    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     lidar = find_lidar_scene(session.scene, session.sensor)

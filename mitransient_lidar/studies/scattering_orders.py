@@ -26,6 +26,7 @@ def scattering_orders(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     orders: int = 8,
     passes: int = 32,
     max_time: float | None = None,
@@ -41,7 +42,7 @@ def scattering_orders(
 
     Parameters
     ----------
-    scene, params, integrator
+    scene, params, instrument, integrator
         As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
@@ -71,7 +72,7 @@ def scattering_orders(
     orders = integer("orders", orders, 1, MOST_ORDERS)
     passes, options = integer("passes", passes, 2, 100_000), RenderOptions(max_time=max_time)
     seed = integer("seed", seed, 0, 2**53)
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
     lidar = renderer.scene

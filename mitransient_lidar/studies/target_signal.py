@@ -35,6 +35,7 @@ def target_signal(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: str | None = None,
     target_id: str = "target",
     passes: int = 64,
     max_time: float | None = None,
@@ -51,7 +52,7 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, seed, integrator
+    scene, params, instrument, seed, integrator
         As for `rendering.render.render`.
     target_id
         Id of the target's shape.
@@ -88,7 +89,7 @@ def target_signal(
     detectabilities are ratios of signal-to-noise ratios for every detector.
     """
     passes, options = integer("passes", passes, _GROUPS, 100_000), RenderOptions(max_time=max_time, seed=seed)
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
     with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)

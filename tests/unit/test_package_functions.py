@@ -53,6 +53,12 @@ def test_every_name_is_documented(name):
         assert pydoc.plain(pydoc.render_doc(FUNCTIONS[name]))
 
 
+# Images by daylight have no laser, which an instrument replaces.
+@pytest.mark.parametrize("name", [one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"])
+def test_parameters_and_an_instrument_go_with_every_scene(name):
+    assert {"params", "instrument"} < {*parameters(name)}
+
+
 def test_a_star_import_leaves_open_alone():
     names = {}
     exec("from mitransient_lidar import *", names)
