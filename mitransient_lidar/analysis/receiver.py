@@ -19,6 +19,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, inte
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
@@ -277,6 +278,7 @@ def _record_channel(
     labels = dataset["shot"].values if series and number == 1 else np.arange(len(signal))
     attributes = {
         **dataset.attrs,
+        **made_from(dataset.attrs, "Signals of a receiver", "recorded"),
         "time_start_ns": float(time[0]) - 0.5 * width * stride,
         "bin_width_ns": width * stride,
         "rendered_bin_width_ns": width,

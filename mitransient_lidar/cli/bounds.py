@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -86,7 +86,7 @@ def bounds(
     if len(designs) < len(over or []):
         raise UserError("--over names a parameter twice: give all its values in one option")
     nuisances = dict(_nuisance(one) for one in nuisance or [])
-    settings = {
+    settings: dict[str, Any] = {
         name: None if text is None else number_or_auto(f"--{name.replace('_', '-')}", text)
         for name, text in (("gain", gain), ("optical_density", optical_density))
     }

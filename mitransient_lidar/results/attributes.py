@@ -96,12 +96,17 @@ def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def titled(what: str, attributes: Mapping[str, Any]) -> str:
+def made_from(attributes: Mapping[Any, Any], title: str, done: str) -> dict[str, str]:
+    """Return ``title`` and ``history`` of a dataset that is made from one with these attributes."""
+    return {"title": titled(title, attributes), "history": step_of_history(done, attributes)}
+
+
+def titled(what: str, attributes: Mapping[Any, Any]) -> str:
     """Return a title that names the scene in the attributes, if they have one."""
     return f"{what}, scene {attributes['scene']}" if "scene" in attributes else what
 
 
-def step_of_history(done: str, attributes: Mapping[str, Any] | None = None) -> str:
+def step_of_history(done: str, attributes: Mapping[Any, Any] | None = None) -> str:
     """Return the attribute ``history`` of a dataset with a line about what was done with it now."""
     line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {done} by mitransient-lidar {__version__}"
     return "\n".join(part for part in (str((attributes or {}).get("history", "")), line) if part)

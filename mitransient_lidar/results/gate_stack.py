@@ -24,7 +24,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import sum_errors
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates, step_of_history, titled
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, made_from
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number
 from mitransient_lidar.results.variables import label
 
@@ -143,8 +143,7 @@ def build_gates(
     stack = label(pixels.assign(variables).assign_coords({name: ("gate", values) for name, values in axis.items()}))
     stack.attrs = {
         **attributes,
-        "title": titled("Energy in gates", attributes),
-        "history": step_of_history("cut into gates", attributes),
+        **made_from(attributes, "Energy in gates", "cut into gates"),
         "gate_step_ns": train.step_ns,
         "gate_rise_ns": train.rise_ns,
         "gate_fall_ns": train.fall_ns,

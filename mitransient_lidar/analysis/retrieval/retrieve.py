@@ -31,6 +31,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
@@ -446,7 +447,7 @@ def retrieve(
     measured = ("surface_range", "depth_m", "column_attenuation")
     if not any(np.isfinite(found[name]).any() for name in measured if name in found):
         raise UserError("nothing can be estimated: no waveform has a surface echo, a column or a bottom echo")
-    return found
+    return found.assign_attrs(made_from(dataset.attrs, "Surface, bottom and water", "estimated"))
 
 
 def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:

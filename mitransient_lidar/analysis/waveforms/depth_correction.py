@@ -16,6 +16,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_ec
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.results.attributes import step_of_history
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import required_number
 from mitransient_lidar.results.variables import described
@@ -201,7 +202,8 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
     }
     added = {name: values.assign_attrs(found[name].attrs) for name, values in stated.items()}
     corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described("depth_correction_m"))})
-    return corrected.assign_attrs(depth_corrections=table.attrs["instrument"])
+    history = step_of_history("corrected", found.attrs)
+    return corrected.assign_attrs(depth_corrections=table.attrs["instrument"], history=history)
 
 
 def _learnt(table: xr.Dataset) -> xr.Dataset:

@@ -30,6 +30,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
+from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import flagged, label
@@ -406,6 +407,7 @@ def _label(
     if several:
         coords["estimator"] = ("estimator", list(settings.estimators))
     provenance = {
+        **made_from(dataset.attrs, "Echoes", "measured"),
         "estimators": list(settings.estimators),
         "echo_fwhm_ns": waveforms.echo_fwhm_ns,
         "echo_threshold": settings.threshold,
