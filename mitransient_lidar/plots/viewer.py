@@ -32,7 +32,8 @@ class View:
     """
 
     def __init__(self, page: str, name: str, height: int) -> None:
-        self.page, self.height = page, height
+        self.page: str = page
+        self.height: int = height
         self._name = name
 
     def _repr_html_(self) -> str:
