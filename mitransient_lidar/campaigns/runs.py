@@ -45,6 +45,11 @@ class Array(NamedTuple):
     values: npt.NDArray[Any]
     attributes: dict[str, Any]
 
+    @classmethod
+    def of(cls, values: xr.DataArray | xr.Variable, dtype: npt.DTypeLike | None = None) -> Array:
+        """Return the array of a variable, of another type if one is given."""
+        return cls(tuple(map(str, values.dims)), np.asarray(values.values, dtype=dtype), plain(values.attrs))
+
 
 class Renderer(Protocol):
     """What renders the runs of a store."""
@@ -257,7 +262,7 @@ class RunRenderer:
             echoes = extract(series if recorded is None else recorded, targets=1)
             for kind, values in echoes.data_vars.items():
                 array = np.asarray(values, dtype=np.int16 if kind == "flags" else np.float32)
-                yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, _plain(values.attrs))
+                yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, plain(values.attrs))
 
     def _coordinates(self, number: int, series: xr.Dataset) -> dict[str, Array]:
         from mitransient_lidar.analysis.waveforms.echo_table import ECHOES
@@ -266,12 +271,9 @@ class RunRenderer:
         names = [
             name for name in ("pixel", "angle_x", "angle_y", "time", "origin", "parameter") if name in series.coords
         ]
-        found = {
-            name: Array(tuple(map(str, series[name].dims)), series[name].values, _plain(series[name].attrs))
-            for name in names
-        }
+        found = {name: Array.of(series[name]) for name in names}
         if recorded is not None and (time := _renamed_time(recorded["signal"], series)).dims[-1] != "time":
-            found["signal_time"] = Array(("signal_time",), time["signal_time"].values, _plain(series["time"].attrs))
+            found["signal_time"] = Array(("signal_time",), time["signal_time"].values, plain(series["time"].attrs))
         if "echoes" in self.campaign.keep:
             found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         return found
@@ -364,7 +366,7 @@ def _extremes(column: Column) -> Sequence[Any]:
 def _single(values: xr.DataArray) -> Array:
     """Return an array in single precision, shots first."""
     ordered = values.transpose("shot", ...) if "shot" in values.dims else values
-    return Array(tuple(map(str, ordered.dims)), np.asarray(ordered, dtype=np.float32), _plain(ordered.attrs))
+    return Array.of(ordered, np.float32)
 
 
 def _number(name: str, values: Mapping[str, Any], dtype: npt.DTypeLike) -> Array:
@@ -397,7 +399,7 @@ def _of_one_shot(array: Array) -> Array:
     return array._replace(dims=array.dims[:place] + array.dims[place + 1 :], values=array.values.take(0, place))
 
 
-def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+def plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     """Return attributes that JSON can hold."""
     return {
         str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value

@@ -110,7 +110,8 @@ class Store:
         except _DAMAGE as error:
             raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
         if self.attributes.get(_SEAL) != seal(self.attributes):
-            raise UserError(f"{path} cannot be used: its attributes have changed.")
+            reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
+            raise UserError(f"{path} cannot be used: {reason}.")
         self._arrays: dict[str, zarr.Array[Any]] = {}
         self._check_arrays()
 

@@ -16,7 +16,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.design import Column
-from mitransient_lidar.campaigns.runs import Array
+from mitransient_lidar.campaigns.runs import Array, plain
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -182,16 +182,13 @@ class FlightRenderer:
         """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
         arrays, echoes = self._stacked(inputs, turned=False)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
-        found = {
-            name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
-            for name in names
-        }
+        found = {name: Array.of(echoes[name]) for name in names}
         samples = arrays["signal"].values.shape[-1]
         width = float(echoes.attrs["bin_width_ns"])
         found["time"] = Array(("time",), (np.arange(samples) + 0.5) * width, described("time", "flight"))
         found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
-        return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
+        return stacked, found, {"echo_attributes": plain(echoes.attrs)}
 
     def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
@@ -349,20 +346,11 @@ def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
     """Return an array of shots, without the name of their dimension."""
     # Without the coordinates, which take longer than the values.
-    ordered = values.variable.transpose("shot", ...)
-    dims = tuple(str(dim) for dim in ordered.dims if dim != "shot")
-    return Array(dims, np.asarray(ordered, dtype=dtype), _plain(ordered.attrs))
+    array = Array.of(values.variable.transpose("shot", ...), dtype)
+    return array._replace(dims=tuple(dim for dim in array.dims if dim != "shot"))
 
 
 def _per_pixel(value: Any, shots: int, pixels: int) -> Array:
     """Return the gain, a number or one for each pixel, of all shots."""
     values = np.broadcast_to(np.asarray(value, dtype=np.float64), (shots, pixels))
     return Array(("pixel",), np.array(values), described("gain"))
-
-
-def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes that JSON can hold."""
-    return {
-        str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
-        for name, value in attributes.items()
-    }

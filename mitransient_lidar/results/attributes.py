@@ -219,20 +219,20 @@ def _are_outlines(text: object, keys: tuple[str, ...] | None) -> bool:
     if not isinstance(listed, list):
         return False
     if keys is None:
-        return all(isinstance(one, list) and all(_is_line(line) for line in one) for one in listed)
-    return all(isinstance(one, dict) and set(keys) <= one.keys() and _has_lines(one) for one in listed)
-
-
-def _has_lines(described: Mapping[str, Any]) -> bool:
-    """Return whether the parts of an outline are a text, a number, numbers, a line or lines."""
-    kinds: dict[str, Callable[[Any], bool]] = {
+        return all(_are_lines(one) for one in listed)
+    parts: dict[str, Callable[[Any], bool]] = {
         "id": lambda value: isinstance(value, str),
         "share": _is_number,
         "z": lambda value: _are_numbers(value) and len(value) == 2,
+        "lines": _are_lines,
         **dict.fromkeys(("line", "seen", "shadow"), _is_line),
-        "lines": lambda value: isinstance(value, list) and all(map(_is_line, value)),
     }
-    return all(kinds[key](value) for key, value in described.items() if key in kinds)
+    known = [one for one in listed if isinstance(one, dict) and set(keys) <= one.keys()]
+    return known == listed and all(parts[key](one[key]) for one in known for key in parts.keys() & one.keys())
+
+
+def _are_lines(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_line, value))
 
 
 def _is_line(value: object) -> bool:
