@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,7 +54,9 @@ _variants.limit_threads()
 if TYPE_CHECKING:
     import xarray
 
+    from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
     from mitransient_lidar.analysis.gates.cut import cut_gates
+    from mitransient_lidar.analysis.gates.range_images import depth_image
     from mitransient_lidar.analysis.receiver import detect_waveforms as record
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve
     from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths
@@ -62,8 +65,14 @@ if TYPE_CHECKING:
     from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+    from mitransient_lidar.loading.scenes import open_scene
+    from mitransient_lidar.physics.lidar.gate_train import GateTrain
+    from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
+    from mitransient_lidar.physics.water.profiles import read_profile
+    from mitransient_lidar.physics.water.water_types import water_of
     from mitransient_lidar.plots.publication.figures import figures
     from mitransient_lidar.plots.viewer import view
+    from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.studies.bounds import bounds
@@ -71,57 +80,80 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
     from mitransient_lidar.studies.fit import fit
+    from mitransient_lidar.studies.fov_sweep import fov_sweep
+    from mitransient_lidar.studies.scattering_orders import scattering_orders
     from mitransient_lidar.studies.tpu import tpu
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
+    "GateTrain": ("physics.lidar.gate_train", "GateTrain"),
+    "SURVEY_ORDERS": ("analysis.depth_uncertainty", "SURVEY_ORDERS"),
     "bounds": ("studies.bounds", "bounds"),
     "campaign": ("campaigns.sweep", "campaign"),
     "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
     "cut_gates": ("analysis.gates.cut", "cut_gates"),
     "depth_bias": ("studies.depth_bias", "depth_bias"),
+    "depth_image": ("analysis.gates.range_images", "depth_image"),
     "detect": ("studies.detection", "detect"),
     "echoes": ("analysis.waveforms.echo_table", "extract"),
     "estimate": ("studies.estimate", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
+    "fov_sweep": ("studies.fov_sweep", "fov_sweep"),
     "instrument_names": ("loading.instruments", "instrument_names"),
+    "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
+    "open_scene": ("loading.scenes", "open_scene"),
     "read_instrument": ("loading.instruments", "read_instrument"),
+    "read_profile": ("physics.water.profiles", "read_profile"),
     "record": ("analysis.receiver", "detect_waveforms"),
     "render": ("rendering.render", "render"),
+    "render_passive": ("rendering.passive", "render_passive"),
     "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
+    "scattering_orders": ("studies.scattering_orders", "scattering_orders"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
     "tpu": ("studies.tpu", "tpu"),
     "view": ("plots.viewer", "view"),
+    "water_of": ("physics.water.water_types", "water_of"),
 }
 
+#: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [
+    "SURVEY_ORDERS",
+    "GateTrain",
     "__version__",
     "bounds",
     "campaign",
     "correct_depths",
     "cut_gates",
     "depth_bias",
+    "depth_image",
     "detect",
     "echoes",
     "estimate",
     "figures",
     "fit",
     "fly",
+    "fov_sweep",
     "instrument_names",
-    "open",
+    "kelvin_wake",
+    "open_scene",
     "read_instrument",
+    "read_profile",
     "record",
     "render",
+    "render_passive",
     "render_shots",
     "retrieve",
+    "save",
+    "scattering_orders",
     "scene_names",
     "scene_parameters",
     "tpu",
     "view",
+    "water_of",
 ]
 
 
@@ -142,15 +174,67 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_FUNCTIONS})
 
 
-def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect
-    """Read a result from an EXR stack or a NetCDF file, signals of a receiver, or the store of a campaign.
+def open(path: str | os.PathLike[str]) -> xarray.Dataset:
+    """Read any file or folder that this package writes.
 
-    See :func:`mitransient_lidar.results.dataset.open` and :func:`mitransient_lidar.campaigns.store.open_campaign`.
+    Parameters
+    ----------
+    path : path
+        An EXR or NetCDF file: waveforms of a render, gates, images by daylight, signals of a receiver, or a table of a
+        study. Or a folder: the store of a campaign, whose arrays are read when they are needed, a flight, or a sequence
+        of gates.
+
+    Returns
+    -------
+    xarray.Dataset
+        What was written; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
+        :func:`mitransient_lidar.campaigns.store.open_campaign`.
+
+    Raises
+    ------
+    UserError
+        If nothing of this package is there, or it is damaged.
     """
-    if Path(path).is_dir():
-        from mitransient_lidar.campaigns.store import open_campaign
+    from mitransient_lidar.core.files import checked_path
+    from mitransient_lidar.results.files import open as open_file
 
-        return open_campaign(path)
-    from mitransient_lidar.results.dataset import open as open_result
+    place = checked_path("path", path)
+    for store in (place, place / "flight.zarr"):
+        if (store / "zarr.json").exists():
+            from mitransient_lidar.campaigns.store import open_campaign
 
-    return open_result(path, signals=True)
+            return open_campaign(store)
+    return open_file(place)
+
+
+def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write any dataset of this package to a file, whose suffix is its format; an existing file is replaced.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The dataset.
+    path : path
+        ``.nc`` is NetCDF-4, of any dataset; ``.exr`` OpenEXR, of waveforms, gates or images by daylight; ``.csv`` a
+        text table of echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
+        :func:`mitransient_lidar.results.files.save`.
+
+    Raises
+    ------
+    UserError
+        If the suffix is another one, the format cannot store the dataset, or the file cannot be written.
+    """
+    from mitransient_lidar.core.files import checked_path
+    from mitransient_lidar.results.files import dataset_of
+    from mitransient_lidar.results.files import save as save_file
+
+    if checked_path("path", path).suffix.lower() != ".csv":
+        save_file(dataset, path)
+    elif "bound" in dataset_of("dataset", dataset, "echoes", "bounds"):
+        from mitransient_lidar.studies.bounds import write_table
+
+        write_table(dataset, path)
+    else:
+        from mitransient_lidar.analysis.waveforms.csv_tables import save_csv
+
+        save_csv(dataset, path)

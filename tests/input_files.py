@@ -65,14 +65,13 @@ def analyse(path: Path) -> None:
     """Use a result as the commands waveforms, retrieve and plot do."""
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve
-    from mitransient_lidar.analysis.waveforms import records
     from mitransient_lidar.analysis.waveforms.echo_table import extract
     from mitransient_lidar.plots.waveforms import plot_waveforms
 
     # Reading takes as long as each use.
     opened = functools.cache(lambda: results.open(path))
     _each(
-        lambda: extract(records.open_waveforms(path), ["gaussian", "leading_edge"]),
+        lambda: extract(results.open(path), ["gaussian", "leading_edge"]),
         lambda: retrieve(opened()),
         lambda: plot_waveforms(opened()),
     )
@@ -183,9 +182,9 @@ def gates(name: str) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         import mitransient_lidar
-        from mitransient_lidar.results.gate_files import save_stack
+        from mitransient_lidar import results
 
-        save_stack(mitransient_lidar.render("gated_waves", passes=2), folder / name)
+        results.save(mitransient_lidar.render("gated_waves", passes=2), folder / name)
         return folder / name
 
     return make
@@ -193,10 +192,10 @@ def gates(name: str) -> Callable[[Path], Path]:
 
 def draw_gates(path: Path) -> None:
     """Open and draw a gate stack."""
+    from mitransient_lidar import results
     from mitransient_lidar.plots.gates.images import plot_gates
-    from mitransient_lidar.results.gate_files import open_stack
 
-    plot_gates(open_stack(path))
+    plot_gates(results.open(path))
 
 
 _CAMPAIGN = """scene = "table1"
@@ -380,9 +379,9 @@ def read_receiver(path: Path) -> None:
 
 def read_corrections(path: Path) -> None:
     """Read a table of corrections."""
-    from mitransient_lidar.analysis.waveforms.depth_correction import read_corrections as read
+    from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 
-    read(path)
+    corrections_for("", path)
 
 
 def read_measured(path: Path) -> None:

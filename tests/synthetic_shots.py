@@ -35,8 +35,7 @@ ATTRIBUTES = {
     "divergence_mrad": 0.1,
     "surface_time_ns": SURFACE,
     "surface_heights_m": [0.0, 0.0],
-    "scene.optical_efficiency": "0.9",
-    "scene.two_way_atmospheric_transmittance": "0.9",
+    "two_way_efficiency": 0.9**3,
 }
 
 

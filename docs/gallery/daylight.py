@@ -8,7 +8,7 @@ width of a filter the power that the lidar's detector has as background.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar import render_passive
 
 # %%
 # ``passive_sea`` looks 35 degrees off nadir at a bottom of 8 m with a white plate and a dark sphere; the sun stands 40

@@ -7,15 +7,14 @@ wide one keeps that light in view, and its column decays with about the absorpti
 
 import matplotlib.pyplot as plt
 
-import mitransient_lidar  # noqa: F401  (before mitsuba: it finds LLVM for Dr.Jit)
-from mitransient_lidar.studies.fov_sweep import fov_sweep
+import mitransient_lidar
 
 # %%
 # A narrow beam of 0.5 mrad on level water of c = 0.3 1/m and a = 0.15 1/m, nearly without ripples, which would refract
 # light out of a narrow view as well.
 
 SCENE = {"divergence_mrad": 0.5, "bottom_depth": 12, "spectrum": "flat", "slope_variance": 2e-5}
-found = fov_sweep("table1", [1, 5, 20, 80], SCENE, passes=4, seed=1)
+found = mitransient_lidar.fov_sweep("table1", [1, 5, 20, 80], SCENE, passes=4, seed=1)
 
 # %%
 # K is half the decay of the power along the path in the water.

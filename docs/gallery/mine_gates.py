@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.analysis.gates.range_images import depth_image
 
 # %%
 # 32x32 pixels instead of 128x128, and few passes: the grain of the images is the error of the render.
@@ -33,7 +32,7 @@ for axis, number in zip(axes.flat, numbers, strict=False):
     )
     axis.set_title(f"gate at {depths[number]:.1f} m", fontsize="medium")
 figure.colorbar(image, ax=axes[0, :], label="energy (fJ)")
-found = depth_image(stack)
+found = mitransient_lidar.depth_image(stack)
 depth = np.where(found.confidence > 0.99, found.depth, np.nan)
 image = axes[1, 2].imshow(depth, extent=(half, -half, -half, half), cmap="viridis_r")
 axes[1, 2].set_title("depth of the echo", fontsize="medium")

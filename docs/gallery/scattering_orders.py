@@ -7,14 +7,15 @@ times, by small angles and once by a large one.
 
 import matplotlib.pyplot as plt
 
-import mitransient_lidar  # noqa: F401  (before mitsuba: it finds LLVM for Dr.Jit)
-from mitransient_lidar.studies.scattering_orders import scattering_orders
+import mitransient_lidar
 
 # %%
 # Turbid water of c = 0.9 1/m and b = 0.7 1/m over a bottom at 6 m, one pixel of 30 mrad.
 
 WATER = {"attenuation": 0.9, "scattering": 0.7, "backscattering": 0.014, "bottom_depth": 6}
-found = scattering_orders("table1", {**WATER, "layout": "1x1", "spectrum": "flat"}, orders=6, passes=4, seed=1)
+found = mitransient_lidar.scattering_orders(
+    "table1", {**WATER, "layout": "1x1", "spectrum": "flat"}, orders=6, passes=4, seed=1
+)
 
 # %%
 # The last order holds all higher ones.

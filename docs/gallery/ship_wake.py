@@ -9,13 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 
 # %%
 # The ship of the scene ``ship_wake``: 20 m long, 6 m/s towards +y, now 60 m past the shot at the origin.
 
 x, y = np.arange(-60, 60.1, 0.5), np.arange(-60, 80.1, 0.5)
-heights = kelvin_wake(x, y, speed=6, bearing=np.pi / 2, length=20, ship_y=60)
+heights = mitransient_lidar.kelvin_wake(x, y, speed=6, bearing=np.pi / 2, length=20, ship_y=60)
 
 # %%
 # The same sea and place with and without the ship.

@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 
 # %%
 # One wind and one water, and few places of the sea: a table for a survey takes more, as the guide of uncertainties has.
@@ -36,7 +35,7 @@ for correction in found.correction.values:
     label = {"none": "as measured", "table": "corrected"}[correction]
     axis.plot(found.depth, 100 * found.tvu.sel(correction=correction), "o-", label=label)
 depth = np.linspace(1, 9)
-for order in SURVEY_ORDERS[:3]:
+for order in mitransient_lidar.SURVEY_ORDERS[:3]:
     axis.plot(depth, 100 * order.largest_tvu(depth), color="0.6", linewidth=0.8)
     axis.text(1, 100 * float(order.largest_tvu(1)), f"order {order.name}", color="0.4", va="bottom")
 axis.set(xlabel="depth (m)", ylabel="vertical uncertainty, 95 % (cm)", ylim=(0, 55))

@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.drawing import pixel_colours
 from mitransient_lidar.rendering.shots.truth import SeaMap
 
@@ -128,7 +127,7 @@ plt.show()
 # mean slope of the waves over the footprint.
 
 found = mitransient_lidar.retrieve(shot)
-sea = SeaMap.of_scene(open_scene("fig09_2x2").scene)
+sea = SeaMap.of_scene(mitransient_lidar.open_scene("fig09_2x2").scene)
 along, across = sea.slope_at(0.0, 0.0)
 names = ("bottom_depth", "bottom_reflectance", "attenuation", "scattering", "backscattering")
 depth, rho, c, b, bb = (float(shot.attrs[f"scene.{name}"]) for name in names)
@@ -193,5 +192,6 @@ plt.show()
 #   ``mitransient_lidar.render("mine.xml", target_error=0.02)``.
 # - **Many shots:** ``render_shots`` and the commands ``find-shots`` and ``shots`` cover a sea, whose waves
 #   are the noise that this tutorial leaves out.
-# - **Files:** ``results.save(shot, "shot.nc")`` writes, ``mitransient_lidar.open("shot.nc")`` reads; also EXR stacks.
+# - **Files:** ``mitransient_lidar.save(shot, "shot.nc")`` writes, ``mitransient_lidar.open("shot.nc")`` reads; EXR
+#   stacks, too.
 # - **Without Python:** ``mitransient-lidar render``, ``retrieve``, ``gates`` and more; ``--help`` lists them.

@@ -8,7 +8,6 @@ column shows in each.
 import matplotlib.pyplot as plt
 
 import mitransient_lidar
-from mitransient_lidar.physics.water.water_types import water_of
 
 # %%
 # ``jerlov`` stands for all coefficients of the water; ``mitransient-lidar water jerlov 1C`` prints them.
@@ -28,7 +27,7 @@ for water, shot in shots.items():
     axis.semilogy(shot.time, 1e6 * total, label=f"Jerlov {water}")
     found = mitransient_lidar.retrieve(shot)
     estimate, error = float(found.absorption), float(found.absorption_stderr)
-    truth = water_of("jerlov", water).absorption
+    truth = mitransient_lidar.water_of("jerlov", water).absorption
     print(f"{water}: absorption {estimate:.3f} +- {error:.3f} 1/m, truth {truth:.3f}")
 axis.set(xlabel="time (ns)", ylabel="power of all pixels (µW)", xlim=(1405, 1520), ylim=(0.1, 3000))
 axis.legend(frameon=False)

@@ -12,7 +12,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.physics.water.profiles import read_profile
 
 # %%
 # The cast of this example is computed: clear water above, and turbid water below 4.5 m.
@@ -24,7 +23,7 @@ cast = np.column_stack([depth, 0.12 + 0.05 * turbid, 0.25 + 0.45 * turbid, 0.003
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "cast.csv"
     np.savetxt(file, cast, delimiter=",", header="depth_m,a532,c532,bb532", comments="")
-    profile = read_profile(file)
+    profile = mitransient_lidar.read_profile(file)
     shot = mitransient_lidar.render(
         "table1", params={"profile": file, "spectrum": "flat", "layout": "1x1"}, passes=8, pass_share=1 / 8, seed=1
     )

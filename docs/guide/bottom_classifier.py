@@ -18,11 +18,11 @@ import xarray as xr
 from matplotlib.figure import Figure
 from sklearn.ensemble import HistGradientBoostingClassifier
 
-import mitransient_lidar  # noqa: F401  (it finds LLVM for Dr.Jit)
+import mitransient_lidar
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
-from mitransient_lidar.campaigns.store import DONE, open_campaign
+from mitransient_lidar.campaigns.store import DONE
 from mitransient_lidar.campaigns.sweep import render_row
 
 #: Bins on both sides of a place that the classifier sees, and bins between places.
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--train", type=int, default=5000, help="number of waveforms to train on")
     given = parser.parse_args()
     logging.disable(logging.WARNING)
-    data = open_campaign(given.store)
+    data = mitransient_lidar.open(given.store)
     data = data.isel(run=np.flatnonzero(data["status"].values == DONE)).load()
     rng = np.random.default_rng(0)
     order = rng.permutation(data.sizes["run"])

@@ -17,28 +17,13 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative
 from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
 from mitransient_lidar.results.geometry import required_number
+from mitransient_lidar.results.variables import described
 
 #: Smallest share of shots with a depth for which a cell has an uncertainty.
 LEAST_FOUND = 0.5
 
 #: Names of the dimension ``correction``: depths as measured, and corrected by a table of mean errors.
 CORRECTIONS = ("none", "table")
-
-_DESCRIBED = {
-    "subaqueous_vertical": ("m", "standard deviation of the depth below the sea, its bias in quadrature"),
-    "subaqueous_horizontal": ("m", "standard deviation of the place on the bottom by waves and footprint, one axis"),
-    "stated": ("m", "median of the stated error of the depth, one standard deviation"),
-    "tvu": ("m", "total vertical uncertainty at 95 %, errors of the trajectory included"),
-    "thu": ("m", "total horizontal uncertainty at 95 %, errors of the trajectory included"),
-    "order": ("1", "strictest order of S-44 that is met"),
-    "channel": ("1", "channel with the smallest uncertainty"),
-    "found": ("1", "share of shots with a depth"),
-    "vertical_a": ("m", "constant part a of the fit sqrt(a^2 + (b d)^2) to subaqueous_vertical"),
-    "vertical_b": ("1", "part b by depth of the fit sqrt(a^2 + (b d)^2) to subaqueous_vertical"),
-    "vertical_residual": ("m", "subaqueous_vertical less its fit"),
-    "horizontal_a": ("m", "constant part a of the fit a + b d to subaqueous_horizontal"),
-    "horizontal_b": ("1", "part b by depth of the fit a + b d to subaqueous_horizontal"),
-}
 
 #: Standard deviations to the limits of 95 % of a normal error, in one dimension and of a circle in two.
 VERTICAL_95, HORIZONTAL_95 = 1.96, 2.45
@@ -205,8 +190,8 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
     }
     data |= _fits(vertical, horizontal)
     found = xr.Dataset(data).transpose("correction", *AXES)
-    for name, (unit, text) in _DESCRIBED.items():
-        found[name].attrs = {"units": unit, "long_name": text}
+    for name in found.data_vars:
+        found[name].attrs = described(str(name))
     found["order"].attrs |= {
         "flag_values": np.arange(-1, len(SURVEY_ORDERS) + 1),
         "flag_meanings": " ".join(["unknown", *(one.name for one in SURVEY_ORDERS), "none"]),

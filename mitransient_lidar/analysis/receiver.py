@@ -17,10 +17,11 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
-from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,7 +32,7 @@ _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 @checked
 def detect_waveforms(
-    dataset: xr.Dataset,
+    dataset: results.Given,
     chain: Annotated[
         ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None,
         Option(f"{RECEIVERS}. By default that of the result's instrument, or apd", flag="--receiver"),
@@ -112,6 +113,7 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
+    dataset = results.dataset_of("dataset", dataset, "waveforms")
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     if len(groups) == 1:
         recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky)
@@ -268,57 +270,36 @@ def _record_channel(
         forms = [np.repeat(one, number, axis=0) for one in forms]
         numbers = np.repeat(np.arange(len(light)), number)
         coords = {name: one.isel(shot=numbers, missing_dims="ignore") for name, one in coords.items() if name != "shot"}
-    over, sampled, share = ("shot", *pixels, "time"), {"units": receiver.units}, {"units": "1"}
+    over = ("shot", *pixels, "time")
     values: dict[str, Any] = {
-        "signal": (over, signal, {**sampled, "long_name": "recorded signal"}),
-        "saturated": (over, saturated, {**share, "long_name": "sample at a limit of amplifier or digitiser"}),
-        "signal_mean": (dims, forms[0], {**sampled, "long_name": "mean of the recorded signal"}),
-        "signal_deviation": (
-            dims,
-            forms[1],
-            {**sampled, "long_name": "standard deviation of the recorded signal of a shot"},
-        ),
-        "snr": (dims, forms[2], {**share, "long_name": "signal-to-noise ratio of a shot"}),
-        "saturation": (dims, forms[3], {**share, "long_name": "probability that a sample is saturated"}),
-        "saturated_shots": (
-            pixels,
-            saturated.any(axis=-1).mean(axis=0),
-            {**share, "long_name": "share of shots with saturated samples"},
-        ),
-        "saturated_samples": (
-            pixels,
-            saturated.mean(axis=(0, -1)),
-            {**share, "long_name": "share of saturated samples"},
-        ),
+        "signal": (over, signal),
+        "saturated": (over, saturated),
+        "signal_mean": (dims, forms[0]),
+        "signal_deviation": (dims, forms[1]),
+        "snr": (dims, forms[2]),
+        "saturation": (dims, forms[3]),
+        "saturated_shots": (pixels, saturated.any(axis=-1).mean(axis=0)),
+        "saturated_samples": (pixels, saturated.mean(axis=(0, -1))),
     }
     if dark is not None and receiver.digitiser is not None:
         level = (dark[0] if series else dark)[..., 0]
-        values["dark_level"] = (pixels, level, {**sampled, "long_name": "mean signal without light of the pulse"})
+        values["dark_level"] = (pixels, level)
         least = level + float(receiver.digitiser.block_threshold_v or 0)
-        values["block_level"] = (pixels, least, {**sampled, "long_name": "signal above which samples are stored"})
+        values["block_level"] = (pixels, least)
     first, weights = receiver.low_pass(width).by_bin()
-    lag = ("lag", (first + np.arange(weights.size)) * width, {"units": "ns", "long_name": "delay of the sample"})
-    values["receiver_response"] = (
-        ("lag",),
-        weights,
-        {**share, "long_name": "weight of the light of a bin in a sample"},
-    )
+    values["receiver_response"] = (("lag",), weights)
     if "waveform_stderr" in dataset:
         # The errors of a render's neighbouring bins agree in sign, as its pulse smooths them.
         error = np.nan_to_num(dataset["waveform_stderr"].transpose(*dims).values)
         shifted = receiver.expected(power + 10**-density * error, width, background).mean - expected.mean
         shifted = np.repeat(np.abs(shifted), number, axis=0) if series else np.abs(shifted)
-        text = "standard error of the mean signal by the Monte Carlo of the render"
-        values["signal_mean_stderr"] = (dims, shifted, {**sampled, "long_name": text})
+        values["signal_mean_stderr"] = (dims, shifted)
     heights = receiver.event_height(power, width, background)
-    values["event_height"] = (
-        pixels,
-        heights.max(axis=0) if series else heights,
-        {**sampled, "long_name": "height that a single event exceeds in one of a thousand records"},
-    )
+    values["event_height"] = (pixels, heights.max(axis=0) if series else heights)
     labels = dataset["shot"].values if series and number == 1 else np.arange(len(signal))
     attributes = {
         **dataset.attrs,
+        **made_from(dataset.attrs, "Signals of a receiver", "recorded"),
         "time_start_ns": float(time[0]) - 0.5 * width * stride,
         "bin_width_ns": width * stride,
         "rendered_bin_width_ns": width,
@@ -327,8 +308,9 @@ def _record_channel(
         **dict(_described("receiver", receiver)),
         **fitting,
     }
-    shot = ("shot", labels, {"units": "1", "long_name": "number of the shot"})
-    return xr.Dataset(values, {**coords, "time": time, "shot": shot, "lag": lag}, attributes)
+    axes = {"time": time, "shot": labels, "lag": (first + np.arange(weights.size)) * width}
+    sampled = ("signal", "signal_mean", "signal_deviation", "dark_level", "block_level", "event_height")
+    return label(xr.Dataset(values, {**coords, **axes}, attributes), **dict.fromkeys(sampled, receiver.units))
 
 
 def saturation_advice(recorded: xr.Dataset) -> str:
@@ -423,23 +405,6 @@ def receiver_of(parameter: str, given: ReceiverChannels | ReceiverChain | str | 
         raise UserError(
             f"{parameter}{text.removeprefix('receiver')}" if text.startswith("receiver =") else text
         ) from None
-
-
-def encoding(recorded: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the encoding of a record in a file: signals behind a converter as its integer codes.
-
-    ``scale_factor`` and ``add_offset`` turn them into volts.
-    """
-    names = ("receiver.digitiser.bits", "receiver.digitiser.full_scale_v", "receiver.digitiser.low_v")
-    if not set(names) <= set(recorded.attrs):
-        return {}
-    bits, full_scale, low = (recorded.attrs[name] for name in names)
-    digitiser = Digitiser(int(bits), float(full_scale), float(low))
-    # The highest number of the type, which no code has, is the one for missing values.
-    kind = np.dtype("uint16" if digitiser.bits < 16 else "uint32")
-    codes = {"dtype": kind, "scale_factor": digitiser.step_v, "add_offset": digitiser.low_v}
-    codes["_FillValue"] = int(np.iinfo(kind).max)
-    return {"signal": codes}
 
 
 def _waveform(dataset: xr.Dataset) -> tuple[tuple[str, ...], FloatArray]:

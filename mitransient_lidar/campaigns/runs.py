@@ -23,6 +23,7 @@ from mitransient_lidar.loading.scenes import open_scene, read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.results.variables import described
 
 #: Half of the side of the square of the places of a sea [m].
 _REACH = 256.0
@@ -43,6 +44,11 @@ class Array(NamedTuple):
     dims: tuple[str, ...]
     values: npt.NDArray[Any]
     attributes: dict[str, Any]
+
+    @classmethod
+    def of(cls, values: xr.DataArray | xr.Variable, dtype: npt.DTypeLike | None = None) -> Array:
+        """Return the array of a variable, of another type if one is given."""
+        return cls(tuple(map(str, values.dims)), np.asarray(values.values, dtype=dtype), plain(values.attrs))
 
 
 class Renderer(Protocol):
@@ -225,11 +231,10 @@ class RunRenderer:
 
     def _stored(self, number: int, values: Mapping[str, Any], series: xr.Dataset) -> dict[str, Array]:
         found = dict(self._arrays(number, series))
-        error = "relative standard error of the median bin"
-        found["error_median"] = _number(series.attrs["error_median"], np.float32, error)
-        found["passes"] = _number(series.attrs["passes"], np.int32, "number of passes")
+        found["error_median"] = _number("error_median", series.attrs, np.float32)
+        found["passes"] = _number("passes", series.attrs, np.int32)
         if _SEA in (own := self.inputs(number, values)) and _SEA not in values:
-            found[_SEA] = _number(own[_SEA], np.int64, "parameter surface_seed of the scene")
+            found[_SEA] = _number(_SEA, own, np.int64)
         if self.campaign.design.shots > 1:
             return found
         return {name: _of_one_shot(array) for name, array in found.items()}
@@ -248,11 +253,8 @@ class RunRenderer:
             yield name, _single(series[name].assign_attrs(about))
         if recorded is not None:
             yield "signal", _single(_renamed_time(recorded["signal"], series))
-            yield "gain", _number(recorded.attrs["gain"], np.float64, "factor of the amplifier's transimpedance")
-            yield (
-                "optical_density",
-                _number(recorded.attrs["optical_density"], np.float64, "optical density of the filter"),
-            )
+            for name in ("gain", "optical_density"):
+                yield name, _number(name, recorded.attrs, np.float64)
         if "truth" in keep:
             for name, values in _truth(series).items():
                 yield name, Array(tuple(map(str, values.dims)), values.values, dict(values.attrs))
@@ -260,7 +262,7 @@ class RunRenderer:
             echoes = extract(series if recorded is None else recorded, targets=1)
             for kind, values in echoes.data_vars.items():
                 array = np.asarray(values, dtype=np.int16 if kind == "flags" else np.float32)
-                yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, _plain(values.attrs))
+                yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, plain(values.attrs))
 
     def _coordinates(self, number: int, series: xr.Dataset) -> dict[str, Array]:
         from mitransient_lidar.analysis.waveforms.echo_table import ECHOES
@@ -269,14 +271,11 @@ class RunRenderer:
         names = [
             name for name in ("pixel", "angle_x", "angle_y", "time", "origin", "parameter") if name in series.coords
         ]
-        found = {
-            name: Array(tuple(map(str, series[name].dims)), series[name].values, _plain(series[name].attrs))
-            for name in names
-        }
+        found = {name: Array.of(series[name]) for name in names}
         if recorded is not None and (time := _renamed_time(recorded["signal"], series)).dims[-1] != "time":
-            found["signal_time"] = Array(("signal_time",), time["signal_time"].values, _plain(series["time"].attrs))
+            found["signal_time"] = Array(("signal_time",), time["signal_time"].values, plain(series["time"].attrs))
         if "echoes" in self.campaign.keep:
-            found["echo"] = Array(("echo",), np.array(ECHOES), {"long_name": "kind of echo"})
+            found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         return found
 
     def _random(self, number: int) -> np.random.Generator:
@@ -367,12 +366,12 @@ def _extremes(column: Column) -> Sequence[Any]:
 def _single(values: xr.DataArray) -> Array:
     """Return an array in single precision, shots first."""
     ordered = values.transpose("shot", ...) if "shot" in values.dims else values
-    return Array(tuple(map(str, ordered.dims)), np.asarray(ordered, dtype=np.float32), _plain(ordered.attrs))
+    return Array.of(ordered, np.float32)
 
 
-def _number(value: float, dtype: npt.DTypeLike, text: str) -> Array:
+def _number(name: str, values: Mapping[str, Any], dtype: npt.DTypeLike) -> Array:
     """Return a number of each run."""
-    return Array((), np.asarray(value, dtype=dtype), {"units": "1", "long_name": text})
+    return Array((), np.asarray(values[name], dtype=dtype), described(name))
 
 
 def _renamed_time(signal: xr.DataArray, series: xr.Dataset) -> xr.DataArray:
@@ -400,7 +399,7 @@ def _of_one_shot(array: Array) -> Array:
     return array._replace(dims=array.dims[:place] + array.dims[place + 1 :], values=array.values.take(0, place))
 
 
-def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+def plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     """Return attributes that JSON can hold."""
     return {
         str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value

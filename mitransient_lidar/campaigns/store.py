@@ -34,7 +34,7 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
-from mitransient_lidar.results.formats import picture_order
+from mitransient_lidar.results.variables import described
 
 _LOG = logging.getLogger(__name__)
 
@@ -63,17 +63,7 @@ _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError,
 
 _WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
 
-#: Attribute with the order of pixels in layouts, which stores of versions up to 0.1 lack: they have right before left.
-_ORDER = ("pixel_order", "far to near, left to right")
-
-_ON_AXIS = 1e-3  # largest angle of pixels that are on the axis [mrad]
-
-_STATUS = {
-    "units": "1",
-    "long_name": "state of the run",
-    "flag_values": [0, 1, 2],
-    "flag_meanings": "planned done failed",
-}
+_STATUS = {**described("status"), "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
 
 
 #: Module and class of the renderer, and name of a run, by the kind of a store.
@@ -109,7 +99,7 @@ class Store:
             with zarr.config.set(_WRITING):
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
-            #: What the store is of, and that as JSON; stores of versions up to 0.1 are of campaigns.
+            #: What the store is of, and that as JSON.
             self.kind = "flight" if "flight" in self.attributes else "campaign"
             self.text = str(self.attributes[self.kind])
             self._renderer_type().check(self.text)
@@ -179,16 +169,6 @@ class Store:
             SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
-
-    def check_pixel_order(self) -> None:
-        """Raise `UserError` if runs that are rendered now would have their pixels in another order than the store."""
-        if _ORDER[0] in self.attributes or "angle_y" not in self._group:
-            return
-        if np.any(np.abs(self.stored("angle_y", slice(None))) > _ON_AXIS):
-            raise UserError(
-                f"{self.path} was begun by an earlier version, whose pixels are in order from right to left: it can be "
-                "read but not completed; choose another place"
-            )
 
     @property
     def unit(self) -> str:
@@ -405,7 +385,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     with _reading(path, "a coordinate"):
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
     dataset["status"] = dataset["status"].copy(data=store.status())
-    return picture_order(dataset)
+    return dataset
 
 
 def _fill(
@@ -446,17 +426,16 @@ def _fill(
     named = {"units": "1", "long_name": f"number of the {renderer.unit}"}
     make("run", Array(("run",), numbers, named), numbers, chunk=LARGEST_SHARD)
     for name, column in columns.items():
-        described = renderer.describe_input(name, column)
-        make(inputs[name], Array(("run",), column, described), column, chunk=LARGEST_SHARD)
+        like = Array(("run",), column, renderer.describe_input(name, column))
+        make(inputs[name], like, column, chunk=LARGEST_SHARD)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
-    make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
+    make("error", Array((), np.array("", dtype=object), described("error", "campaign")))
     for name, found in arrays.items():
         make(name, found)
     dims = {dim for found in arrays.values() for dim in found.dims}
     if "shot" in dims:
         shots = np.arange(renderer.shots)
-        number = {"units": "1", "long_name": "number of the shot over the sea of the run"}
-        make("shot", Array(("shot",), shots, number), shots)
+        make("shot", Array(("shot",), shots, described("shot", "campaign")), shots)
     axis, time = renderer.axis, coordinates["time"].values
     secondary = [name for name in (*coordinates, *inputs.values(), "surface_seed") if name not in dims]
     about: dict[str, Any] = {
@@ -473,7 +452,6 @@ def _fill(
         "variables": list(arrays),
         "arrays": sorted(group.array_keys()),
         "coordinates": " ".join(name for name in secondary if name in group),
-        _ORDER[0]: _ORDER[1],
         **versions(),
         "versions": own_versions(),
         **attributes,

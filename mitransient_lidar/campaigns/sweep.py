@@ -24,6 +24,7 @@ from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, LARG
 from mitransient_lidar.campaigns.versions import check_versions
 from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import integer, require_memory, shown
@@ -103,11 +104,8 @@ def campaign(
     KeyboardInterrupt
         After Ctrl-C; processes write the runs that they have, which stay.
     """
-    return open_campaign(
-        complete(
-            lambda: _prepare(_campaign(campaign), Path(store), shard_size), workers, scheduler, retry_failed, progress
-        ).path
-    )
+    path, given = checked_path("store", store), (workers, scheduler, retry_failed, progress)
+    return open_campaign(complete(lambda: _prepare(_campaign(campaign), path, shard_size), *given).path)
 
 
 def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
@@ -168,7 +166,9 @@ def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> C
     """Return a campaign that may be given as a file or a dict."""
     if isinstance(given, Campaign):
         return given
-    return Campaign.of(given) if isinstance(given, Mapping) else Campaign.read(given)
+    if isinstance(given, Mapping):
+        return Campaign.of(given)
+    return Campaign.read(checked_path("campaign", given))
 
 
 def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
@@ -222,7 +222,6 @@ def complete(
         wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
         if shards:
-            store.check_pixel_order()
             check_versions(store.path, store.attributes)
             few = min(number, len(shards))
             if client is None:

@@ -56,7 +56,7 @@ def check_versions(store: Path, attributes: Mapping[str, Any]) -> None:
     Files of the package that have changed since, as in a folder of sources, give a warning.
     """
     own = own_versions()
-    # Stores of versions up to 0.2 have those of Mitsuba and Dr.Jit alone.
+    # Stores of version 0.2 have those of Mitsuba and Dr.Jit alone.
     first = {name: attributes.get(f"{name}_version", own[name]) for name in ("mitsuba", "drjit")}
     begun = attributes.get("versions", first)
     if differs := difference({**begun, FILES: own[FILES]}, own):

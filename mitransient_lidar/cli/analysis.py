@@ -34,10 +34,10 @@ def _record(
     from mitransient_lidar.analysis import receiver as analysis
 
     with reporting(quiet):
-        result = results.open(file)
+        result = results.dataset_of("FILE", file, "result")
     recorded = call(result)
     name_subject(file, result.attrs, quiet)
-    write_netcdf(recorded, target, analysis.encoding(recorded))
+    write_netcdf(recorded, target)
     for line in analysis.describe_recording(recorded):
         typer.echo(line)
 
@@ -75,9 +75,10 @@ def _echoes(
         raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
     if wind_speed is not None and correct is None:
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
-    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, records
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
 
-    dataset = records.open_waveforms(file)
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
     instrument = str(dataset.attrs.get("instrument", ""))
     corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
     estimators = call.arguments["estimators"] or ["gaussian"]
@@ -111,7 +112,7 @@ def _retrieve(
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieval_table import describe_retrieval
 
-    dataset = results.open(file)
+    dataset = results.dataset_of("FILE", file, "result")
     if figure is not None and "true_slope_along" not in dataset.coords:
         raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
     found = call(dataset)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import typer
 
 from mitransient_lidar.cli.overwriting import check_kept
 from mitransient_lidar.core.errors import UserError, WriteError
-from mitransient_lidar.core.files import check_encodable, replacing, together
+from mitransient_lidar.core.files import check_encodable, together
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -96,13 +96,13 @@ def announced() -> Iterator[None]:
         typer.echo(path)
 
 
-def write_netcdf(dataset: xr.Dataset, path: Path, encoding: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-    """Write a dataset to a NetCDF file, with the encoding of some variables, and print its path."""
-    from mitransient_lidar.results import netcdf
+def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
+    """Write a dataset to a NetCDF file, and print its path."""
+    from mitransient_lidar.results import save
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with announced(), replacing(path) as temporary:
-        netcdf.dump(dataset, temporary, encoding or {})
+    with announced():
+        save(dataset, path)
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,11 @@ class GateFiles:
 
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
         """Write the files and print their paths; `result` provides the waveforms of the page."""
+        from mitransient_lidar import results
         from mitransient_lidar.plots.gate_viewer import page as gate_page
         from mitransient_lidar.plots.gates import images
-        from mitransient_lidar.results import gate_files
+        from mitransient_lidar.results import exr
+        from mitransient_lidar.results.gate_stack import check_stack
 
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):
@@ -150,7 +152,7 @@ class GateFiles:
         with announced():
             for path in self.names():
                 if path.suffix == ".exr":
-                    gate_files.save_stack(stack, path)
+                    results.save(check_stack(stack), path)
                 elif path.suffix == ".html":
                     gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
                 elif path.suffix != ".png":
@@ -160,7 +162,7 @@ class GateFiles:
                 else:
                     _draw_depths(stack, path, quiet)
             if "sequence" in self.wanted:
-                gate_files.save_sequence(stack, self.folder, self.stem)
+                exr.write_sequence(check_stack(stack), self.folder, self.stem)
 
 
 def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:

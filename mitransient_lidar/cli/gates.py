@@ -66,15 +66,8 @@ def _gates(
 def _open(path: Path) -> xr.Dataset:
     """Open a result or a gate stack."""
     from mitransient_lidar import results
-    from mitransient_lidar.results import gate_files
 
-    try:
-        return results.open(path)
-    except UserError as error:
-        try:
-            return gate_files.open_stack(path)
-        except UserError:
-            raise error from None
+    return results.dataset_of("FILE", path, "result", "gates")
 
 
 COMMANDS = {

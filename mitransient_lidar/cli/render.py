@@ -77,14 +77,13 @@ _DRAWINGS = {
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
     from mitransient_lidar import results
-    from mitransient_lidar.results import gate_files
 
     dispensable = {".exr": "EXR file"}.get(target.suffix, "drawing of the pixels" * target.stem.endswith("_layout"))
     try:
         if target.suffix == ".exr":
             results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
         elif target.suffix == ".nc":
-            (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+            results.save(dataset, target)
         else:
             function_at(next(_DRAWINGS[end] for end in _DRAWINGS if target.stem.endswith(end)))(dataset, target)
     except WriteError:
@@ -109,7 +108,7 @@ def _passive(
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
     check_targets(output, targets, scene)
     from mitransient_lidar.plots import passive as passive_plots
-    from mitransient_lidar.results.radiance import save_radiance
+    from mitransient_lidar.results import save
 
     with DeferredInterrupt(at_once=False):
         image = _again(call)()
@@ -121,7 +120,7 @@ def _passive(
         with announced():
             for target in targets:
                 if target.suffix != ".gif" or "row" in image.dims:
-                    writers.get(target.suffix, save_radiance)(image, target)
+                    writers.get(target.suffix, save)(image, target)
     if not quiet:
         typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
         if "background_power" in image:

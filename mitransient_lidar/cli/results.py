@@ -61,11 +61,11 @@ def _view(
     target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
     draws_again(file)
     check_figure(target)
-    from mitransient_lidar.analysis.waveforms.records import open_waveforms
+    from mitransient_lidar import results
     from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_components, plot_waveforms
 
-    dataset = open_waveforms(file)
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     with announced():
@@ -83,10 +83,11 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
     """Write the page of a result, and open it in the browser."""
     if output is not None:
         check_suffix("--output", output, ".html")
+    from mitransient_lidar import results
     from mitransient_lidar.plots.viewer import view as page_of
 
     with reporting(quiet):
-        dataset = _open_any(file)
+        dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates")
         page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=_PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -94,20 +95,6 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
         path = page.save(output)
     if browser and not webbrowser.open(path.resolve().as_uri()):
         typer.echo("no browser was found: open the page in one.", err=True)
-
-
-def _open_any(path: Path) -> xr.Dataset:
-    """Read a result, a gate stack or recorded signals."""
-    from mitransient_lidar.analysis.waveforms.records import open_waveforms
-    from mitransient_lidar.results.gate_files import open_stack
-
-    try:
-        return open_waveforms(path)
-    except UserError as error:
-        try:
-            return open_stack(path)
-        except UserError:
-            raise error from None
 
 
 def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
@@ -132,7 +119,7 @@ def _compare(
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
     check_figure(target)
-    datasets = results.open(first), results.open(second)
+    datasets = results.dataset_of("FILE", first, "result"), results.dataset_of("OTHER", second, "result")
     outcome = comparison.compare(*datasets)
     with announced():
         plot_comparison(*datasets, outcome, target)

@@ -20,6 +20,7 @@ from typing import TextIO
 
 from mitransient_lidar.core.errors import UserError, WriteError, printable
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.validation import shown
 
 #: Beginning of the names of temporary files and folders; host, process space, process and a unique number follow, which
 #: tell leftovers of processes that were killed from files of running ones.
@@ -101,6 +102,13 @@ def check_regular(path: str | os.PathLike[str]) -> None:
     except ValueError as error:
         raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL.") from error
     _check_mode(path, mode)
+
+
+def checked_path(name: str, path: object) -> Path:
+    """Return a path; raise `UserError` if it is no text or path, or empty."""
+    if not isinstance(path, (str, os.PathLike)) or not str(path):
+        raise UserError(f"{name} = {shown(path)} must be the path of a file or folder")
+    return Path(path)
 
 
 def is_there(path: Path) -> bool:

@@ -12,6 +12,7 @@ import xarray as xr
 from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import ProcessCount, Scheduler, complete
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
@@ -84,8 +85,8 @@ def fly(
     if isinstance(flight, Mapping):
         plan = FlightPlan.of(flight)
     else:
-        plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
-    folder = Path(folder)
+        plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(checked_path("flight", flight))
+    folder = checked_path("folder", folder)
     coordinate_system_wkt(plan.crs, plan.origin[:2])
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size, progress), workers, scheduler, False, progress)
     flown = Flown.of(store)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -18,46 +17,18 @@ from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths
 from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.variables import PointClass, flagged, label
 
 _PER_NS = 0.5e-9 * C0  # distance in air per nanosecond of a two-way time [m/ns]
 _ORTHONORMAL = 1e-6  # largest error of lengths and products of the directions of a pose
 _SMALLEST_DESCENT = 1e-3  # least vertical component of a line of sight that meets the sea
 
 
-class PointClass(IntEnum):
-    """Class of a point, by the codes of LAS 1.4 for bathymetry."""
-
-    BOTTOM = 40
-    SURFACE = 41
-    OBJECT = 43
-    NO_ECHO = 45
-
-
-#: Echoes of `echo_table.extract` that are points, in the order of their arrival.
-_ECHOES = {"surface": PointClass.SURFACE, "target": PointClass.OBJECT, "bottom": PointClass.BOTTOM}
+#: Classes of the echoes of `echo_table.extract` that are points, in the order of their arrival.
+ECHOES = {"surface": PointClass.SURFACE, "target": PointClass.OBJECT, "bottom": PointClass.BOTTOM}
 
 _OF_ECHOES = ("depth_m", "depth_m_stderr", "depth_m_method_error", "time_ns_stderr", "amplitude", "flags")
 _OF_SURFACES = ("surface_time_ns", "surface_time_ns_stderr", "surface_time_ns_method_error")
-
-_DESCRIBED = {
-    "x": ("m", "easting"),
-    "y": ("m", "northing"),
-    "z": ("m", "height above the mean sea level of the scene"),
-    "kind": ("1", "class: 40 bottom, 41 water surface, 43 submerged object, 45 no echo"),
-    "depth": ("m", "depth below the local surface"),
-    "intensity": ("", "amplitude of the echo"),
-    "x_uncertainty": ("m", "standard deviation of x"),
-    "y_uncertainty": ("m", "standard deviation of y"),
-    "horizontal_uncertainty": ("m", "root of the sum of the variances of x and y"),
-    "vertical_uncertainty": ("m", "standard deviation of z"),
-    "depth_uncertainty": ("m", "standard deviation of the depth"),
-    "shot": ("1", "number of the pulse, from 0"),
-    "pixel": ("1", "number of the pixel, from 0"),
-    "return_number": ("1", "number of the point in its waveform, from 1"),
-    "number_of_returns": ("1", "points of the waveform"),
-    "flags": ("1", "problems of the echo, as of echo_table"),
-    "gps_time": ("s", "time of the pulse"),
-}
 
 
 def positions(
@@ -169,7 +140,7 @@ def positions(
         "x": x,
         "y": y,
         "z": z,
-        "kind": np.array([*_ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8),
+        "kind": np.array([*ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8),
         # The surface from which depths count, estimated from all pixels of the shot; its own echo may be later.
         "depth": np.where(echo == 0, 0.0, table.value("depth_m", shot, pixel, echo)),
         "intensity": table.value("amplitude", shot, pixel, echo),
@@ -186,12 +157,10 @@ def positions(
     }
     if time_s is not None:
         values["gps_time"] = times[shot]
-    units = {"intensity": echoes["amplitude"].attrs.get("units", "")}
-    data = {
-        name: ("point", value, {"units": units.get(name, _DESCRIBED[name][0]), "long_name": _DESCRIBED[name][1]})
-        for name, value in values.items()
-    }
-    return xr.Dataset(data, attrs={"surface_level_m": surface.level, "surface_level_error_m": surface.level_error})
+    points = xr.Dataset({name: ("point", value) for name, value in values.items()})
+    points = label(points, "points", intensity=echoes["amplitude"].attrs.get("units", ""))
+    points["kind"].attrs.update(flagged(PointClass))
+    return points.assign_attrs(surface_level_m=surface.level, surface_level_error_m=surface.level_error)
 
 
 def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SurfaceModel:
@@ -254,12 +223,12 @@ class _Table:
             raise UserError(
                 f"the echoes have the dimensions {', '.join(map(str, echoes.dims))}: they need shot and pixel"
             )
-        chosen = echoes.sel(echo=list(_ECHOES))
+        chosen = echoes.sel(echo=list(ECHOES))
         values = {name: chosen[name].transpose("shot", *pixels, "echo").values for name in _OF_ECHOES}
         values |= {name: chosen[name].transpose("shot", *pixels).values for name in _OF_SURFACES}
         shots = echoes.sizes["shot"]
         shape = shots, values["surface_time_ns"].size // max(shots, 1)
-        last = {name: (len(_ECHOES),) if name in _OF_ECHOES else () for name in values}
+        last = {name: (len(ECHOES),) if name in _OF_ECHOES else () for name in values}
         return cls({name: value.reshape(*shape, *last[name]) for name, value in values.items()}, shape)
 
     def points(self) -> tuple[IntArray, IntArray, IntArray]:

@@ -22,11 +22,12 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.positions import PointClass, fit_surface, numbered_returns, positions
+from mitransient_lidar.flights.positions import ECHOES, fit_surface, numbered_returns, positions
 from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
+from mitransient_lidar.results.variables import PointClass, flagged, label
 
 #: Pulses of a chunk of a file.
 _CHUNK = 4096
@@ -36,10 +37,6 @@ _COUNTS = 65000
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")
-
-
-#: Echo of a point by its class.
-_ECHO_OF = {PointClass.SURFACE: "surface", PointClass.OBJECT: "target", PointClass.BOTTOM: "bottom"}
 
 
 class Quality(IntFlag):
@@ -181,10 +178,10 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
         surface = fit_surface(points, mean_slope(attributes, width), plan.surface_radius)
         points = positions(echoes, poses, *angles, surface=surface, **options)
     shot = points["shot"].values
-    points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
-    points["line"] = ("point", flown.values("line")[shot], {"units": "1"})
+    points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot])
+    points["line"] = ("point", flown.values("line")[shot])
     points = points.assign(_quality(points, echoes))
-    return points.assign(_truth(flown, plan, points))
+    return label(points.assign(_truth(flown, plan, points)), "points")
 
 
 def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
@@ -193,9 +190,9 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
     flags = points["flags"].values
 
     def of_echo(name: str) -> npt.NDArray[Any]:
-        values = echoes[name].transpose("shot", "pixel", "echo").sel(echo=list(_ECHO_OF.values())).values
+        values = echoes[name].transpose("shot", "pixel", "echo").sel(echo=list(ECHOES)).values
         found = np.zeros(flags.shape, dtype=values.dtype)
-        for number, kind in enumerate(_ECHO_OF):
+        for number, kind in enumerate(ECHOES.values()):
             own = points["kind"].values == kind
             found[own] = values[..., number][place][own]
         return found
@@ -211,16 +208,9 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
         corrected = behind & np.isfinite(of_echo("depth_correction_m"))
         quality |= np.where(corrected, int(Quality.CORRECTED), 0)
         quality |= np.where(behind & of_echo("beyond_table"), int(Quality.BEYOND_TABLE), 0)
-    meanings = {
-        "units": "1",
-        "long_name": "quality of the point",
-        "flag_masks": [int(one) for one in Quality],
-        "flag_meanings": " ".join(str(one.name).lower() for one in Quality),
-    }
-    withheld = {"units": "1", "long_name": "whether the echo is saturated or its fit poor"}
     return {
-        "quality": ("point", quality.astype(np.uint8), meanings),
-        "withheld": ("point", ~silent & (clipped | poor), withheld),
+        "quality": ("point", quality.astype(np.uint8), flagged(Quality)),
+        "withheld": ("point", ~silent & (clipped | poor)),
     }
 
 
@@ -266,12 +256,8 @@ def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]
     known = {name: flown.values(name)[shot] for name in _TRUTH}
     true_z = np.where(dry, known["true_surface_height"], height)
     found: dict[str, Any] = {
-        "true_z": (
-            "point",
-            true_z,
-            {"units": "m", "long_name": "height of the surface in the beam or of a solid"},
-        ),
-        "true_target": ("point", target & ~dry, {"units": "1", "long_name": "whether the highest solid is a target"}),
+        "true_z": ("point", true_z),
+        "true_target": ("point", target & ~dry),
     }
     return found | {name: ("point", values, dict(flown.store.array(name).attrs)) for name, values in known.items()}
 
@@ -339,7 +325,7 @@ def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
     shot, pixel, kind = (points[name].values for name in ("shot", "pixel", "kind"))
     names = [str(name) for name in flown.coordinate("echo")]
     arrival = np.array(surface[shot, pixel])
-    for code, name in ((PointClass.BOTTOM, "bottom"), (PointClass.OBJECT, "target"), (PointClass.SURFACE, "surface")):
+    for name, code in ECHOES.items():
         own = kind == code
         found = time[shot[own], pixel[own], names.index(name)]
         arrival[own] = np.where(np.isfinite(found), found, arrival[own])

@@ -16,7 +16,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.design import Column
-from mitransient_lidar.campaigns.runs import Array
+from mitransient_lidar.campaigns.runs import Array, plain
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -48,6 +48,7 @@ from mitransient_lidar.loading.scenes import read_record
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
+from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches
@@ -62,22 +63,6 @@ _ROUNDING = 1e-6
 #: Pulses of a flight that automatic settings of its receiver are chosen from, those of another one that are sampled
 #: before it, and passes of each.
 _PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
-
-#: Inputs of each pulse: unit and description.
-_INPUTS = {
-    "pulse": ("1", "number of the pulse in the flight"),
-    "time_s": ("s", "time of the pulse"),
-    **{f"origin_{axis}": ("m", f"position of the scanner, {axis}") for axis in "xyz"},
-    **{f"{side}_{axis}": ("1", f"direction {side}, {axis}") for side in ("axis", "far", "left") for axis in "xyz"},
-    "scan_angle_deg": ("degree", "angle of the pulse across the flight from the vertical, positive to the right"),
-    "line": ("1", "number of the flight line"),
-    "group": ("1", "group of pulses of similar poses"),
-    "group_angle_deg": ("degree", "angle from nadir of the lidar of the group"),
-    "group_height": ("m", "height of the lidar of the group above the mean sea level"),
-    "group_x": ("m", "place of the lidar of the group, x"),
-    "group_y": ("m", "place of the lidar of the group, y"),
-    "record_start_ns": ("ns", "start of the record of the lidar of the group"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +156,7 @@ class FlightRenderer:
             if name.startswith(setting):
                 number = name.removeprefix(setting)
                 return {"units": "1", "long_name": f"{text} of channel {number} of the receiver, chosen for the flight"}
-        unit, text = _INPUTS[name]
-        return {"units": unit, "long_name": text}
+        return described(name, "flight")
 
     def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
         """Return nothing: all inputs are known before."""
@@ -198,17 +182,13 @@ class FlightRenderer:
         """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
         arrays, echoes = self._stacked(inputs, turned=False)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
-        found = {
-            name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
-            for name in names
-        }
+        found = {name: Array.of(echoes[name]) for name in names}
         samples = arrays["signal"].values.shape[-1]
         width = float(echoes.attrs["bin_width_ns"])
-        time = {"units": "ns", "long_name": "time from the start of the record of the shot, centres of samples"}
-        found["time"] = Array(("time",), (np.arange(samples) + 0.5) * width, time)
-        found["echo"] = Array(("echo",), np.array(ECHOES), {"long_name": "kind of echo"})
+        found["time"] = Array(("time",), (np.arange(samples) + 0.5) * width, described("time", "flight"))
+        found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
-        return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
+        return stacked, found, {"echo_attributes": plain(echoes.attrs)}
 
     def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
@@ -220,12 +200,11 @@ class FlightRenderer:
         )
         pixels = recorded.sizes["pixel"]
         start = float(recorded.attrs["time_start_ns"]) + later
-        about = {"units": "ns", "long_name": "time of the start of the first sample after the pulse"}
         found = {
             "signal": _single(recorded["signal"]),
-            "sample_start_ns": Array((), start, about),
-            "time_offset_ns": Array((), later, {"units": "ns", "long_name": "time of the shot after its group's"}),
-            "gain": _per_pixel(recorded.attrs["gain"], len(later), pixels, "factor of the amplifier's transimpedance"),
+            "sample_start_ns": Array((), start, described("sample_start_ns")),
+            "time_offset_ns": Array((), later, described("time_offset_ns")),
+            "gain": _per_pixel(recorded.attrs["gain"], len(later), pixels),
         }
         for name, values in series.coords.items():
             if str(name).startswith("true_"):
@@ -367,20 +346,11 @@ def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
     """Return an array of shots, without the name of their dimension."""
     # Without the coordinates, which take longer than the values.
-    ordered = values.variable.transpose("shot", ...)
-    dims = tuple(str(dim) for dim in ordered.dims if dim != "shot")
-    return Array(dims, np.asarray(ordered, dtype=dtype), _plain(ordered.attrs))
+    array = Array.of(values.variable.transpose("shot", ...), dtype)
+    return array._replace(dims=tuple(dim for dim in array.dims if dim != "shot"))
 
 
-def _per_pixel(value: Any, shots: int, pixels: int, text: str) -> Array:
-    """Return a number, or one for each pixel, of all shots."""
+def _per_pixel(value: Any, shots: int, pixels: int) -> Array:
+    """Return the gain, a number or one for each pixel, of all shots."""
     values = np.broadcast_to(np.asarray(value, dtype=np.float64), (shots, pixels))
-    return Array(("pixel",), np.array(values), {"units": "1", "long_name": text})
-
-
-def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes that JSON can hold."""
-    return {
-        str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
-        for name, value in attributes.items()
-    }
+    return Array(("pixel",), np.array(values), described("gain"))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text, replacing, together
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.parameters import values_of
 
@@ -32,6 +33,8 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
         If there is no such scene; the message lists shipped scenes of similar names.
     """
     names = scene_names()
+    if not isinstance(name_or_path, (str, os.PathLike)):
+        raise UserError(f"scene = {shown(name_or_path)} must be the name of a shipped scene or the path of an XML file")
     if str(name_or_path) in names:
         return folder_of_scenes() / f"{name_or_path}.xml"
     path = Path(name_or_path)

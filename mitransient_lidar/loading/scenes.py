@@ -125,14 +125,16 @@ def open_scene(
         return scene
     variants.set_variant(variant)
     import mitsuba as mi
+    import xarray as xr
 
     from mitransient_lidar.transport.scene_parts import fit_seas, lidar_sensor
 
     check_params(params)
+    is_dict = isinstance(scene, Mapping) and not isinstance(scene, xr.Dataset)
     if isinstance(scene, mi.Scene):
         _no_parameters(params, instrument, "a loaded scene")
         loaded = LoadedScene(scene, scene.id() or "scene", {})
-    elif isinstance(scene, Mapping) or (isinstance(scene, SceneRecord) and not scene.is_xml):
+    elif is_dict or (isinstance(scene, SceneRecord) and not scene.is_xml):
         _no_parameters(params, instrument, "a dict")
         loaded = _load_dict(scene)
     elif isinstance(scene, (SceneRecord, str, os.PathLike)):

@@ -146,7 +146,6 @@ def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool
     if label:
         ax.set(xlabel=ANGLE_Y_LABEL, ylabel=ANGLE_X_LABEL)
     left, right, near, far = image_extent(dataset)
-    # Results of versions up to 0.1 have the right edge in column 0.
     angle_x, angle_y = dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values
     across = (right, left) if angle_y[-1] > angle_y[0] else (left, right)
     along = (far, near) if angle_x[-1] > angle_x[0] else (near, far)

@@ -22,7 +22,6 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Most cells along a side of an imager that are drawn with edges.
@@ -294,10 +293,9 @@ def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
     outline = _draw_field(ax, dataset.attrs, ground)
     if len(outline) == 0 or not np.isfinite(outline).all():
         return outline
-    seen = picture_order(dataset)
-    energy = seen["impulse_response"].sum("time").values
+    energy = dataset["impulse_response"].sum("time").values
     rows, columns = energy.shape
-    left, right, near, far = drawing.image_extent(seen)
+    left, right, near, far = drawing.image_extent(dataset)
     angles = np.meshgrid(np.linspace(far, near, rows + 1), np.linspace(left, right, columns + 1), indexing="ij")
     corners = ground.project(ground.receiver, np.stack(angles, axis=-1))
     factor, prefix = drawing.si_prefix(float(np.nanmax(energy, initial=0.0)))

@@ -12,7 +12,6 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.formats import picture_order
 
 #: Share of the pixels that may be brighter than white, or darker than black: glints would leave the rest black.
 _CLIPPED = 0.01
@@ -68,7 +67,7 @@ def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
         raise UserError(f"cannot write {path}: the file name must end in .gif.")
     if dataset["radiance"].dims != ("frame", "row", "column"):
         raise UserError("an animation needs frames of an imager: render several frames of a layout with many pixels")
-    radiance = picture_order(dataset)["radiance"].values
+    radiance = dataset["radiance"].values
     low, high = _levels(radiance)
     grey = np.nan_to_num(255 * np.clip((radiance - low) / max(high - low, 1e-300), 0, 1)).astype(np.uint8)
     scale = max(1, -(-_ANIMATION_WIDTH // radiance.shape[2]))

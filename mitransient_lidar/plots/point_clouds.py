@@ -9,17 +9,17 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.flights.positions import PointClass
 from mitransient_lidar.flights.products import Flown
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.results.variables import PointClass
 
-#: Colour and name of the points of a class.
+#: Colour of the points of a class.
 _CLASSES = {
-    PointClass.SURFACE: ("#1f77b4", "water surface"),
-    PointClass.BOTTOM: ("#8c564b", "bottom"),
-    PointClass.OBJECT: ("#d62728", "object"),
-    PointClass.NO_ECHO: ("#999999", "no echo"),
+    PointClass.SURFACE: "#1f77b4",
+    PointClass.BOTTOM: "#8c564b",
+    PointClass.OBJECT: "#d62728",
+    PointClass.NO_ECHO: "#999999",
 }
 
 #: Half of the width of the strip of a profile [m], and most waveforms in it.
@@ -111,10 +111,10 @@ def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
     along = "x" if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else "y"
-    for kind, (colour, name) in _CLASSES.items():
+    for kind, colour in _CLASSES.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
-            label = f"{name} ({np.count_nonzero(chosen)})"
+            label = f"{kind.text} ({np.count_nonzero(chosen)})"
             ax.plot(points[along].values[chosen], points["z"].values[chosen], ".", color=colour, ms=1.5, label=label)
     ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title="Points by class, from the side")
     drawing.add_grid(ax)

@@ -10,12 +10,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import xarray as xr
-
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
+from mitransient_lidar.results.files import Given, dataset_of
 
 _NOTEBOOK_MB = 20.0  # of a page in a notebook, which is stored with it
 _FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # of temporary pages
@@ -33,7 +32,8 @@ class View:
     """
 
     def __init__(self, page: str, name: str, height: int) -> None:
-        self.page, self.height = page, height
+        self.page: str = page
+        self.height: int = height
         self._name = name
 
     def _repr_html_(self) -> str:
@@ -76,9 +76,7 @@ def _remove_former_pages() -> None:
                 shutil.rmtree(folder)
 
 
-def view(
-    result: xr.Dataset, waveforms: xr.Dataset | None = None, *, height: int = 640, limit_mb: float = _NOTEBOOK_MB
-) -> View:
+def view(result: Given, waveforms: Given | None = None, *, height: int = 640, limit_mb: float = _NOTEBOOK_MB) -> View:
     """Return a page that shows a result, which a notebook shows below the cell.
 
     Parameters
@@ -97,5 +95,8 @@ def view(
     UserError
         If the result has neither gates nor a record in time, or `limit_mb` is too small for it.
     """
+    result = dataset_of("result", result, "waveforms", "signals", "gates")
+    if waveforms is not None:
+        waveforms = dataset_of("waveforms", waveforms, "waveforms")
     name = scene_name(result.attrs) or "result"
     return View(page_text(result, waveforms, limit_mb), name, height)

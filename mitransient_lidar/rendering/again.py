@@ -20,8 +20,6 @@ from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
 from mitransient_lidar.rendering.options import KEPT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
-from mitransient_lidar.results import exr, netcdf
-from mitransient_lidar.results.formats import input_format
 
 logger = logging.getLogger(__name__)
 
@@ -45,12 +43,7 @@ def is_result(scene: Any) -> bool:
 
 def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, Any]:
     """Return the attributes of a result, or of its EXR or NetCDF file; raise UserError if it cannot be read."""
-    if isinstance(result, xr.Dataset):
-        return dict(result.attrs)
-    path = Path(result)
-    if input_format(path) == "netcdf":
-        return dict(netcdf.read_netcdf(path).attrs)
-    return dict(exr.exact_metadata(path, exr.read_parts(path)[0].attributes).get("attributes", {}))
+    return dict((result if isinstance(result, xr.Dataset) else results.open(result)).attrs)
 
 
 def result_kind(attributes: Mapping[str, Any]) -> str:
@@ -130,7 +123,7 @@ def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[s
     if "shot" not in series.dims or not np.array_equal(series["shot"], np.arange(attributes.get("shots", 0))):
         raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
     check_params(given.get("params"))
-    # The bins of some shots are those of all of them. Series of earlier versions do not hold the passes of each shot.
+    # The bins of some shots are those of all of them.
     same: dict[str, Any] = {} if "params" in given or "positions" in given else {"axis": results.time_axis(series)}
     if same and "shot_passes" in series.coords and not any(name in given for name in _ENDS):
         same |= {"passes": int(_held(attributes, "most_passes")), "shot_passes": series["shot_passes"].values}

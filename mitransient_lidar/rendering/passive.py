@@ -20,6 +20,7 @@ from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.options import (
     MOST_PASSES,
@@ -38,10 +39,12 @@ from mitransient_lidar.rendering.passes import (
     run_passes,
     warn_of_edge_loss,
 )
-from mitransient_lidar.results.radiance import build_radiance
+from mitransient_lidar.results.attributes import titled
+from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
+    from mitransient_lidar.transport.sensor.pixels import PixelArray
 
 logger = logging.getLogger(__name__)
 
@@ -104,7 +107,9 @@ def render_passive(
     Returns
     -------
     xarray.Dataset
-        As described in `results.radiance`. ``etendue`` [m^2 sr] is open area times solid angle of each pixel times
+        ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,), after ``frame`` with
+        its coordinate ``time_s`` [s] for several; with a filter ``background_power`` [W], which the receiver detects
+        without its laser. ``etendue`` [m^2 sr] is open area times solid angle of each pixel times
         the transmittance of optics and (one way) air; power is radiance times etendue times width of the filter. The
         attribute ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that
         were begun, and the attribute ``interrupted`` is 1.
@@ -158,15 +163,38 @@ def render_passive(
         frame_passes=rendered,
         frame_step_s=step,
     )
-    return build_radiance(
-        images,
-        step * np.arange(len(images), dtype=np.float64) if frames > 1 else None,
-        etendue,
-        coords=results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid),
-        grid=pixels.grid,
-        filter_width_nm=width,
-        attributes=attributes,
-    )
+    times = step * np.arange(len(images), dtype=np.float64) if frames > 1 else None
+    return _labelled(images, times, pixels, etendue, width, attributes)
+
+
+def _labelled(
+    images: Sequence[tuple[FloatArray, FloatArray]],
+    times: FloatArray | None,
+    pixels: PixelArray,
+    etendue: FloatArray,
+    filter_width_nm: float | None,
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Return radiances and their errors, shape (pixels,), at times [s] of frames, as a dataset."""
+    coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
+    inner, shape = coords["angle_x"][0], coords["angle_x"][1].shape
+    dims, counts = (inner, shape) if times is None else (("frame", *inner), (len(images), *shape))
+    if times is not None:
+        coords |= {"frame": np.arange(len(times)), "time_s": ("frame", times)}
+    radiance, stderr = (np.reshape([image[i] for image in images], counts) for i in (0, 1))
+    area = etendue.reshape(shape)
+    variables: dict[str, Any] = {
+        "radiance": (dims, radiance),
+        "radiance_stderr": (dims, stderr),
+        "etendue": (inner, area),
+    }
+    weight, known = np.where(np.isfinite(radiance), area, 0), np.nan_to_num(radiance)
+    attributes = {**attributes, "background_radiance": float(np.sum(known * weight) / np.sum(weight))}
+    if filter_width_nm is not None:
+        variables["background_power"] = (dims, background_power(known, area, filter_width_nm))
+        attributes["filter_width_nm"] = filter_width_nm
+    title = titled("Radiance by daylight", attributes)
+    return label(xr.Dataset(variables, coords, {**results.provenance(attributes), "title": title}))
 
 
 def _render_frame(

@@ -47,8 +47,8 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 @alone
 def render(
     scene: SceneOrResult,
-    *,
     params: Mapping[str, Any] | None = None,
+    *,
     instrument: Instrument = None,
     sensor: Sensor = None,
     integrator: Annotated[Any, Option("Integrator to use instead of the scene's")] = None,

@@ -1,37 +1,48 @@
-"""Images of 32-bit floating-point numbers in OpenEXR files, and stacks of time bins in one image.
+"""OpenEXR files of datasets: parts of 32-bit floating-point channels, compressed with ZIP, and their metadata.
 
-A file has one or more parts of scan lines, compressed with ZIP. A stack of time bins is one part whose layers are the
-bins: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``,
-``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs. Beyond 1024 channels it
-has several parts, named by their first channel.
+- Time bins are the layers of one part: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels
+  ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs, beyond
+  1024 channels of several parts, named by their first channel.
+- Gates, and frames by daylight, are one part each, named ``gate000`` (four digits from 1000 gates on) or ``frame0000``,
+  with the channels ``Y`` and ``Y.stderr``. Every part has the header attributes ``gateStartNs``, ``gateWidthNs`` and,
+  if known, ``gateDepthM``, or ``timeS``. A sequence is a folder of files with one gate each, numbered like the parts.
 
-The attributes are written twice: OpenEXR supports only integers and floats of 32 bits and no empty list, so a JSON
-string (header attribute ``mitransientLidar``) stores them exactly; ``exrheader`` and other programs read the copies
-under their own names. The attribute ``mitransientLidarSha256`` of each part is the checksum of that string and of the
-channels: OpenEXR has none for its header, nor for blocks that ZIP cannot make smaller.
+Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice: OpenEXR
+supports only integers and floats of 32 bits and no empty list, so a JSON string (header attribute ``mitransientLidar``)
+stores them exactly; ``exrheader`` and other programs read copies of the numbers and texts that most readers need. The
+attribute ``mitransientLidarSha256`` of each part is the checksum of that string and of the channels: OpenEXR has none
+for its header, nor for blocks that ZIP cannot make smaller.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
+import xarray as xr
 
 from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result
 from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing, together
 from mitransient_lidar.core.validation import require_memory
+from mitransient_lidar.results.attributes import attribute, shown
 
-_EXACT = "mitransientLidar"
-_CHECKSUM = "mitransientLidarSha256"
+_LOG = logging.getLogger(__name__)
+
+_EXACT, _CHECKSUM = "mitransientLidar", "mitransientLidarSha256"
+_IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence and different between sequences
 _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
+_NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
 _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
 #: Channels of a part: OpenImageIO reads no more, and OpenEXR takes a time that grows with their square.
 _MOST_CHANNELS = 1024
@@ -39,123 +50,165 @@ _BYTES_PER_CHANNEL = 2500  #: Memory of a channel besides its values.
 _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
-Stacks = dict[str, dict[str, npt.NDArray[np.float32]]]
+#: Stack and component of the variables over time bins.
+_LAYERS = {
+    "impulse_response": ("bin", "Y"),
+    "impulse_response_stderr": ("bin", "stderr"),
+    "waveform": ("wave", "Y"),
+    "waveform_stderr": ("wave", "stderr"),
+}
+
+
+class _Images(NamedTuple):
+    """Datasets whose images along a dimension are parts."""
+
+    dim: str
+    digits: int  #: Fewest digits of the number of a part.
+    channels: dict[str, str]  #: Channel of each variable.
+    header: dict[str, str]  #: Header attribute of each coordinate over the dimension.
+
+
+_IMAGES = {
+    "gates": _Images(
+        "gate",
+        3,
+        {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"},
+        {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"},
+    ),
+    "radiance": _Images("frame", 4, {"radiance": "Y", "radiance_stderr": "Y.stderr"}, {"time_s": "timeS"}),
+}
 
 
 class Part(NamedTuple):
     """One image of a file."""
 
     name: str  #: Unique name of the part; empty in a file of one part.
-    attributes: dict[str, Any]  #: The header; for writing, the output of `header`.
+    attributes: dict[str, Any]  #: The header; for writing, of types that OpenEXR stores.
     channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values of shape (row, column).
 
 
-def write(
-    path: str | os.PathLike[str],
-    stacks: Mapping[str, Mapping[str, npt.NDArray[Any]]],
-    exact: Mapping[str, Any],
-    readable: Mapping[str, Any],
-) -> None:
-    """Write stacks of time bins.
-
-    Parameters
-    ----------
-    path : path
-        File to write; an existing one is overwritten.
-    stacks : mapping of str to mapping of str to array
-        Stack name (letters) to component name to values of shape (row, column, time); stored as 32-bit floats.
-    exact : mapping
-        Metadata that `read` returns unchanged, of JSON types.
-    readable : mapping of str to int, float, str or a list of those
-        Header attributes for other programs. Integers and floats beyond 32 bits are written as text, empty lists are
-        omitted.
+def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
+    """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts of a file, or of the files of a sequence.
 
     Raises
     ------
     UserError
-        If so many channels do not fit into the memory.
-    OSError
-        If the file cannot be written.
+        If the dataset has variables that the file cannot store, or so many channels do not fit into the memory.
     """
+    variables = _LAYERS if content == "waveforms" else _IMAGES[content].channels
+    if extra := [str(name) for name in dataset.data_vars if name not in variables]:
+        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
+    dataset = dataset.assign_attrs({str(name): attribute(str(name), value) for name, value in dataset.attrs.items()})
+    exact = {
+        "content": content,
+        "is_sequence": sequence,
+        "dims": list(next(iter(dataset.data_vars.values())).dims),
+        "attributes": dataset.attrs,
+        "variables": {name: dataset[name].attrs for name in variables},
+        "coordinates": {
+            str(name): {
+                "dims": list(coordinate.dims),
+                "kind": "str" if coordinate.dtype.kind in "UO" else coordinate.dtype.name,
+                "values": coordinate.values.tolist(),
+                "attributes": coordinate.attrs,
+            }
+            for name, coordinate in dataset.coords.items()
+        },
+    }
+    readable = {f"lidar.{name}": value for name, value in shown(dataset.attrs).items() if name != "scene_xml"}
+    if "pixel" in dataset.coords:
+        readable["pixelNames"] = [str(name) for name in dataset["pixel"].values]
+    if content == "waveforms":
+        readable |= {"timeStartNs": dataset.attrs["time_start_ns"], "binWidthNs": dataset.attrs["bin_width_ns"]}
+        return _layers(dataset, exact, readable)
+    return _images(dataset, exact, readable, _IMAGES[content])
+
+
+def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any]) -> list[Part]:
+    """Return time bins as layers of one part, or of several for many channels."""
     channels: dict[str, npt.NDArray[np.float32]] = {}
-    for stack, components in stacks.items():
-        for component, values in components.items():
-            # Bins first: every channel is one contiguous image.
-            images = np.ascontiguousarray(np.moveaxis(np.asarray(values, dtype=np.float32), -1, 0))
-            digits = max(4, len(str(len(images) - 1)))
-            for index, image in enumerate(images):
-                channels[f"{stack}{index:0{digits}d}.{component}"] = image
+    for name, (stack, component) in _LAYERS.items():
+        # Bins first: every channel is one contiguous image.
+        images = _pictures(dataset[name].values, -1)
+        digits = max(4, len(str(len(images) - 1)))
+        for index, image in enumerate(images):
+            channels[f"{stack}{index:0{digits}d}.{component}"] = image
     names = sorted(channels)
     advice = "take fewer or wider bins, or a .nc file"
     require_memory(f"{len(names)} channels of an EXR file", _BYTES_PER_CHANNEL * len(names), advice)
     several = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
-    shared = header(readable, exact)
-    parts = [
+    shared = {**_header(readable), _EXACT: json.dumps(exact)}
+    return [
         Part(
             chosen[0] if len(several) > 1 else "",
-            shared if number == 0 else {},
+            {} if number else shared,
             {name: channels[name] for name in chosen},
         )
         for number, chosen in enumerate(several)
     ]
-    write_parts(path, parts)
 
 
-def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
-    """Read the stacks and the exact metadata from a file of `write`.
-
-    Raises
-    ------
-    UserError
-        If the file is damaged or truncated, holds no stack of time bins, or was not written by `write`.
-    """
-    parts = read_parts(path)
-    exact = exact_metadata(path, parts[0].attributes)
-    layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
-    for part in parts:
-        for name, image in part.channels.items():
-            if match := _LAYER.fullmatch(name):
-                layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
-    stacks: Stacks = {}
-    for (stack, component), by_bin in layers.items():
-        if sorted(by_bin) != list(range(len(by_bin))):
-            raise UserError(_damaged(path))
-        stacks.setdefault(stack, {})[component] = np.stack([by_bin[index] for index in range(len(by_bin))], axis=-1)
-    if not stacks:
-        raise UserError(f"{path} holds no time bins.")
-    return stacks, exact
-
-
-def header(readable: Mapping[str, Any], exact: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the header attributes of a part from metadata as for `write`; `exact_metadata` returns `exact`."""
-    attributes = {
-        name: _plain(value)
-        for name, value in readable.items()
-        if value != [] and 0 < len(name.encode()) <= _LONGEST_NAME
-    }
-    if exact is not None:
-        attributes[_EXACT] = json.dumps(exact)
-    return attributes
+def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any], kind: _Images) -> list[Part]:
+    """Return images as parts, with readable attributes in the first one, or in all of a sequence."""
+    single = kind.dim not in dataset.dims
+    stack = dataset.expand_dims(kind.dim) if single else dataset
+    images = {name: _pictures(stack[name].transpose(kind.dim, ...).values, 0) for name in kind.channels}
+    text = json.dumps(exact)
+    identity = hashlib.sha256(text.encode())
+    for values in images.values():
+        identity.update(values.tobytes())
+    count = stack.sizes[kind.dim]
+    digits = kind.digits if count < 10**kind.digits else len(str(count - 1))
+    parts = []
+    for index in range(count):
+        own: dict[str, Any] = {
+            key: float(stack[name].values[index])
+            for name, key in kind.header.items()
+            if name in stack.coords and not single and np.isfinite(stack[name].values[index])
+        }
+        own[_IDENTITY] = identity.hexdigest()
+        described = {**_header(readable), **own} if exact["is_sequence"] or index == 0 else own
+        channels = {channel: images[name][index] for name, channel in kind.channels.items()}
+        name = "" if single else f"{kind.dim}{index:0{digits}d}"
+        parts.append(Part(name, described | ({_EXACT: text} if index == 0 else {}), channels))
+    return parts
 
 
-def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the exact metadata of a part.
+def _pictures(values: npt.NDArray[Any], axis: int) -> npt.NDArray[np.float32]:
+    """Return values as contiguous images (axis, row, column); pixels without a grid are an image one row high."""
+    images = np.moveaxis(values.astype(np.float32), axis, 0)
+    return np.ascontiguousarray(images if images.ndim == 3 else images[:, np.newaxis])
+
+
+def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
+    """Write a gate stack as numbered files in a folder, one per gate: ``<stem>_gate000.exr`` and so on.
+
+    The folder is created if it is missing, and existing files of the same names are replaced. The first file is written
+    last, so that `read` rejects an interrupted sequence.
 
     Raises
     ------
     UserError
-        If they are missing or damaged.
+        If `stem` is no file name, or a file cannot be written.
     """
-    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
-    if _EXACT not in attributes:
-        raise UserError(foreign)
-    exact = parse_json(attributes[_EXACT], f"the header attribute {_EXACT} of {path}")
-    if not isinstance(exact, dict):
-        raise UserError(foreign)
-    return exact
+    if not stem or Path(stem).name != stem:
+        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders.")
+    parts = parts_of(stack.drop_dims("parameter", errors="ignore"), folder, "gates", sequence=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}.") from error
+    paths = [folder / f"{stem}_{part.name}.exr" for part in parts]
+    with together():
+        for path, part in zip(paths, parts, strict=True):
+            with replacing(path) as temporary:
+                write(temporary, [part])
+    similar = {path for path in folder.iterdir() if (number := _NUMBERED.fullmatch(path.name)) and number[1] == stem}
+    if stale := sorted(similar - set(paths)):
+        _LOG.warning("%s does not belong to this sequence of %d gates, but has a similar name", stale[0], len(paths))
 
 
-def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
+def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
     """Write one or more images into one file, which is overwritten if it exists.
 
     Raises
@@ -174,6 +227,110 @@ def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
             file.write(os.fspath(path))
     except RuntimeError as error:
         raise OSError(str(error)) from error
+
+
+def read(path: Path) -> xr.Dataset:
+    """Read a dataset from a file, the first file of a sequence, or a folder with one sequence.
+
+    Raises
+    ------
+    UserError
+        If a file is missing, damaged or truncated, or was not written by this package.
+    """
+    if path.is_dir():
+        path = _first_of_folder(path)
+    parts = read_parts(path)
+    number = _NUMBERED.fullmatch(path.name)
+    if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
+        first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
+        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}.")
+    exact = exact_metadata(path, parts[0].attributes)
+    try:
+        kind = _IMAGES.get(exact.get("content", ""))
+        images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)
+        return _labelled(images, exact)
+    except UserError:
+        raise
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged: its metadata and its images disagree.") from error
+
+
+def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of variables over time bins, (row, column, time)."""
+    layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
+    for part in parts:
+        for name, image in part.channels.items():
+            if match := _LAYER.fullmatch(name):
+                layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
+    for by_bin in layers.values():
+        if sorted(by_bin) != list(range(len(by_bin))):
+            raise UserError(_damaged(path))
+    return {
+        name: np.stack([layers[key][index] for index in range(len(layers[key]))], axis=-1)
+        for name, key in _LAYERS.items()
+    }
+
+
+def _of_images(
+    path: Path, parts: list[Part], exact: Mapping[str, Any], kind: _Images
+) -> dict[str, npt.NDArray[np.float32]]:
+    """Return the values of variables in one part each image, (..., row, column) with the dimension of the parts."""
+    along = kind.dim in exact["dims"]
+    count = len(exact["coordinates"][next(iter(kind.header))]["values"]) if along else 1
+    if exact["is_sequence"] and count > 1:
+        parts = parts + _later_files(path, count)
+    if len(parts) != count:
+        raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} {kind.dim}s can be read.")
+    if len({part.attributes[_IDENTITY] for part in parts}) != 1:
+        raise UserError(f"{path} is damaged: its {count} {kind.dim}s belong to different stacks.")
+    axis = exact["dims"].index(kind.dim) if along else 0
+    found = {}
+    for name, channel in kind.channels.items():
+        images = np.stack([part.channels[channel] for part in parts])
+        found[name] = np.moveaxis(images, 0, -1 if axis else 0) if along else images[0]
+    return found
+
+
+def _labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) -> xr.Dataset:
+    """Return the dataset of images by variable; those without a grid lose their row."""
+    dims = tuple(exact["dims"])
+    coordinates = {
+        name: (item["dims"], np.array(item["values"], dtype=item["kind"]), item["attributes"])
+        for name, item in exact["coordinates"].items()
+    }
+    data = {}
+    for name, image in images.items():
+        values = image if image.ndim == len(dims) else image.squeeze(axis=1 if dims[0] == "frame" else 0)
+        data[name] = (dims, values.astype(np.float64), exact["variables"][name])
+    return xr.Dataset(data, coordinates, exact["attributes"])
+
+
+def _later_files(first: Path, count: int) -> list[Part]:
+    """Return the images of a sequence after the first file; raise `UserError` if a file is missing or damaged."""
+    number = _NUMBERED.fullmatch(first.name)
+    if number is None or int(number[2]) != 0:
+        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr.")
+    parts: list[Part] = []
+    for index in range(1, count):
+        path = first.with_name(f"{number[1]}_gate{index:0{len(number[2])}d}{first.suffix}")
+        if not path.is_file():
+            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing.")
+        parts += read_parts(path)
+    return parts
+
+
+def _first_of_folder(folder: Path) -> Path:
+    try:
+        numbers = {path: _NUMBERED.fullmatch(path.name) for path in sorted(folder.iterdir())}
+    except OSError as error:
+        raise UserError(f"cannot read {folder}: {error.strerror}.") from error
+    firsts = [path for path, number in numbers.items() if number and int(number[2]) == 0]
+    if len(firsts) == 1:
+        return firsts[0]
+    if firsts:
+        names = ", ".join(path.name for path in firsts[:3])
+        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names}).")
+    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr.")
 
 
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
@@ -206,6 +363,29 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
         if part.attributes.get(_CHECKSUM, checksum) != checksum:
             raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written.")
     return parts
+
+
+def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the exact metadata of a part.
+
+    Raises
+    ------
+    UserError
+        If they are missing or damaged.
+    """
+    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
+    if _EXACT not in attributes:
+        raise UserError(foreign)
+    exact = parse_json(attributes[_EXACT], f"the header attribute {_EXACT} of {path}")
+    if not isinstance(exact, dict):
+        raise UserError(foreign)
+    return exact
+
+
+def _header(readable: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the header attributes for other programs: text for numbers beyond 32 bits, and no empty lists."""
+    named = {name: value for name, value in readable.items() if value != [] and len(name.encode()) <= _LONGEST_NAME}
+    return {name: _plain(value) for name, value in named.items()}
 
 
 def _checksum(part: Part) -> str:

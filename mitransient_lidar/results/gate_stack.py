@@ -19,13 +19,18 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, made_from
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number
+from mitransient_lidar.results.variables import label
+
+#: Dimensions of results with time bins alone.
+_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
@@ -120,32 +125,22 @@ def build_gates(
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
     shape = tuple(pixels.sizes[dim] for dim in dims)
-    collected = {"long_name": "energy collected while the gate is open", "ancillary_variables": "gate_energy_stderr"}
-    error = {"long_name": "standard error of the energy collected in the gate"}
     variables = {}
-    for name, values, about in (("gate_energy", energy, collected), ("gate_energy_stderr", stderr, error)):
+    for name, values in (("gate_energy", energy), ("gate_energy_stderr", stderr)):
         array = np.asarray(values, np.float64)
         if array.shape not in ((*shape, train.count), (math.prod(shape), train.count)):
             raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
-        variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count), {"units": "J", **about})
+        variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count))
     axis = {
-        "gate": (np.arange(train.count), {"units": "1", "long_name": "number of the gate"}),
-        "gate_start": (train.starts_ns, {"units": "ns", "long_name": "half height of the gate's rising edge"}),
-        "gate_width": (
-            np.full(train.count, train.width_ns),
-            {"units": "ns", "long_name": "time between the half heights of the gate"},
-        ),
-        "gate_depth": (
-            gate_depths(train, attributes),
-            {"units": "m", "long_name": "depth of the middle of the gate on the axis", "positive": "down"},
-        ),
+        "gate": np.arange(train.count),
+        "gate_start": train.starts_ns,
+        "gate_width": np.full(train.count, train.width_ns),
+        "gate_depth": gate_depths(train, attributes),
     }
-    stack = pixels.assign(variables).assign_coords({name: ("gate", *item) for name, item in axis.items()})
-    history = str(attributes.get("history", ""))
+    stack = label(pixels.assign(variables).assign_coords({name: ("gate", values) for name, values in axis.items()}))
     stack.attrs = {
         **attributes,
-        "title": f"Energy in gates, scene {attributes['scene']}" if "scene" in attributes else "Energy in gates",
-        "history": "\n".join(part for part in (history, f"gates by mitransient-lidar {__version__}") if part),
+        **made_from(attributes, "Energy in gates", "cut into gates"),
         "gate_step_ns": train.step_ns,
         "gate_rise_ns": train.rise_ns,
         "gate_fall_ns": train.fall_ns,
@@ -168,17 +163,11 @@ def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.A
         Derivative of the energy in each gate, in J per unit of the parameter, and its standard error.
     """
     energy = stack["gate_energy"]
-    texts = {"": "derivative of the energy collected while the gate is open", "_stderr": "standard error of it"}
     arrays = {
-        f"gate_energy_derivative{end}": (
-            ("parameter", *energy.dims),
-            np.reshape(values, (-1, *energy.shape)),
-            {"units": "J per unit of the parameter", "long_name": text},
-        )
-        for (end, text), values in zip(texts.items(), (slopes, stderr), strict=True)
+        f"gate_energy_derivative{end}": (("parameter", *energy.dims), np.reshape(values, (-1, *energy.shape)))
+        for end, values in (("", slopes), ("_stderr", stderr))
     }
-    arrays["gate_energy_derivative"][2]["ancillary_variables"] = "gate_energy_derivative_stderr"
-    return stack.assign(arrays)
+    return label(stack.assign(arrays))
 
 
 def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis) -> None:
@@ -204,3 +193,32 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
             f"gate {gate} is open from {spans[gate, 0]:.1f} to {spans[gate, 1]:.1f} ns, but every gate must lie within "
             f"the record, {time.start_ns:.1f} to {time.end_ns:.1f} ns"
         )
+
+
+def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
+    """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
+
+    Raises
+    ------
+    UserError
+        If it has no gates, or dimensions other than (row, column, gate) or (pixel, gate); `place` names it.
+    """
+    if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
+        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+    energy = dataset["gate_energy"]
+    pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
+    if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):
+        raise UserError(
+            f"the dataset is no gate stack: gate_energy has the shape {dict(energy.sizes)}, but must have the "
+            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and must not be empty."
+        )
+    needed = {"gate_start": {"gate"}, "gate_width": {"gate"}, "angle_x": {*pixels}, "angle_y": {*pixels}}
+    for name, dims in needed.items():
+        if name not in dataset.coords or set(dataset[name].dims) != dims:
+            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
+    check_attributes(place, dataset.attrs)
+    check_coordinates(place, dataset, "gate_energy")
+    stack = dataset.drop_dims(_OF_BINS, errors="ignore")
+    if "gate_energy_derivative" not in stack:
+        stack = stack.drop_dims("parameter", errors="ignore")
+    return stack.transpose(..., *pixels, "gate")

@@ -21,19 +21,15 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.results.variables import described
 
 Attributes = Mapping[str, Any]
 
 
-#: Unit, description, and decimals kept of the coordinates of `LinesOfSight`.
+#: Decimals kept of the coordinates of `LinesOfSight`.
 _SIGHT = {
-    "sight_x": ("mrad", "angle of the line of sight in the plane of incidence, away from nadir", 6),
-    "sight_y": ("mrad", "angle of the line of sight across the plane of incidence", 6),
-    "off_nadir": ("degree", "angle of the line of sight from the vertical in air", 7),
-    "surface_time": ("ns", "arrival of the echo of the mean sea level along the line of sight", 6),
-    "surface_spread": ("ns", "standard deviation of that arrival over the pixel's direct light", 6),
-    "depth_per_ns": ("m ns-1", "depth per delay along the line of sight", 10),
-    "beam_share": ("1", "share of the beam's energy in the pixel", 9),
+    **{"sight_x": 6, "sight_y": 6, "off_nadir": 7, "surface_time": 6, "surface_spread": 6},
+    **{"depth_per_ns": 10, "beam_share": 9},
 }
 
 
@@ -118,8 +114,8 @@ class LinesOfSight:
         values = vars(self) | {"off_nadir": np.degrees(self.off_nadir)}
         values |= {name: 1e3 * values[name] for name in ("sight_x", "sight_y")}
         return {
-            name: (dims, np.round(values[name], digits).reshape(shape), {"units": unit, "long_name": text})
-            for name, (unit, text, digits) in _SIGHT.items()
+            name: (dims, np.round(values[name], digits).reshape(shape), described(name))
+            for name, digits in _SIGHT.items()
         }
 
     def at(self, index: slice | npt.NDArray[np.intp]) -> LinesOfSight:
@@ -257,15 +253,9 @@ def two_way_efficiency(attributes: Attributes, given: float | None = None) -> fl
     """Return a given efficiency of optics and atmosphere, or that of the lidar; see `lidar_system`."""
     if given is not None:
         return in_range("efficiency", given, 0, 1)
-    if "two_way_efficiency" in attributes:
-        return required_number(attributes, "two_way_efficiency")
-    # Results of earlier versions have the scene's parameters alone.
-    names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
-    try:
-        optics, atmosphere = (float(attributes[name]) for name in names)
-    except (KeyError, TypeError, ValueError):
-        raise UserError("efficiency must be given: the dataset has no attribute two_way_efficiency") from None
-    return optics**2 * atmosphere
+    if "two_way_efficiency" not in attributes:
+        raise UserError("efficiency must be given: the dataset has no attribute two_way_efficiency")
+    return required_number(attributes, "two_way_efficiency")
 
 
 def optional_number(attributes: Attributes, name: str) -> float | None:

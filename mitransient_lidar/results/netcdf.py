@@ -1,4 +1,8 @@
-"""NetCDF files of labelled datasets."""
+"""NetCDF files of labelled datasets.
+
+A file has at most 40 attributes of its own, numbers and texts. The attribute ``mitransient_lidar`` is a text of JSON
+with all others, lists among them, which `read` restores.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import h5netcdf
@@ -19,52 +23,73 @@ from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.marks import LONGEST_TAIL
-from mitransient_lidar.results.formats import attribute, picture_order
+from mitransient_lidar.physics.receiver.electronics import Digitiser
+from mitransient_lidar.results.attributes import attribute, shown
 
-_CHECKSUM = b"mitransient-lidar sha256 "  # what the SHA-256 of a file follows at its end
-_LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the attributes to read back as lists
+#: What a file of this package starts with, and what its SHA-256 follows at its end.
+SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
+
+#: Attribute with the JSON of those that are not attributes of the file.
+OTHERS = "mitransient_lidar"
+
+_SMALL = 4096  # bytes of a variable that is not worth compressing
+_ROUNDING = 1e-2  # of a step of a converter, by which a signal may differ from a code
 
 
-def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], compressed: Collection[str]) -> None:
-    """Write a dataset, with the large variables `compressed`, to a NetCDF-4 file; an existing one is overwritten.
+def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
-    Attributes have the types that `formats.attribute` returns.
+    It goes by way of memory, because HDF5 ends the process where the disk is full. Signals behind a converter are
+    written as its codes.
 
     Raises
     ------
+    ValueError
+        If an attribute is no number, text or list of one of these.
     OSError
         If the file cannot be written.
     """
     dataset = dataset.drop_encoding()
-    # NetCDF does not distinguish a list of one item from the item.
-    dataset.attrs[_LISTS] = json.dumps([name for name, value in dataset.attrs.items() if isinstance(value, list)])
+    attributes = {str(name): attribute(str(name), value) for name, value in dataset.attrs.items()}
+    dataset.attrs = shown(attributes)
+    # All names, in their order: without a value, those that the file has itself.
+    others = {name: None if name in dataset.attrs else value for name, value in attributes.items()}
+    dataset.attrs[OTHERS] = json.dumps(others)
     # No fill value: CF forbids it for coordinates, and a NaN in the data is a value.
     encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in dataset.variables}
-    for name in compressed:
-        encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True}
-    dump(dataset, path, encoding)
-
-
-def dump(dataset: xr.Dataset, path: str | os.PathLike[str], encoding: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write a dataset to a NetCDF-4 file by way of memory, because HDF5 ends the process where the disk is full.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    for name, values in dataset.variables.items():
+        if values.dtype.kind in "fiub" and values.nbytes > _SMALL:
+            encoding[str(name)] |= {"zlib": True, "complevel": 4, "shuffle": True}
+    if "signal" in dataset:
+        encoding["signal"] |= _codes(dataset["signal"].values, attributes)
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:
         dataset.dump_to_store(H5NetCDFStore(file), encoding=encoding)
-    with open(path, "wb") as output:
+    with Path(path).open("wb") as output:
         output.write(buffer.getbuffer())
         output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+
+
+def _codes(signal: np.ndarray[Any, Any], attributes: dict[str, Any]) -> dict[str, Any]:
+    """Return the encoding of signals [V] as codes of the converter in the attributes; empty for other values."""
+    names = ("receiver.digitiser.bits", "receiver.digitiser.full_scale_v", "receiver.digitiser.low_v")
+    if not set(names) <= attributes.keys():
+        return {}
+    bits, full_scale, low = (attributes[name] for name in names)
+    digitiser = Digitiser(int(bits), float(full_scale), float(low))
+    codes = (signal[np.isfinite(signal)] - digitiser.low_v) / digitiser.step_v
+    if np.any(np.abs(codes - np.rint(codes)) > _ROUNDING):
+        return {}  # such as a mean over shots
+    # The highest number of the type, which no code has, is the one for missing values.
+    kind = np.dtype("uint16" if digitiser.bits < 16 else "uint32")
+    scale = {"scale_factor": digitiser.step_v, "add_offset": digitiser.low_v}
+    return {"dtype": kind, "_FillValue": int(np.iinfo(kind).max), **scale}
 
 
 def check_sum(path: str | os.PathLike[str]) -> bool:
     """Return whether a file ends in its checksum; raise `UserError` if in another one, before HDF5, which may hang.
 
-    `dump` appends it to the HDF5 data, and commands a mark (`core.marks`). HDF5 does not read them, and removes them
+    `write` appends it to the HDF5 data, and commands a mark (`core.marks`). HDF5 does not read them, and removes them
     when another program changes the file.
     """
     length = len(_CHECKSUM) + 2 * hashlib.sha256().digest_size
@@ -84,8 +109,8 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
     return True
 
 
-def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a file of `write_netcdf` into memory, images in picture order.
+def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
+    """Read a NetCDF-4 file into memory, and return whether another program than `write` has written it.
 
     Raises
     ------
@@ -96,18 +121,19 @@ def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     check_sum(path)
     with damaged_file(damaged):
         check_hdf5(path)
-    with (
-        damaged_file(damaged),
-        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
-    ):
+    with damaged_file(damaged), xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file:
         check_size(path, file.nbytes, largest_result())
         dataset = file.load().drop_encoding()
-        lists = parse_json(dataset.attrs.pop(_LISTS, "[]"), f"the attribute {_LISTS} of {path}")
-        dataset.attrs = {
-            str(name): np.atleast_1d(value).tolist() if name in lists else attribute(str(name), value)
-            for name, value in dataset.attrs.items()
-        }
+        foreign = OTHERS not in dataset.attrs
+        others = parse_json(dataset.attrs.pop(OTHERS, "{}"), f"the attribute {OTHERS} of {path}")
+        own = {str(name): value for name, value in dataset.attrs.items()}
+        # Another program may have removed or added some since.
+        named = {name: own.get(name, value) for name, value in dict(others).items() if name in own or value is not None}
         for name, coordinate in dataset.coords.items():
             if coordinate.dtype.kind == "O":
                 dataset[name] = coordinate.astype(str)
-    return picture_order(dataset)
+    try:
+        dataset.attrs = {name: attribute(name, value) for name, value in {**named, **own}.items()}
+    except ValueError as error:
+        raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
+    return dataset, foreign

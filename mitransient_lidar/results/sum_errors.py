@@ -12,6 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.results.variables import label
 
 #: Variable with the correlation of the errors of bins, and its dimensions.
 VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")
@@ -199,10 +200,8 @@ def with_correlation(dataset: xr.Dataset, middles_ns: FloatArray, correlation: F
 
     The arguments are the middles of the blocks [ns], shape (blocks,), and the correlations of `SumErrors`.
     """
-    described = {"units": "1", "long_name": "mean correlation of the errors of the waveform's bins in two blocks"}
-    middles = {name: (name, middles_ns, {"units": "ns", "long_name": "middle of a block of bins"}) for name in DIMS}
-    values = correlation.astype(np.float32)
-    dataset = dataset.assign({VARIABLE: (DIMS, values, described)}).assign_coords(middles)
+    middles = {name: (name, middles_ns) for name in DIMS}
+    dataset = label(dataset.assign({VARIABLE: (DIMS, correlation.astype(np.float32))}).assign_coords(middles))
     known = SumErrors.of(dataset)
     assert known is not None
     count = dataset.sizes["time"]

@@ -11,12 +11,13 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Numbers, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import FewerPasses, Instrument, Numbers, Option, Scene, Seed, checked
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
+from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.plane_crossings import PlaneCrossings
@@ -30,22 +31,10 @@ _ABOVE_BOTTOM = 1e-3
 #: Number of radii and delays of the distributions, smallest over largest, and largest share of the light beyond them.
 _STEPS, _SMALLEST, _BEYOND = 160, 1e-3, 2e-3
 
-_MEANING = {
-    "transmitted": ("1", "share of the pulse energy that passes the depth downwards"),
-    "unscattered": ("1", "share of the pulse energy that passes the depth unscattered"),
-    "in_view": ("1", "share of the light at the depth that is in the field of view"),
-    "centroid_x": ("m", "mean x of the light"),
-    "centroid_y": ("m", "mean y of the light"),
-    "radius_rms": ("m", "root-mean-square distance from the centroid"),
-    "radius_50": ("m", "radius about the centroid that holds 50 % of the light"),
-    "radius_90": ("m", "radius about the centroid that holds 90 % of the light"),
-    "shift_rms": ("m", "root-mean-square horizontal shift by scattering"),
-    "delay_mean": ("ns", "mean delay by scattering"),
-    "delay_std": ("ns", "standard deviation of the delay by scattering"),
-    "within_radius": ("1", "share of the light within a radius of the centroid"),
-    "within_shift": ("1", "share of the light that scattering has shifted by at most a radius"),
-    "within_delay": ("1", "share of the light that scattering has delayed by at most a delay"),
-}
+_MEASURED = (
+    *("transmitted", "unscattered", "in_view", "centroid_x", "centroid_y", "radius_rms", "radius_50", "radius_90"),
+    *("shift_rms", "delay_mean", "delay_std", "within_radius", "within_shift", "within_delay"),
+)
 #: Coordinates of the distributions.
 _CURVES = {"within_radius": "radius", "within_shift": "radius", "within_delay": "delay"}
 
@@ -70,6 +59,7 @@ def beam_spread(
     depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     passes: Annotated[int, Option("Number of independent passes of each render", 2, 10_000)] = 8,
     max_time: FewerPasses = None,
     photons: Annotated[int, Option("Photons of a pass", 1024, 2**24)] = 2**16,
@@ -80,7 +70,7 @@ def beam_spread(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`.
     depths
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
@@ -115,7 +105,7 @@ def beam_spread(
     Paths end at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     wanted = np.unique(depths)
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -182,7 +172,7 @@ def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[
     weight, energy = light.weight, lidar.transmitter.energy
     shares = {"transmitted": weight.sum() / energy, "unscattered": weight[light.scatterings == 0].sum() / energy}
     if len(weight) == 0:
-        unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEANING}
+        unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEASURED}
         return {**unknown, **shares}
 
     def mean(values: npt.ArrayLike) -> float:
@@ -254,19 +244,13 @@ def _dataset(
 ) -> xr.Dataset:
     """Return means and standard errors over the passes."""
     data: dict[str, Any] = {}
-    for name, (units, meaning) in _MEANING.items():
+    for name in _MEASURED:
         values = np.array([[row[name] for row in rows] for rows in measured])
         error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
         dims = ("depth", _CURVES[name]) if name in _CURVES else ("depth",)
-        labels = {"units": units, "long_name": meaning, "ancillary_variables": f"{name}_stderr"}
-        data[name] = dims, values.mean(axis=0), labels
-        data[f"{name}_stderr"] = dims, error, {"units": units, "long_name": f"standard error of the {meaning}"}
-    coordinates = {
-        "depth": ("depth", depths, {"units": "m", "long_name": "depth below the mean sea level", "positive": "down"}),
-        "radius": ("radius", axes["radius"], {"units": "m", "long_name": "horizontal distance"}),
-        "delay": ("delay", axes["delay"], {"units": "ns", "long_name": "delay by scattering"}),
-    }
-    return xr.Dataset(data, coords=coordinates, attrs=attributes)
+        data |= {name: (dims, values.mean(axis=0)), f"{name}_stderr": (dims, error)}
+    coordinates = {"depth": depths, "radius": axes["radius"], "delay": axes["delay"]}
+    return label(xr.Dataset(data, coords=coordinates, attrs=attributes), "spread")
 
 
 def describe_spread(spread: xr.Dataset) -> list[str]:

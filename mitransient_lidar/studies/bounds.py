@@ -22,6 +22,7 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.options import (
     RECEIVERS,
     BackgroundPower,
+    Instrument,
     NumberOrAuto,
     Option,
     Scene,
@@ -35,6 +36,7 @@ from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
+from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
@@ -50,6 +52,7 @@ def bounds(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     free: Annotated[
         Sequence[str], Option("Unknown parameters, e.g. attenuation,bottom_reflectance", form="NAME,NAME,...")
     ],
@@ -102,7 +105,7 @@ def bounds(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`.
     free
         Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
@@ -149,7 +152,7 @@ def bounds(
     receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render
-        session = open_scene(scene, {**(params or {}), **design})
+        session = open_scene(scene, {**(params or {}), **design}, instrument)
     began, found = time.perf_counter(), []
     for number, design in enumerate(designs):
         if number and time.perf_counter() - began > limit:
@@ -159,6 +162,7 @@ def bounds(
         for i in range(renders):
             # Seeds of a render are signed.
             options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
+            options["instrument"] = instrument
             results.append(render(scene, params={**(params or {}), **design}, **options))
             if results[-1].attrs.get("interrupted"):
                 raise KeyboardInterrupt("interrupted; bounds need all renders, and none is kept.")
@@ -223,22 +227,17 @@ def _compared(
         # Nothing is compared with a first design that has no bound.
         ratio = joined["bound"].values / np.where(np.isfinite(first), first, np.nan)
         errors = [_ratio_errors(one, found[0]) for one in found]
-    one_each = {"units": "1"}
     joined = joined.assign(
-        ratio=(("design", "parameter"), ratio, {**one_each, "long_name": "bound over that of the first design"}),
-        ratio_stderr=(("design", "parameter"), errors, {**one_each, "long_name": "standard error of the ratio"}),
-        lost_samples=(
-            "design",
-            [float(one["lost_samples"].mean()) for one in found],
-            {**one_each, "long_name": "share of samples that saturate"},
-        ),
-        remarks=("design", [one.attrs["remarks"] for one in found], {"long_name": "what a record does not determine"}),
+        ratio=(("design", "parameter"), ratio),
+        ratio_stderr=(("design", "parameter"), errors),
+        lost_samples=("design", [float(one["lost_samples"].mean()) for one in found]),
+        remarks=("design", [one.attrs["remarks"] for one in found]),
     )
     values = np.stack([one["parameter_value"].values for one in found])
     coords: dict[str, Any] = {"design": labels, "parameter_value": (("design", "parameter"), values)}
     coords |= {f"design_{name}": ("design", [str(one[name]) for one in designs]) for name in designs[0]}
     joined = joined.assign_coords(coords)
-    return joined.assign_attrs(attributes)
+    return label(joined.assign_attrs(attributes))
 
 
 def _ratio_errors(one: xr.Dataset, first: xr.Dataset) -> list[float]:

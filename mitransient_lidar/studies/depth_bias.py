@@ -30,6 +30,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.results.files import Given
+from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,32 +72,14 @@ _BRIGHT, _RIGHT = 10.0, 2.0
 #: Attributes of renders that do not depend on angle, wind, water and depth.
 _GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")
 
-_NUMBERS = {
-    "bias": ("m", "mean error of the depth below the local surface"),
-    "spread": ("m", "standard deviation of that error"),
-    "found": ("1", "share of shots with a depth"),
-    "noise_error": ("m", "median of the stated error by noise"),
-    "error": ("m", "median of the stated error"),
-    "z": ("1", "root mean square of error over stated error"),
-    "wrong": ("1", "share of shots with an error above 0.5 m and no flag"),
-    "flagged": ("1", "share of shots with a depth and a flag"),
-    "bright": ("1", "share of shots whose largest signal-to-noise ratio within 0.5 m of the bottom is above 10"),
-    "bright_found": ("1", "share of shots with a depth among the bright ones"),
-    "hidden": ("1", "share of shots that are bright and have a depth only where errors of the render are no noise"),
-    "corrected_bias": ("m", "bias after correction"),
-    "corrected_spread": ("m", "standard deviation after correction"),
-    "corrected_z": ("1", "root mean square of error over stated error after correction"),
-    "snr": ("1", "median over shots of the largest signal-to-noise ratio within 0.5 m of the bottom"),
-}
+#: Numbers of each bottom, estimator and pixel.
+_NUMBERS = (
+    *("bias", "spread", "found", "noise_error", "error", "z", "wrong", "flagged", "bright", "bright_found", "hidden"),
+    *("corrected_bias", "corrected_spread", "corrected_z", "snr"),
+)
 
 #: Numbers of bottoms that are not found.
 _ZERO = ("found", "flagged", "wrong")
-
-#: Root mean squares of slopes, in the names of the truth of shots.
-_SLOPES = {
-    "slope_along": "root mean square over shots of the slope in the line of sight, mean over the beam",
-    "slope_across": "root mean square over shots of the slope across the line of sight, mean over the beam",
-}
 
 
 @checked
@@ -129,7 +113,7 @@ def depth_bias(
         float, Option("Relative standard error of a render over waves; of a level sea 0.6 of it", 0, 1, above=True)
     ] = 0.05,
     corrections: Annotated[
-        xr.Dataset | str | None,
+        Given | None,
         Option("Table of another seed to also correct the depths by; auto for the shipped one", form="FILE"),
     ] = None,
     max_time: SeaTime = None,
@@ -190,6 +174,7 @@ def depth_bias(
         If a render was interrupted.
     """
     own = read_instrument(instrument)
+    former = None if corrections is None else corrections_for(instrument, corrections)
     usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
     other = usual + (_FURTHER if usual < _GRAZING else -_FURTHER)
     axes = {
@@ -199,7 +184,6 @@ def depth_bias(
         "depth": np.asarray(depths, float),
     }
     of_level = np.asarray(ripples, float)
-    former = corrections_for(instrument, corrections) if isinstance(corrections, str) else corrections
     waves = axes["wind_speed"][axes["wind_speed"] > 0]
     if waves.size < axes["wind_speed"].size:
         axes["wind_speed"] = np.concatenate([np.zeros_like(of_level), waves])
@@ -266,8 +250,7 @@ def depth_bias(
         **geometry,
     }
     found = _labelled(axes, cells, pixels, list(estimators), attributes, total - left_out)
-    described = {"units": "m s-1", "long_name": "wind whose ripples the sea has"}
-    return found.assign_coords(ripples=("wind_speed", waves, described))
+    return label(found.assign_coords(ripples=("wind_speed", waves)))
 
 
 def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
@@ -330,7 +313,7 @@ def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Datas
         after = summarize_depths(correct_depths(found, corrections), truth)
         numbers |= {f"corrected_{name}": after[name] for name in ("bias", "spread", "z")}
     numbers["attenuation"] = usual_attenuation(found["attenuation"].values, found["attenuation_stderr"].values)
-    for name in _SLOPES:
+    for name in ("slope_along", "slope_across"):
         numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
     depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
     near = np.abs(depth - float(np.mean(truth))) < _NEAR
@@ -384,17 +367,13 @@ def _labelled(
         return values
 
     data: dict[str, Any] = {}
-    for name, (unit, text) in _NUMBERS.items():
+    for name in _NUMBERS:
         if name in next(iter(cells.values())):
             dims = (*AXES, "pixel") if name == "snr" else (*AXES, "estimator", "pixel")
-            data[name] = (dims, table(name), {"units": unit, "long_name": text})
-    for name, text in _SLOPES.items():
-        data[name] = (AXES, table(name), {"units": "1", "long_name": text})
-    described = {"units": "1/m", "long_name": "attenuation of the column along the path, weighted by its errors"}
-    data["attenuation"] = (AXES, table("attenuation"), described)
-    units = {"off_nadir_deg": "degree", "wind_speed": "m s-1", "depth": "m"}
-    coords: dict[str, Any] = {
-        name: (name, values, {"units": units[name]} if name in units else {}) for name, values in axes.items()
-    }
+            data[name] = (dims, table(name))
+    # Root mean squares of slopes, in the names of the truth of shots.
+    for name in ("slope_along", "slope_across", "attenuation"):
+        data[name] = (AXES, table(name))
+    coords: dict[str, Any] = dict(axes)
     coords |= {"estimator": list(estimators), "pixel": list(pixels)}
-    return xr.Dataset(data, coords, dict(attributes))
+    return label(xr.Dataset(data, coords, dict(attributes)), "bias")

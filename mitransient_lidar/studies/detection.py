@@ -19,6 +19,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
     RECEIVERS,
     BackgroundPower,
+    Instrument,
     Numbers,
     Option,
     Scene,
@@ -33,6 +34,7 @@ from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
+from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -48,6 +50,7 @@ def detect(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     receiver: Annotated[ReceiverChain | str, Option(RECEIVERS)] = "apd",
     pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
@@ -79,7 +82,7 @@ def detect(
 
     Parameters
     ----------
-    scene, params, integrator
+    scene, params, instrument, integrator
         As for `target_signal.target_signal`, with at most 16 pixels.
     receiver
         Detector and electronics of every pixel, or a name in `physics.receiver.presets.RECEIVERS`.
@@ -143,7 +146,7 @@ def detect(
     limit = max_time or math.inf
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     for option, wanted, key in (("depths", depths, "target_depth"), ("clutter", clutter, "surface_seed")):
         if wanted and key not in session.parameters:
             raise UserError(f"scene {session.name} has no parameter {key}, which {option} needs")
@@ -154,7 +157,7 @@ def detect(
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render
-        find_target(open_scene(scene, {**(params or {}), "target_depth": depth}).scene, target_id)
+        find_target(open_scene(scene, {**(params or {}), "target_depth": depth}, instrument).scene, target_id)
     began, left_out = time.perf_counter(), ""
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []
@@ -165,13 +168,13 @@ def detect(
             _LOG.warning("max_time = %g s ended before the depths of %s m, which are left out", limit, left_out)
             break
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
-        fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
+        fixed = session.scene if place is None else open_scene(scene, moved, instrument).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
         axis: TimeAxis | None = None
         for i in range(renders):
             if clutter:
                 number = int(float(session.parameters["surface_seed"])) + 1 + i
-                sea = open_scene(scene, {**moved, "surface_seed": number})
+                sea = open_scene(scene, {**moved, "surface_seed": number}, instrument)
                 # The records of all seas have the bins of the first one.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
             found.append(
@@ -229,7 +232,7 @@ def detect(
         brightest=str(first[0]["pixel"].values[experiments[0].brightest]),
         pulse_fwhm_ns=pulse_fwhm_ns,
     )
-    return xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes)
+    return label(xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes), "detection")
 
 
 def _experiment(

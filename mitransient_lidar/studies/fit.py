@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.information.bandwidth import (
 )
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
-from mitransient_lidar.analysis.information.measured import measured
+from mitransient_lidar.analysis.information.measured import measured, with_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, checked, positive_option
 from mitransient_lidar.core.parameters.water import LAYERED_WATER
@@ -148,10 +148,7 @@ def fit(
     names = _names(free)
     if unknown := [name for name in start or {} if name not in (*names, SCALE, TIME_OFFSET)]:
         raise UserError(f"start of {unknown[0]}: it is not one of the free parameters {', '.join(names)}")
-    if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in (".nc", ".exr"):
-        from mitransient_lidar import results
-
-        source = results.open(source, signals=True)
+    source = with_waveforms(source)
     found = measured(source, noise=noise, receiver=receiver)
     if BANDWIDTH in names:
         if found.receiver is not None:

@@ -15,7 +15,7 @@ import xarray as xr
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Numbers, Option, Scene, Seed, checked, positive_option
+from mitransient_lidar.core.options import Instrument, Numbers, Option, Scene, Seed, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
@@ -26,6 +26,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene
@@ -43,6 +44,7 @@ def fov_sweep(
     ] = (2, 5, 10, 20, 50, 100),
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     min_depth: Annotated[
         float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
     ] = 1.0,
@@ -61,7 +63,7 @@ def fov_sweep(
 
     Parameters
     ----------
-    scene, params
+    scene, params, instrument
         As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
         ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
     min_depth, max_depth
@@ -109,7 +111,7 @@ def fov_sweep(
     which include the correlation of the bins.
     """
     fields = np.unique(fov_mrad)
-    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
+    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     lidar = find_lidar_scene(session.scene, session.sensor)
@@ -130,23 +132,16 @@ def fov_sweep(
     # Kd is above c for nearly isotropic scattering, where the fit is not defined.
     fit = system_attenuation(water.attenuation, min(water.kd, water.attenuation), 2 * np.hypot(radius, beam))
     per_field = {
-        "effective_attenuation": ([slope for slope, _ in slopes], "1/m", "attenuation coefficient of the column"),
-        "effective_attenuation_stderr": ([error for _, error in slopes], "1/m", "standard error of the attenuation"),
-        "spot_radius": (radius, "m", "radius of the circle that the receiver sees on the surface"),
-        "scaled_radius": (water.attenuation * radius, "1", "beam attenuation times spot radius"),
-        "system_attenuation": (fit, "1/m", "fit to Gordon's results"),
+        "effective_attenuation": [slope for slope, _ in slopes],
+        "effective_attenuation_stderr": [error for _, error in slopes],
+        "spot_radius": radius,
+        "scaled_radius": water.attenuation * radius,
+        "system_attenuation": fit,
     }
-    data: dict[str, Any] = {
-        key: ("field_of_view", np.asarray(values), {"units": units, "long_name": meaning})
-        for key, (values, units, meaning) in per_field.items()
-    }
+    data: dict[str, Any] = {key: ("field_of_view", np.asarray(values)) for key, values in per_field.items()}
     over_time = ("field_of_view", "time")
-    data["impulse_response"] = (over_time, mean, {"units": "J", "long_name": "received energy per bin"})
-    data["impulse_response_stderr"] = (over_time, stderr, {"units": "J", "long_name": "its standard error"})
-    coords = {
-        "field_of_view": ("field_of_view", fields, {"units": "mrad", "long_name": "full angle of the field of view"}),
-        "time": ("time", lidar.axis.centres_ns, {"units": "ns"}),
-    }
+    data |= {"impulse_response": (over_time, mean), "impulse_response_stderr": (over_time, stderr)}
+    coords = {"field_of_view": fields, "time": lidar.axis.centres_ns}
     attributes = session.attributes(
         lidar,
         seed=seed,
@@ -161,7 +156,7 @@ def fov_sweep(
         beam_radius=beam,
         left_out_mrad=left_out,
     )
-    return xr.Dataset(data, coords, attributes)
+    return label(xr.Dataset(data, coords, attributes))
 
 
 def describe_fov_sweep(found: xr.Dataset) -> list[str]:

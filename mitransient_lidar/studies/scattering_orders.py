@@ -8,12 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.options import FewerPasses, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import FewerPasses, Instrument, Option, Scene, Seed, checked
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import label
 from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
 
 _REVERSALS = ("one", "several")
@@ -25,6 +26,7 @@ def scattering_orders(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     orders: Annotated[int, Option("Number of orders to separate", 1, MOST_ORDERS)] = 8,
     passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 32,
     max_time: FewerPasses = None,
@@ -40,7 +42,7 @@ def scattering_orders(
 
     Parameters
     ----------
-    scene, params, integrator
+    scene, params, instrument, integrator
         As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
@@ -61,7 +63,7 @@ def scattering_orders(
     UserError
         If the scene or a parameter is invalid or out of range.
     """
-    session = open_scene(scene, params)
+    session = open_scene(scene, params, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
     lidar = renderer.scene
@@ -82,22 +84,22 @@ def scattering_orders(
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {
-        "impulse_response": (dims, energy.mean.reshape(shape), {"units": "J", "long_name": "received energy per bin"}),
-        "impulse_response_stderr": (dims, energy.stderr.reshape(shape), {"units": "J"}),
-        "waveform": (dims, power.mean.reshape(shape), {"units": "W", "long_name": "received power"}),
-        "waveform_stderr": (dims, power.stderr.reshape(shape), {"units": "W"}),
+        "impulse_response": (dims, energy.mean.reshape(shape)),
+        "impulse_response_stderr": (dims, energy.stderr.reshape(shape)),
+        "waveform": (dims, power.mean.reshape(shape)),
+        "waveform_stderr": (dims, power.stderr.reshape(shape)),
         # Errors of sums are estimated from the passes, since bins of a pass share paths.
-        "energy": (dims[1:3], totals.mean, {"units": "J", "long_name": "received energy"}),
-        "energy_stderr": (dims[1:3], totals.stderr, {"units": "J"}),
+        "energy": (dims[1:3], totals.mean),
+        "energy_stderr": (dims[1:3], totals.stderr),
     }
     coords = {
         "pixel": list(pixels.names),
         "reversals": list(_REVERSALS),
-        "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
-        "time": ("time", axis.centres_ns, {"units": "ns"}),
+        "order": np.arange(orders + 1),
+        "time": axis.centres_ns,
     }
     attributes = session.attributes(lidar, chosen, **log.attributes(seed))
-    return xr.Dataset(data, coords=coords, attrs=attributes)
+    return label(xr.Dataset(data, coords=coords, attrs=attributes), "orders")
 
 
 def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:

@@ -12,6 +12,7 @@ from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefracti
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import lidar_geometry
+from mitransient_lidar.results.variables import label
 
 #: Half width of the gates about the echoes of a level sea [ns].
 _HALF_GATE_NS = 10.0
@@ -48,14 +49,10 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
             gate = time - _HALF_GATE_NS, time + _HALF_GATE_NS
             row[f"{name}_peak"], row[f"{name}_time"] = highest_points(shot, *gate)
         rows.append(row)
-    units = {"aim_x": "m", "aim_y": "m", "slope_along": "1", "slope_across": "1"}
-    data = {}
-    for name in rows[0]:
-        values = np.array([row[name] for row in rows])
-        unit = units.get(name, "W" if "peak" in name else "ns")
-        data[name] = (("shot", "pixel")[: values.ndim], values, {"units": unit})
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    data = {name: (("shot", "pixel")[: values.ndim], values) for name, values in columns.items()}
     pixels = [str(name) for name in series["pixel"].values]
-    return xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs)
+    return label(xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs), "highest")
 
 
 def _echo_times(shot: xr.Dataset) -> dict[str, float]:

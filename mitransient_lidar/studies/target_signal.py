@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Option, Scene, TargetId, checked, positive_option
+from mitransient_lidar.core.options import FewerPasses, Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
@@ -20,6 +20,7 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -35,6 +36,7 @@ def target_signal(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    instrument: Instrument = None,
     target_id: TargetId = "target",
     grid: Annotated[int, Option("Places of the target along each axis", 1, 15)] = 1,
     max_offset: Annotated[float, positive_option("Largest offset of these places along each axis", "m")] = 2.0,
@@ -58,7 +60,7 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, integrator
+    scene, params, instrument, integrator
         As for `rendering.render.render`.
     grid, max_offset
         Places of the target along each axis, and their largest offset from that in the scene, for the result of
@@ -94,10 +96,9 @@ def target_signal(
     if grid > 1:
         offsets = np.linspace(-max_offset, max_offset, grid).tolist()
         options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed, "integrator": integrator}
-        return target_map(
-            scene, params, x=offsets, y=offsets, max_time=max_time, axis=axis, progress=progress, **options
-        )
-    session = open_scene(scene, params)
+        options |= {"instrument": instrument, "max_time": max_time, "axis": axis, "progress": progress}
+        return target_map(scene, params, x=offsets, y=offsets, **options)
+    session = open_scene(scene, params, instrument)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
     with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)
@@ -162,7 +163,7 @@ def target_map(
     KeyboardInterrupt
         If a render was interrupted.
     """
-    known = open_scene(scene, params).parameters
+    known = open_scene(scene, params, options.get("instrument")).parameters
     for name in ("target_x", "target_y"):
         if name not in known:
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
@@ -177,7 +178,7 @@ def target_map(
         cell = target_signal(scene, moved, **options).drop_dims("time")
         if cell.attrs.get("interrupted"):
             raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
-        cells.append(cell.assign(place_passes=((), cell.attrs["passes"], {"units": "1", "long_name": "passes"})))
+        cells.append(cell.assign(place_passes=((), cell.attrs["passes"], described("place_passes"))))
         if progress is not None:
             progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
@@ -258,8 +259,8 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
         statistics = PassStatistics()
         for one in values:
             statistics.add(one)
-        data[name] = (("pixel", "time"), statistics.mean, {"units": "W"})
-        data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr, {"units": "W"})
+        data[name] = (("pixel", "time"), statistics.mean)
+        data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr)
     summed = data["difference"][1].sum(axis=0)
     if not np.any(summed > 0):
         raise UserError("target: it returns no light within the record; check its place, and the start of the record")
@@ -278,15 +279,13 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
     total = power.sum(axis=0)
     means = gated(total / len(power))
     left_out = [gated((total - power[group].sum(axis=0)) / (len(power) - len(group))) for group in groups]
-    units = {"echo": "J", "backscatter": "J", "shadow": "J", "detectability": "J^(1/2)"}
     for name, value in means.items():
         error = np.sqrt((_GROUPS - 1) * np.mean([(other[name] - value) ** 2 for other in left_out], axis=0))
         dims = "combination" if name.startswith("combined") else "pixel"
-        unit = units.get(name.removeprefix("combined_"), "1")
-        data[name] = (dims, value, {"units": unit})
-        data[f"{name}_stderr"] = (dims, error, {"units": unit})
-    coords = {"time": ("time", time, {"units": "ns"}), "combination": ["sum", "best"]}
-    return xr.Dataset(data, coords=coords, attrs={"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak})
+        data |= {name: (dims, value), f"{name}_stderr": (dims, error)}
+    coords = {"time": time, "combination": ["sum", "best"]}
+    attributes = {"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak}
+    return label(xr.Dataset(data, coords=coords, attrs=attributes), "target")
 
 
 def describe_target(result: xr.Dataset) -> list[str]:

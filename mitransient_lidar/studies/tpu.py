@@ -20,6 +20,8 @@ from mitransient_lidar.core.options import Numbers, Option, checked
 from mitransient_lidar.core.validation import finite
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.results.files import Given
+from mitransient_lidar.results.variables import described
 from mitransient_lidar.studies.depth_bias import (
     Depths,
     InstrumentName,
@@ -77,7 +79,7 @@ def tpu(
     shots: Places = 12,
     records: Records = 4,
     corrections: Annotated[
-        xr.Dataset | str | None,
+        Given | None,
         Option("Table of depth-bias to also correct the depths by, auto for the shipped one, or none", form="FILE"),
     ] = "auto",
     pointing_mrad: Annotated[float, Option("Standard deviation of the beam's direction, each axis", 0)] = 0.1,
@@ -122,8 +124,9 @@ def tpu(
     given = dict(params or {})
     own = [finite("altitude", given.get("altitude", usual["altitude"]))]
     heights = np.asarray(own if altitudes is None else altitudes, float)
-    if isinstance(corrections, str):
-        corrections = None if corrections == "none" else corrections_for(instrument, corrections)
+    if corrections is not None:
+        unwanted = isinstance(corrections, str) and corrections == "none"
+        corrections = None if unwanted else corrections_for(instrument, corrections)
     trajectory, limit = TrajectoryErrors(pointing_mrad, position_m, height_m), max_time
     angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
     began = time.perf_counter()
@@ -163,7 +166,7 @@ def tpu(
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
     seas = math.prod(found[0].sizes[axis] for axis in AXES)
     left_out = sum(one.attrs["seas_left_out"] for one in found) + (heights.size - len(found)) * seas
-    rendered = ("altitude", heights[: len(found)], {"units": "m"})
+    rendered = ("altitude", heights[: len(found)], described("altitude"))
     return joined.assign_coords(altitude=rendered).assign_attrs(estimator=estimator, seas_left_out=left_out)
 
 

@@ -7,12 +7,12 @@ from oracles.phase import henyey_greenstein
 from significance import largest_error, largest_z
 
 import mitransient_lidar
+from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.plots.waveforms import plot_components
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.results import dataset as results
 from mitransient_lidar.transport.path_classes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]

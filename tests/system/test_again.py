@@ -16,8 +16,7 @@ from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.results.gate_files import save_sequence, save_stack
-from mitransient_lidar.results.radiance import save_radiance
+from mitransient_lidar.results import save
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 SMALL = {"surface_size": "60", "bin_width_ns": "4", "bin_count": "40"}
@@ -278,8 +277,8 @@ def test_gates_alone_give_the_same_bits(tmp_path):
     params = {"layout": "16x16", "surface_cell_size": 0.2}
     first = mitransient_lidar.render("gated_mine", params=params, integrator=FEW, passes=2, max_memory=0.003)
     assert "waveform" not in first
-    save_stack(first, tmp_path / "a.exr")
-    save_sequence(first, tmp_path / "all", "a")
+    save(first, tmp_path / "a.exr")
+    save(first, tmp_path / "all" / "a")
     for path in (tmp_path / "a.exr", tmp_path / "all" / "a_gate000.exr"):
         assert_same_bits(first, mitransient_lidar.render(path))
 
@@ -315,7 +314,7 @@ def test_daylight_gives_the_same_bits(tmp_path):
     first = render_passive("passive_sea", params, integrator=few, passes=[2, 3], frames=2, filter_width_nm=2.0)
     assert first.attrs["frame_passes"] == [2, 3]
     for suffix in (".nc", ".exr"):
-        save_radiance(first, tmp_path / f"a{suffix}")
+        save(first, tmp_path / f"a{suffix}")
         assert_same_bits(first, mitransient_lidar.render(tmp_path / f"a{suffix}"))
     assert mitransient_lidar.render(first, frames=1, passes=2).sizes.get("frame", 1) == 1
     done = run("passive", tmp_path / "a.exr", "-o", tmp_path / "b", "--no-plot", "-q")

@@ -414,5 +414,5 @@ def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatc
     )
     monkeypatch.undo()
     assert shards.render_in_process(str(path), 1) == (5, 1, "")
-    assert shards.render_in_process(str(path), 1, retry=True) == (6, 0)
+    assert shards.render_in_process(str(path), 1, retry=True) == (6, 0, "")
     np.testing.assert_array_equal(open_campaign(path)["waveform"].values[8], open_campaign(quick)["waveform"].values[8])

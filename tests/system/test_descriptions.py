@@ -12,7 +12,8 @@ from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.results.gate_files import open_stack, save_stack
+from mitransient_lidar.results import open as open_stack
+from mitransient_lidar.results import save as save_stack
 
 FLAT = {"spectrum": "flat", "wind_speed": 5}
 

@@ -19,7 +19,6 @@ from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.plots.gate_viewer.page import write_page
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
-from mitransient_lidar.results import gate_files
 
 #: A bright target at 3 m, far and to the left of the axis, over a level sea.
 PLACE = {"target_x": 2.5, "target_y": 1.5, "target_depth": 3.0, "target_reflectance": 0.9, "spectrum": "flat"}
@@ -96,7 +95,7 @@ def test_exr_files_in_another_reader(imager, stack, tmp_path):
     image.close()
     at = [names.index(f"bin{index:04d}.Y") for index in np.flatnonzero(near_echo(imager))]
     assert far_left_exceeds(values[..., at].sum(axis=-1))
-    gate_files.save_stack(stack, tmp_path / "b.exr")
+    results.save(stack, tmp_path / "b.exr")
     image = OpenImageIO.ImageInput.open(str(tmp_path / "b.exr"))
     assert image.seek_subimage(1, 0)
     names, values = image.spec().channelnames, np.asarray(image.read_image("float"))
@@ -135,16 +134,3 @@ def test_page(stack, tmp_path):
     planes = np.frombuffer(zlib.decompress(base64.b64decode(text), -15), np.uint8).reshape(4, -1)
     values = np.ascontiguousarray(planes.T).view("<f4").reshape(3, SIZE, SIZE)
     assert far_left_exceeds(values[1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".exr", ".nc"])
-def test_files_of_earlier_versions(imager, stack, suffix, tmp_path):
-    """Column 0 was the right one until 0.1: files are read in the order of today."""
-    results.save(imager.isel(column=slice(None, None, -1)), tmp_path / f"result{suffix}")
-    gate_files.save_stack(stack.isel(column=slice(None, None, -1)), tmp_path / f"stack{suffix}")
-    found = results.open(tmp_path / f"result{suffix}")
-    assert far_left_exceeds(found["impulse_response"].where(near_echo(imager), 0).sum("time").values)
-    found = gate_files.open_stack(tmp_path / f"stack{suffix}")
-    np.testing.assert_allclose(found["gate_energy"], stack["gate_energy"], rtol=1e-6)
-    np.testing.assert_array_equal(found["angle_y"], stack["angle_y"])

@@ -18,7 +18,7 @@ from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.waveforms import plot_waveforms
-from mitransient_lidar.results.dataset import save
+from mitransient_lidar.results import save
 
 SCENE = {"layout": "1x1", "spectrum": "flat", "time_start_ns": 1380, "bin_count": 200}
 INTEGRATORS = (

@@ -270,10 +270,10 @@ def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float,
         levels[name] = Level(*_jackknife(groups, lambda errors: math.log(np.std(errors, ddof=1))))
         bias.append(_interval(*_jackknife(groups, lambda errors: float(np.mean(errors)))))
     return {
-        **_with_limits("depth_bias", bias, "m"),
-        **_with_limits("depth_spread", [levels[name].limits() for name in COMBINATIONS], "m"),
+        **_with_limits("depth_bias", bias),
+        **_with_limits("depth_spread", [levels[name].limits() for name in COMBINATIONS]),
         **_with_limits("depth_gain", [levels[name].limits(levels["single"]) for name in COMBINATIONS]),
-        "depth_bound": ("combination", [bounds[name] for name in COMBINATIONS], {"units": "m"}),
+        "depth_bound": ("combination", [bounds[name] for name in COMBINATIONS]),
     }
 
 
@@ -287,9 +287,9 @@ def by_depth(trials: Sequence[Experiment], places: Sequence[float], pfa: float, 
         reached.append(_interval(_crossing(places, [level.log for level in row]), np.array(changes)))
     needed = [[level.limits() for level in row] for row in table]
     return {
-        "depth": ("depth", list(places), {"units": "m"}),
+        "depth": ("depth", list(places)),
         **_with_limits("needed_at_depth", needed, dims=("combination", "depth")),
-        **_with_limits("detectable_depth", reached, "m"),
+        **_with_limits("detectable_depth", reached),
     }
 
 
@@ -333,12 +333,10 @@ def _interval(value: float, changes: FloatArray) -> tuple[float, float, float]:
     return value, value - reach, value + reach
 
 
-def _with_limits(
-    name: str, values: npt.ArrayLike, unit: str = "1", dims: tuple[str, ...] = ("combination",)
-) -> Variables:
+def _with_limits(name: str, values: npt.ArrayLike, dims: tuple[str, ...] = ("combination",)) -> Variables:
     """Return a variable and the limits of its interval, the last axis of the values."""
     table = np.array(values, dtype=np.float64)
-    return {f"{name}{end}": (dims, table[..., i], {"units": unit}) for i, end in enumerate(("", "_low", "_high"))}
+    return {f"{name}{end}": (dims, table[..., i]) for i, end in enumerate(("", "_low", "_high"))}
 
 
 def _seed(seed: int, single: bool, which: int) -> int:

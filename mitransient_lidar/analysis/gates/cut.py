@@ -9,7 +9,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import SumErrors
@@ -17,7 +17,7 @@ from mitransient_lidar.results.sum_errors import SumErrors
 _LOG = logging.getLogger(__name__)
 
 
-def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
+def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     """Return the gate stack of a result with ``waveform`` and ``waveform_stderr`` [W].
 
     Raises
@@ -36,11 +36,11 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
     equivalent to (sum w)^2 / sum w^2 bins. Derivatives of a result are cut in the same way, with the correlation of the
     waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too.
     """
-    if missing := [name for name in ("waveform", "waveform_stderr") if name not in dataset]:
-        raise UserError(
-            f"the stack has no {missing[0]}: gates can be cut only from a result that kept its histogram, so render "
-            "the scene again with other gates"
-        )
+    dataset = results.dataset_of("dataset", dataset, "waveforms")
+    if "waveform_stderr" not in dataset:
+        raise UserError("the dataset has no waveform_stderr, and gates need the errors of the waveforms")
+    if not isinstance(train, GateTrain):
+        raise UserError(f"train = {shown(train)} must be a GateTrain, which has the gates")
     dims, time = results.record_dims(dataset, "waveform"), results.time_axis(dataset)
     check_train(train, dataset.attrs, time)
     errors = SumErrors.of(dataset)

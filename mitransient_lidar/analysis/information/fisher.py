@@ -22,6 +22,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, Setting
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
+from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
@@ -305,43 +306,20 @@ def _labelled(
     """Return the dataset of `fisher_information`."""
     own = len(names) - len(prior)
     stderr = [jackknife_error(one) if len(one) and np.isfinite(one).all() else math.nan for one in without.T]
-    per_unit = {"units": "unit of the parameter, see parameter_units"}
     pixels = tuple(dim for dim in dims if dim != "time")
     over, both = ("parameter",), ("parameter", "other_parameter")
-    ratio = {"units": "1"}
     data: dict[str, Any] = {
-        "bound": (over, found.bound, {**per_unit, "long_name": "least standard deviation of an estimate"}),
-        "bound_stderr": (over, stderr, {**per_unit, "long_name": "standard error of the bound by the render"}),
-        "bound_known": (
-            over,
-            found.bound_known,
-            {**per_unit, "long_name": "least standard deviation with all other parameters known"},
-        ),
-        "variance_share": (
-            over,
-            shares["variance_share"],
-            {**ratio, "long_name": "share of the information in the variance of the samples"},
-        ),
-        "monte_carlo_share": (
-            over,
-            shares["monte_carlo_share"],
-            {**ratio, "long_name": "information by the noise of the render, relative to the true one"},
-        ),
-        "information": (
-            both,
-            information,
-            {"units": "1/(unit of one parameter x unit of the other)", "long_name": "Fisher information"},
-        ),
-        "correlation": (both, found.correlation, {**ratio, "long_name": "correlation of the estimates"}),
-        "lost_samples": (
-            pixels,
-            lost.reshape([first.sizes[dim] for dim in pixels]),
-            {**ratio, "long_name": "share of samples that saturate"},
-        ),
+        "bound": (over, found.bound),
+        "bound_stderr": (over, stderr),
+        "bound_known": (over, found.bound_known),
+        "variance_share": (over, shares["variance_share"]),
+        "monte_carlo_share": (over, shares["monte_carlo_share"]),
+        "information": (both, information),
+        "correlation": (both, found.correlation),
+        "lost_samples": (pixels, lost.reshape([first.sizes[dim] for dim in pixels])),
     }
     if len(without):
-        about = {**per_unit, "long_name": "bound without one of the renders"}
-        data["bound_left_out"] = (("render", "parameter"), without, about)
+        data["bound_left_out"] = (("render", "parameter"), without)
     extra = {"parameter_value": 0.0, "parameter_units": "", "parameter_method": "score"}
     values = {
         name: [*(first[name].values.tolist() if name in first.coords else [default] * own)]
@@ -351,11 +329,11 @@ def _labelled(
     values["parameter_units"] += [NUISANCES[name] for name in prior]
     values["parameter_method"] += ["differences of bins" if name == "time_offset" else "score" for name in prior]
     coords: dict[str, Any] = {
-        "parameter": ("parameter", list(names), {"long_name": "name of the parameter"}),
-        "other_parameter": ("other_parameter", list(names), {"long_name": "name of the parameter"}),
-        "prior": ("parameter", [*[math.inf] * own, *prior.values()], {**per_unit, "long_name": "known to"}),
+        "parameter": ("parameter", list(names)),
+        "other_parameter": ("other_parameter", list(names)),
+        "prior": ("parameter", [*[math.inf] * own, *prior.values()]),
         **{name: ("parameter", value) for name, value in values.items()},
         **{str(name): first[name] for name in ("pixel", "angle_x", "angle_y") if name in first.coords},
     }
     kept = {name: first.attrs[name] for name in _COPIED if name in first.attrs}
-    return xr.Dataset(data, coords, {**kept, "remarks": "\n".join(remarks)})
+    return label(xr.Dataset(data, coords, {**kept, "remarks": "\n".join(remarks)}))

@@ -62,16 +62,14 @@ def fit_table(
     sentences += errors.messages(names, np.array(list(values.values())))
     stderr = np.full(mean.shape, np.nan) if noise is None else np.sqrt(noise)
     rows = {
-        "measured": (found.values, "measured waveform"),
-        "measured_stderr": (stderr, "standard error of the measured waveform"),
-        "fitted": (mean, "fitted waveform"),
-        "fitted_stderr": (np.sqrt(by_model), "standard error of the fitted waveform by Monte Carlo"),
+        "measured": found.values,
+        "measured_stderr": stderr,
+        "fitted": mean,
+        "fitted_stderr": np.sqrt(by_model),
+        "residual": residual,
+        "used": (weights > 0).astype(np.int8),
     }
-    arrays = {name: found.labelled(array, text) for name, (array, text) in rows.items()}
-    arrays["residual"] = found.labelled(residual, "measured less fitted, in standard deviations")
-    arrays["used"] = found.labelled((weights > 0).astype(np.int8), "sample that was fitted")
-    for name in ("residual", "used"):
-        arrays[name].attrs["units"] = "1"
+    arrays = {name: found.labelled(array, name) for name, array in rows.items()}
     vectors = {
         "value": np.array(list(values.values())),
         "stderr": errors.stderr,

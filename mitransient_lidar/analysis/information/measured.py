@@ -24,6 +24,8 @@ from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.results.files import Given
+from mitransient_lidar.results.variables import described
 
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
@@ -92,9 +94,8 @@ class Measured:
 
     def labelled(self, values: npt.ArrayLike, name: str) -> xr.DataArray:
         """Return values of shape (pixel, time) with the dimensions and coordinates of the waveforms."""
-        unit = self.template.attrs.get("units", "")
-        array = np.reshape(values, self.template.shape)
-        return self.template.copy(data=array).assign_attrs({"units": unit, "long_name": name})
+        about = {"units": self.template.attrs.get("units", ""), "long_name": name, **described(name)}
+        return self.template.copy(data=np.reshape(values, self.template.shape)).assign_attrs(about)
 
     def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
         """Return the scale of the samples of a model, of the same shape, by least squares with variances `noise`.
@@ -133,6 +134,19 @@ class Prediction(NamedTuple):
         return np.array([np.interp(times, self.time_ns, row, left=outside, right=outside) for row in values])
 
 
+def with_waveforms(source: Given) -> Given:
+    """Return the dataset of a result or of signals, given itself or by its file; the path of a table as it is.
+
+    Raises
+    ------
+    UserError
+        If it is another dataset, or its file cannot be read.
+    """
+    if isinstance(source, (str, os.PathLike)) and Path(source).suffix.lower() not in (".nc", ".exr", ""):
+        return source
+    return results.dataset_of("source", source, "waveforms", "signals")
+
+
 def measured(
     source: xr.Dataset | str | os.PathLike[str],
     *,
@@ -161,9 +175,7 @@ def measured(
         of range.
     """
     given = None if noise is None else positive("noise", noise)
-    is_table = not isinstance(source, xr.Dataset) and Path(source).suffix.lower() not in (".nc", ".exr")
-    if not isinstance(source, xr.Dataset) and not is_table:
-        source = results.open(source, signals=True)
+    source = with_waveforms(source)
     if isinstance(source, xr.Dataset) and "signal" in source:
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")

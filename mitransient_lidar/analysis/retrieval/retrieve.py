@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
@@ -40,6 +43,7 @@ from mitransient_lidar.results.geometry import (
     share_in_view,
     spot_diameter,
 )
+from mitransient_lidar.results.variables import flagged, label
 
 _LOG = logging.getLogger(__name__)
 _STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
@@ -152,18 +156,18 @@ def surface_slopes(
     height_error = distance_error * math.cos(lidar.off_nadir)
     steepness, direction = surface_slope.steepest(along, across)
     table = {
-        "slope_along": (along, "1", "slope of the surface along the lidar's azimuth"),
-        "slope_along_stderr": (along_error, "1", "standard error of the slope along"),
-        "slope_across": (across, "1", "slope of the surface across the lidar's azimuth"),
-        "slope_across_stderr": (across_error, "1", "standard error of the slope across"),
-        "slope_deg": (np.degrees(steepness), "degree", "angle of the surface from the horizontal"),
-        "slope_direction_deg": (np.degrees(direction), "degree", "direction of the rise from the lidar's azimuth"),
-        "surface_range": (distance, "m", "distance to the surface along the axis"),
-        "surface_range_stderr": (distance_error, "m", "standard error of the distance"),
-        "surface_height": (height, "m", "height of the surface above the mean sea level"),
-        "surface_height_stderr": (height_error, "m", "standard error of the height"),
-        "plane_misfit": (plane.misfit_ns, "ns", "deviation of the echoes from a plane"),
-        "slope_refused": (refused.astype(np.float64), "1", "1 where a slope is steeper than the sea"),
+        "slope_along": along,
+        "slope_along_stderr": along_error,
+        "slope_across": across,
+        "slope_across_stderr": across_error,
+        "slope_deg": np.degrees(steepness),
+        "slope_direction_deg": np.degrees(direction),
+        "surface_range": distance,
+        "surface_range_stderr": distance_error,
+        "surface_height": height,
+        "surface_height_stderr": height_error,
+        "plane_misfit": plane.misfit_ns,
+        "slope_refused": refused.astype(np.float64),
     }
     found = _labelled(dataset, table, shape)
     found = found.assign_attrs(slope_method=method, slope_prior_deviation=[float(one) for one in prior])
@@ -310,9 +314,7 @@ def bottom(
     known = np.where(unsure, np.nan, np.stack(reflectance, axis=-1))
     errors = np.abs(known) * deviation
     names, probability = column_retrieval.bottom_class(known[..., 2], errors[..., 2], classes)
-    found = _labelled(
-        dataset, {"bottom_energy": (energy, "J", "energy of the bottom echo")}, echoes["attenuation"].shape
-    )
+    found = _labelled(dataset, {"bottom_energy": energy}, echoes["attenuation"].shape)
     dims = tuple(found["bottom_energy"].dims)
     unknown = np.full(np.shape(time), np.nan)
     depths = np.stack(np.broadcast_arrays(*depth, unknown), axis=-1)
@@ -323,22 +325,13 @@ def bottom(
     }
     for name, (by_slope, by_column) in applied.items():
         steps = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
-        found[f"{name}_corrected"] = ((*dims, "correction"), steps, {"long_name": f"correction of the {name} applied"})
-    for name, values, dim, unit, text in (
-        ("reflectance", known, "correction", "1", "reflectance of the bottom"),
-        ("reflectance_stderr", errors, "correction", "1", "error of the reflectance by the sea, noise and method"),
-        ("depth_m", depths, "correction", "m", "depth of the bottom below the mean sea level"),
-        ("depth_m_stderr", depth_errors, "correction", "m", "error of the depth by the sea, noise and method"),
-        ("class_probability", probability, "bottom_class", "1", "probability of the bottom's class"),
-    ):
-        found[name] = ((*dims, dim), values, {"units": unit, "long_name": text})
-    meanings = {
-        "long_name": "reasons for which the reflectance is not given",
-        "flag_masks": [int(flag) for flag in ReflectanceFlag],
-        "flag_meanings": " ".join(str(flag.name).lower() for flag in ReflectanceFlag),
-    }
-    found["reflectance_flags"] = (dims, np.broadcast_to(flags, np.shape(time)), meanings)
-    return found.assign_coords(correction=["level", "slope", "column"], bottom_class=names)
+        found[f"{name}_corrected"] = ((*dims, "correction"), steps)
+    numbers = {"reflectance": known, "reflectance_stderr": errors, "depth_m": depths, "depth_m_stderr": depth_errors}
+    for name, values in numbers.items():
+        found[name] = ((*dims, "correction"), values)
+    found["class_probability"] = ((*dims, "bottom_class"), probability)
+    found["reflectance_flags"] = (dims, np.broadcast_to(flags, np.shape(time)), flagged(ReflectanceFlag))
+    return label(found.assign_coords(correction=["level", "slope", "column"], bottom_class=names), "bottom")
 
 
 def water(
@@ -391,24 +384,24 @@ def water(
     excess, gain = (np.nan, np.nan) if light is None else (light.excess, light.level)
     found = column_retrieval.water_of_column(decay, backscatter, excess, gain)
     table = {
-        "column_attenuation": (decay, "1/m", "attenuation of the column's signal along the path"),
-        "column_attenuation_stderr": (decay_error, "1/m", "standard error of the attenuation by noise"),
-        "absorption": (found.absorption, "1/m", "absorption coefficient"),
-        "backscattering": (found.backscattering, "1/m", "backscattering coefficient"),
-        "kd": (found.kd, "1/m", "diffuse attenuation coefficient"),
-        "attenuation": (found.attenuation, "1/m", "beam attenuation coefficient for the typical bb/b"),
-        "attenuation_low": (found.attenuation_low, "1/m", "smallest beam attenuation coefficient"),
-        "attenuation_high": (found.attenuation_high, "1/m", "largest beam attenuation coefficient"),
+        "column_attenuation": decay,
+        "column_attenuation_stderr": decay_error,
+        "absorption": found.absorption,
+        "backscattering": found.backscattering,
+        "kd": found.kd,
+        "attenuation": found.attenuation,
+        "attenuation_low": found.attenuation_low,
+        "attenuation_high": found.attenuation_high,
     }
     level_error = (column["amplitude_stderr"] / column["amplitude"]).values
     for name, error in found.errors(decay_error, level_error).items():
-        table[f"{name}_stderr"] = (error, "1/m", f"error of {table[name][2]} by noise and method")
-    return _labelled(dataset, table, np.shape(decay))
+        table[f"{name}_stderr"] = error
+    return _labelled(dataset, table, np.shape(decay), "water")
 
 
 @checked
 def retrieve(
-    dataset: xr.Dataset,
+    dataset: Given,
     *,
     slope_deviation: Annotated[
         tuple[float, float] | None,
@@ -429,10 +422,29 @@ def retrieve(
         float | None, Option("Two-way efficiency of optics and air, by default that of the scene", 0, 1)
     ] = None,
 ) -> xr.Dataset:
-    """Return the estimates of `surface_slopes`, `bottom` and, if the view is wide enough, `water`; NaN where unknown.
+    """Estimate surface, bottom and, if the view is wide enough, water from the waveforms of the pixels.
 
-    The arguments and errors are those of these functions. If no quantity can be estimated, `UserError` is raised.
+    Parameters
+    ----------
+    dataset : xarray.Dataset or path
+        Waveforms of one shot or of a series.
+    wind_speed, wind_direction_deg, slope_deviation
+        Wind [m/s], its direction [degree], or standard deviations of the slopes [1] of the sea, as for
+        `surface_slopes`.
+    efficiency : float, optional
+        Efficiency of optics and atmosphere, 0 to 1, as for `bottom`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The variables of `surface_slopes`, `bottom` and `water`; NaN where unknown.
+
+    Raises
+    ------
+    UserError
+        If a number is out of range, the dataset lacks what these functions need, or no quantity can be estimated.
     """
+    dataset = dataset_of("dataset", dataset, "waveforms")
     if "pixel" in dataset.dims and dataset.sizes["pixel"] == 1:
         slopes = _unknown_slopes(dataset)
     else:
@@ -451,7 +463,7 @@ def retrieve(
     measured = ("surface_range", "depth_m", "column_attenuation")
     if not any(np.isfinite(found[name]).any() for name in measured if name in found):
         raise UserError("nothing can be estimated: no waveform has a surface echo, a column or a bottom echo")
-    return found
+    return found.assign_attrs(made_from(dataset.attrs, "Surface, bottom and water", "estimated"))
 
 
 def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
@@ -462,14 +474,13 @@ def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
     distance, error = (0.5e-9 * C0 * one for one in (time, np.hypot(by_noise, by_method)))
     unknown, cosine = np.full(np.shape(time), np.nan), math.cos(lidar.off_nadir)
     names = ("slope_along", "slope_across", "slope_deg", "slope_direction_deg", "plane_misfit")
-    table = {name: (unknown, "", "not observable with one pixel") for name in names}
-    table |= {f"{name}_stderr": (unknown, "1", "not observable with one pixel") for name in names[:2]}
+    table = dict.fromkeys((*names, *(f"{name}_stderr" for name in names[:2])), unknown)
     table |= {
-        "surface_range": (distance, "m", "distance to the surface along the axis"),
-        "surface_range_stderr": (error, "m", "standard error of the distance"),
-        "surface_height": (lidar.height - distance * cosine, "m", "height of the surface above the mean sea level"),
-        "surface_height_stderr": (error * cosine, "m", "standard error of the height"),
-        "slope_refused": (np.zeros(np.shape(time)), "1", "1 where a slope is steeper than the sea"),
+        "surface_range": distance,
+        "surface_range_stderr": error,
+        "surface_height": lidar.height - distance * cosine,
+        "surface_height_stderr": error * cosine,
+        "slope_refused": np.zeros(np.shape(time)),
     }
     prior = [float(one) for one in surface_inputs.largest_deviations(dataset)]
     found = _labelled(dataset, table, np.shape(time))
@@ -496,15 +507,14 @@ def _summed(dataset: xr.Dataset) -> xr.Dataset:
     return summed.assign_attrs(dataset.attrs)
 
 
-def _labelled(dataset: xr.Dataset, table: dict[str, tuple[FloatArray, str, str]], shape: tuple[int, ...]) -> xr.Dataset:
+def _labelled(
+    dataset: xr.Dataset, table: Mapping[str, FloatArray], shape: tuple[int, ...], kind: str = ""
+) -> xr.Dataset:
     """Return arrays with one value per waveform over the dataset's shots."""
     dims = ("shot",) if shape else ()
-    data = {
-        name: (dims, np.reshape(values, shape), {"units": unit, "long_name": text})
-        for name, (values, unit, text) in table.items()
-    }
+    data = {name: (dims, np.reshape(values, shape)) for name, values in table.items()}
     coords: dict[Any, Any] = {name: one for name, one in dataset.coords.items() if shape and one.dims == ("shot",)}
-    return xr.Dataset(data, coords, dataset.attrs)
+    return label(xr.Dataset(data, coords, dataset.attrs), kind)
 
 
 def _count(values: FloatArray) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.resources
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,14 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_ec
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.results import netcdf
-from mitransient_lidar.results.formats import input_format
+from mitransient_lidar.results.attributes import step_of_history
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import required_number
+from mitransient_lidar.results.variables import described
 
 #: Dimensions of a table that depths are interpolated in, in this order, before estimator and pixel.
 AXES = ("off_nadir_deg", "wind_speed", "water", "depth")
 
-_TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
 #: Share of shots with a depth from which a bias counts for the changes between nodes; fewest places of a spread.
 _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
@@ -38,51 +37,42 @@ _NEAR = 2.0  # largest error of a depth that counts [m]
 _LEVEL = 1e-6  # largest difference of the heights of a level sea [m]
 
 
-def read_corrections(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a table of corrections, as of `depth_bias`, from a NetCDF file.
+def corrections_for(instrument: str, given: Given, name: str = "corrections") -> xr.Dataset:
+    """Return a table of corrections, as of `studies.depth_bias`: itself, of a file, or with ``auto`` the shipped one.
 
     Raises
     ------
     UserError
-        If the file cannot be read, or holds no such table.
+        If it cannot be read, there is none of the instrument, or it is no such table; `name` is that of the parameter.
     """
-    if input_format(path) != "netcdf":
-        raise UserError(f"{path} must be a NetCDF file (.nc) of depth-bias")
-    table = netcdf.read_netcdf(path)
+    source = given
+    if isinstance(given, str) and given == "auto":
+        if not instrument:
+            raise UserError(
+                "corrections = 'auto' needs a result of an instrument: give the file of a table of depth-bias"
+            )
+        folder = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"
+        source = folder / f"{instrument}_depths.nc"
+        if Path(instrument).name != instrument or not source.is_file():
+            raise UserError(
+                f"there are no shipped corrections of the instrument {instrument}: make them with depth-bias"
+            )
+    table = dataset_of(name, source, "corrections")
+    place = "the table of corrections" if isinstance(source, xr.Dataset) else source
     wanted = {*AXES, "estimator", "pixel"}
-    known = set(_TABLE) <= set(table.data_vars) and "ripples" in table.coords and "instrument" in table.attrs
+    known = "ripples" in table.coords and "instrument" in table.attrs
     if not known or set(table["bias"].dims) != wanted or set(table["attenuation"].dims) != set(AXES):
-        raise UserError(f"{path} holds no corrections of depths: it must be a table of depth-bias")
+        raise UserError(f"{place} holds no corrections of depths: it must be a table of depth-bias")
     level = table["wind_speed"].values == 0
     axes = {axis: table[axis].values for axis in ("off_nadir_deg", "depth", "wind_speed")}
     axes |= {"wind_speed": axes["wind_speed"][~level], "ripples": table["ripples"].values[level]}
     for axis, values in axes.items():
         if np.any(np.diff(values) <= 0):
-            raise UserError(f"{path} has {axis} that does not ascend")
+            raise UserError(f"{place} has {axis} that does not ascend")
     return table.transpose(*AXES, "estimator", "pixel")
 
 
-def corrections_for(instrument: str, given: str | os.PathLike[str]) -> xr.Dataset:
-    """Return the table of a file, or with ``auto`` the shipped one of an instrument.
-
-    Raises
-    ------
-    UserError
-        If it cannot be read, or there is none.
-    """
-    if given != "auto":
-        return read_corrections(given)
-    if not instrument:
-        raise UserError("corrections = 'auto' needs a result of an instrument: give the file of a table of depth-bias")
-    path = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments" / f"{instrument}_depths.nc"
-    if Path(instrument).name != instrument or not path.is_file():
-        raise UserError(f"there are no shipped corrections of the instrument {instrument}: make them with depth-bias")
-    return read_corrections(path)
-
-
-def correct_depths(
-    found: xr.Dataset, table: xr.Dataset, wind_speed: float | None = None, turn_deg: float = 0.0
-) -> xr.Dataset:
+def correct_depths(found: Given, table: Given, wind_speed: float | None = None, turn_deg: float = 0.0) -> xr.Dataset:
     """Subtract the mean errors of a table from the depths of bottoms and targets.
 
     Parameters
@@ -90,7 +80,7 @@ def correct_depths(
     found : xarray.Dataset
         Echoes, from `echo_table.extract` with ``depth_from`` echo.
     table : xarray.Dataset
-        From `read_corrections` or `studies.depth_bias.depth_bias`.
+        From `studies.depth_bias.depth_bias`, its file, or ``auto`` for the shipped one of the instrument.
     wind_speed : float, optional
         Wind speed [m/s], at least 0, of a level sea that of its ripples; by default that of the result's scene. With 0,
         the sea is level.
@@ -135,7 +125,9 @@ def correct_depths(
     and ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
     where no other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
-    instrument = found.attrs.get("instrument", "")
+    found = dataset_of("found", found, "echoes")
+    instrument = str(found.attrs.get("instrument", ""))
+    table = corrections_for(instrument, table, "table")
     if instrument != table.attrs["instrument"]:
         own = f"instrument {instrument}" if instrument else "no instrument"
         raise UserError(f"the corrections are of the instrument {table.attrs['instrument']}, but the result has {own}")
@@ -203,15 +195,15 @@ def correct_depths(
         # A pixel without light of the surface has the time of another one.
         error = (error**2 + rounding.max("pixel") ** 2).transpose(*correction.dims) ** 0.5
     behind = xr.DataArray([False, False, True, True], dims="echo") & correction.notnull()
-    described = {"units": "m", "long_name": "mean error that was subtracted from the depth"}
     stated = {
         "depth_m": found["depth_m"] - correction.fillna(0),
         "depth_m_stderr": found["depth_m_stderr"] * of_echoes(share).where(behind, 1.0),
         "depth_m_method_error": found["depth_m_method_error"].where(~behind | error.isnull(), error),
     }
     added = {name: values.assign_attrs(found[name].attrs) for name, values in stated.items()}
-    corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described)})
-    return corrected.assign_attrs(depth_corrections=table.attrs["instrument"])
+    corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described("depth_correction_m"))})
+    history = step_of_history("corrected", found.attrs)
+    return corrected.assign_attrs(depth_corrections=table.attrs["instrument"], history=history)
 
 
 def _learnt(table: xr.Dataset) -> xr.Dataset:
@@ -234,7 +226,7 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
     noise = table["noise_error"] ** 2
     beyond = left - noise
     beyond = beyond.mean("water").where(waves, beyond).clip(min=0).where(left.notnull())
-    return table[list(_TABLE)].assign(
+    return table[["bias", "spread", "found", "noise_error", "attenuation"]].assign(
         bias=table["bias"] * certain,
         variance=beyond + uncertain,
         uncertain=uncertain,

@@ -31,7 +31,10 @@ from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
+from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.variables import flagged, label
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
@@ -42,31 +45,17 @@ _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its 
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
-_QUANTITIES = {
-    "time_ns": "arrival of the echo",
-    "depth_m": "depth of the echo below",
-    "amplitude": "height of the echo",
-    "energy": "integral of the echo over time",
-    "width_ns": "full width of the echo at half maximum",
-}
+_QUANTITIES = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
 _OF_ECHOES = (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES), "flags")
-_PER_WAVEFORM = {
-    "attenuation": ("1/m", "effective attenuation of the column along the path"),
-    "attenuation_stderr": ("1/m", "standard error of the effective attenuation"),
-    "attenuation_chi2": ("1", "squared residuals of the column's fit over its degrees of freedom"),
-    "column_start_ns": ("ns", "time from which on samples count for the column"),
-    "column_end_ns": ("ns", "time up to which samples count for the column"),
-    "layer_depth_m": ("m", "depth of a change in the column"),
-    "layer_p_value": ("1", "probability that noise causes as strong a change"),
-    "layer_step": ("1", "logarithm of the signal below the change over that above it"),
-    "layer_attenuation_above": ("1/m", "attenuation above the change along the path"),
-    "layer_attenuation_below": ("1/m", "attenuation below the change along the path"),
-}
+_PER_WAVEFORM = (
+    *("attenuation", "attenuation_stderr", "attenuation_chi2", "column_start_ns", "column_end_ns"),
+    *("layer_depth_m", "layer_p_value", "layer_step", "layer_attenuation_above", "layer_attenuation_below"),
+)
 
 
 @checked
 def extract(
-    dataset: xr.Dataset,
+    dataset: Given,
     estimators: Annotated[
         str | Sequence[str],
         Option(
@@ -210,6 +199,7 @@ def extract(
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
     attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
+    dataset = dataset_of("dataset", dataset, "waveforms", "signals")
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
     if not names or (unknown := [name for name in names if name not in ESTIMATORS]):
@@ -401,51 +391,39 @@ def _label(
     """Return the table with its dimensions, units and provenance."""
     dims, shape = waveforms.dims[:-1], waveforms.shape[:-1]
     energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
-    units = {"time_ns": "ns", "depth_m": "m", "width_ns": "ns", "amplitude": waveforms.unit, "energy": energy}
 
-    def of_echoes(values: npt.NDArray[Any], described: dict[str, Any]) -> tuple[Any, ...]:
+    def of_echoes(values: npt.NDArray[Any], **described: Any) -> tuple[Any, ...]:
         inner = ("estimator", "echo") if several else ("echo",)
         return (*dims, *inner), values.reshape(*shape, *values.shape[3 - len(inner) :]), described
 
-    data: dict[str, Any] = {}
-    for name, description in _QUANTITIES.items():
-        for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
-            end = f" the {'local surface' if settings.depth_from == 'echo' else 'mean sea level'}" * (name == "depth_m")
-            described = {"units": units[name], "long_name": f"{of}{description}{end}"}
-            data[name + suffix] = of_echoes(table[name + suffix], described)
-    by_method = {"units": "m", "long_name": "typical error of the depth by scattering and the light's distribution"}
-    data["depth_m_method_error"] = of_echoes(table["depth_m_method_error"], by_method)
-    by_places = "error by the few places that return light, of the "
-    for suffix, of in (("", ""), ("_stderr", "standard error of the "), ("_method_error", by_places)):
+    names = [*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES), "depth_m_method_error"]
+    data: dict[str, Any] = {name: of_echoes(table[name]) for name in names}
+    for suffix in ("", "_stderr", "_method_error"):
         values = table["surface_time_ns" + suffix]
-        described = {"units": "ns", "long_name": f"{of}arrival of the surface"}
         inner, sizes = ("estimator",) * several, values.shape[1 : 1 + several]
-        data["surface_time_ns" + suffix] = (*dims, *inner), values.reshape(*shape, *sizes), described
-    meanings = {
-        "units": "1",
-        "long_name": "problems of the echo",
-        "flag_masks": [int(flag) for flag in EchoFlag],
-        "flag_meanings": " ".join(str(flag.name).lower() for flag in EchoFlag),
-    }
-    data["flags"] = of_echoes(table["flags"].astype(np.int64), meanings)
-    for name, (unit, description) in _PER_WAVEFORM.items():
+        data["surface_time_ns" + suffix] = (*dims, *inner), values.reshape(*shape, *sizes)
+    data["flags"] = of_echoes(table["flags"].astype(np.int64), **flagged(EchoFlag))
+    for name in _PER_WAVEFORM:
         if name in table:
             layer = ("layer",) if table[name].ndim > 1 else ()
-            values = table[name].reshape(*shape, *table[name].shape[1:])
-            data[name] = ((*dims, *layer), values, {"units": unit, "long_name": description})
+            data[name] = ((*dims, *layer), table[name].reshape(*shape, *table[name].shape[1:]))
     coords: dict[str, Any] = {
         str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)
     }
-    coords["echo"] = ("echo", echo_names(table["flags"].shape[-1] - 3), {"long_name": "kind of echo"})
+    coords["echo"] = ("echo", echo_names(table["flags"].shape[-1] - 3))
     if several:
-        coords["estimator"] = ("estimator", list(settings.estimators), {"long_name": "estimator of the echo's time"})
+        coords["estimator"] = ("estimator", list(settings.estimators))
     provenance = {
+        **made_from(dataset.attrs, "Echoes", "measured"),
         "estimators": list(settings.estimators),
         "echo_fwhm_ns": waveforms.echo_fwhm_ns,
         "echo_threshold": settings.threshold,
         "echo_contrast": settings.contrast,
     }
-    return xr.Dataset(data, coords, {**dataset.attrs, **provenance})
+    energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
+    kind = "mean" if settings.depth_from == "mean" else ""
+    found = xr.Dataset(data, coords, {**dataset.attrs, **provenance})
+    return label(found, kind, amplitude=waveforms.unit, energy=energy)
 
 
 def _estimate(

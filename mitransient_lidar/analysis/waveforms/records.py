@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -23,9 +22,6 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
-from mitransient_lidar.results import netcdf
-from mitransient_lidar.results.dataset import check_axes
-from mitransient_lidar.results.formats import input_format
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
 from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
 
@@ -35,29 +31,6 @@ _LATEST = 3.0  # widths of an echo by which the surface may be late
 _LOWEST = -3.0  # point of a sea without the attribute surface_heights_m [m]
 _UNKNOWN = 10.0  # noise of samples that are not stored, over the threshold of blocks
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
-
-
-def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a dataset with ``waveform`` or ``signal`` into memory, from a file of `results.save` or a NetCDF-4 file.
-
-    Raises
-    ------
-    UserError
-        If the file is missing or damaged, has neither variable, or its times are invalid.
-    """
-    if input_format(path) == "exr":
-        return results.open(path)
-    try:
-        dataset = netcdf.read_netcdf(path)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
-    name = next((name for name in ("signal", "waveform") if name in dataset), None)
-    if name is None:
-        raise UserError(f"{path} holds neither a signal nor a waveform over time.")
-    check_axes(path, dataset, name)
-    return dataset
 
 
 @dataclass(frozen=True)

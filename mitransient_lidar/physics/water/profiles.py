@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import read_netcdf, readable_suffix
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.grids import NO_DATA, undeclared_no_data
 from mitransient_lidar.core.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
 from mitransient_lidar.core.text_tables import complete_rows, read_table
@@ -291,7 +292,7 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
         is not a number within its range, or contradicts the others; or there are fewer than 2 depths. The message names
         the line, or the index along the dimension.
     """
-    path = Path(path)
+    path = checked_path("path", path)
     readers = {**dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_text), ".nc": _read_netcdf}
     columns, places = readers[readable_suffix(path, readers, "profile")](path, wavelength_nm)
     try:

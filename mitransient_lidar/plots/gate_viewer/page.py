@@ -32,8 +32,7 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gate_viewer.time_bins import RECORDS, one_record, time_bins
 from mitransient_lidar.plots.gates.images import known_depths
 from mitransient_lidar.results.dataset import time_axis
-from mitransient_lidar.results.formats import picture_order
-from mitransient_lidar.results.gate_files import check_stack
+from mitransient_lidar.results.gate_stack import check_stack
 
 _LOG = logging.getLogger(__name__)
 
@@ -122,7 +121,6 @@ def page_text(
     else:
         gated = check_stack(stack)
         record = _record(gated, stack if result is None and "waveform" in stack else result)
-        gated = picture_order(gated)
     frame = _frame()
     room = 1e6 * limit_mb - sum(len(piece.encode()) for piece in frame) - _room_for_metadata(gated)
     gates, waveforms = _fit(gated, record, room, limit_mb, is_record=is_record)
@@ -144,7 +142,7 @@ def page_text(
 
 
 def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
-    """Return the result, if any, in picture order, after checking that it has waveforms of the pixels of the stack."""
+    """Return the result, if any, after checking that it has waveforms of the pixels of the stack."""
     if result is None:
         return None
     if "waveform" not in result:
@@ -155,7 +153,7 @@ def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
         raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}.")
     # A result without angles is in the order of the stack.
     known = {name: stack[name].variable for name in ("angle_x", "angle_y") if name not in result.coords}
-    return picture_order(result.assign_coords(known))
+    return result.assign_coords(known)
 
 
 def _fit(

@@ -7,10 +7,10 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import record_dims, time_axis
-from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
-from mitransient_lidar.results.schema import check_attributes, check_coordinates
+from mitransient_lidar.results.variables import described
 
 #: Variables with a record in time, and their errors; of a signal the standard deviation of one record.
 RECORDS = {"signal": "signal_deviation", "waveform": "waveform_stderr"}
@@ -48,17 +48,11 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     for angle in ("angle_x", "angle_y"):
         if angle not in own or set(own[angle].dims) != set(pixels):
             raise UserError(f"the result has no coordinate {angle} over ({', '.join(pixels)}): it has no map to draw")
-    about = {"units": str(dataset[name].attrs.get("units", "W" if name == "waveform" else "V"))}
-    about["long_name"] = "received power" if name == "waveform" else "recorded signal"
+    about = {**described(name), **{key: str(text) for key, text in dataset[name].attrs.items() if key == "units"}}
     arrays = {"waveform": (values, about), "waveform_stderr": (error, {})}
     order = (*pixels, "time")
-    return picture_order(
-        xr.Dataset(
-            {key: (order, one.transpose(*order).values, text) for key, (one, text) in arrays.items()},
-            own,
-            dataset.attrs,
-        )
-    )
+    data = {key: (order, one.transpose(*order).values, text) for key, (one, text) in arrays.items()}
+    return xr.Dataset(data, own, dataset.attrs)
 
 
 def time_bins(record: xr.Dataset) -> xr.Dataset:

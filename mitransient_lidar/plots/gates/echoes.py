@@ -14,7 +14,7 @@ from mitransient_lidar.analysis.gates.range_images import DepthImage, depth_imag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import known_depths, reached_by_surface
-from mitransient_lidar.results.gate_files import check_stack
+from mitransient_lidar.results.gate_stack import check_stack
 from mitransient_lidar.results.geometry import optional_number
 
 _NAMED_PIXELS = 16  # on an axis

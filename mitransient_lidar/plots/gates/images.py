@@ -25,7 +25,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.gate_files import check_stack
+from mitransient_lidar.results.gate_stack import check_stack
 from mitransient_lidar.results.geometry import optional_number
 
 _LIT = 0.01  # share of the beam in a lit pixel, relative to the brightest

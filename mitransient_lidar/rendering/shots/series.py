@@ -29,6 +29,7 @@ from mitransient_lidar.rendering.options import Components, RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
+from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -237,7 +238,7 @@ def render_shots(
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
-    known["shot_passes"] = ("shot", record.passes, {"units": "1", "long_name": "number of passes of the shot"})
+    known["shot_passes"] = ("shot", record.passes, described("shot_passes"))
     return series.dataset(record, attributes).assign_coords(known)
 
 

@@ -12,6 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -24,25 +25,6 @@ if TYPE_CHECKING:
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
 _REACH, _FEWEST_CELLS = 4.5, 4
-
-_IN_BEAM = "mean over the beam's footprint"
-_OF_WATER = "of the water, mean from the mean sea level to the bottom"
-
-#: Unit and description of the coordinates of a series of shots, by name.
-_DESCRIBED = {
-    "aim_x": ("m", "place where the axis meets the mean sea level, x"),
-    "aim_y": ("m", "place where the axis meets the mean sea level, y"),
-    "true_slope_along": ("1", f"slope of the surface, {_IN_BEAM}, positive for a face towards the lidar"),
-    "true_slope_across": ("1", f"slope of the surface, {_IN_BEAM}, positive for a rise to the left"),
-    "true_surface_height": ("m", f"height of the surface above the mean sea level, {_IN_BEAM}"),
-    "true_bottom_depth": ("m", "depth of the bottom below the mean sea level where the refracted axis meets it"),
-    "true_bottom_depth_below_surface": ("m", "depth of that point below the mean surface in the beam's footprint"),
-    "true_absorption": ("1/m", f"absorption coefficient a {_OF_WATER}"),
-    "true_scattering": ("1/m", f"scattering coefficient b {_OF_WATER}"),
-    "true_backscattering": ("1/m", f"backscattering coefficient bb {_OF_WATER}"),
-    "true_attenuation": ("1/m", f"beam attenuation coefficient c {_OF_WATER}"),
-    "true_kd": ("1/m", f"diffuse attenuation coefficient Kd {_OF_WATER}"),
-}
 
 #: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
@@ -198,11 +180,7 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
         "true_bottom_depth_below_surface": depth + height,
         **({} if lidar.water is None else water_means(lidar.water, depth)),
     }
-    return {
-        name: ("shot", values[name], {"units": unit, "long_name": text})
-        for name, (unit, text) in _DESCRIBED.items()
-        if name in values
-    }
+    return {name: ("shot", column, described(name)) for name, column in values.items()}
 
 
 def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:

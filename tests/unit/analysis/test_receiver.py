@@ -9,9 +9,8 @@ import xarray as xr
 from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms, encoding
+from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
-from mitransient_lidar.analysis.waveforms.records import open_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
@@ -19,7 +18,7 @@ from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
-from mitransient_lidar.results.netcdf import dump
+from mitransient_lidar.results import save
 
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # J
 CHAIN = ReceiverChain(
@@ -325,7 +324,10 @@ def changed(value):
     ("call", "message"),
     [
         (lambda: detect_waveforms(make(), "pmtt"), "chain = 'pmtt' must be .*apd"),
-        (lambda: detect_waveforms(make().drop_vars("waveform"), CHAIN), "no variable waveform"),
+        (
+            lambda: detect_waveforms(make().drop_vars("waveform"), CHAIN),
+            "another dataset, but must have waveforms",
+        ),
         (lambda: detect_waveforms(make().transpose("time", "pixel"), CHAIN), r"dimensions \('time', 'pixel'\)"),
         (lambda: detect_waveforms(make().drop_vars("time"), CHAIN), "no coordinate time"),
         (lambda: detect_waveforms(make().drop_vars("pixel"), CHAIN), "no coordinate pixel"),
@@ -422,8 +424,8 @@ def test_a_record_behind_a_measured_response_is_written(tmp_path):
     recorded = detect_waveforms(make(instrument="of my own"), chain)
     assert recorded.attrs["receiver.amplifier.impulse_response"] == "60 samples, -1 to 8 ns"
     assert float((recorded["receiver_response"] * recorded["lag"]).sum()) == pytest.approx(2, abs=0.05)
-    dump(recorded, tmp_path / "measured.nc", encoding(recorded))
-    assert open_waveforms(tmp_path / "measured.nc")["lag"].size == recorded["lag"].size
+    save(recorded, tmp_path / "measured.nc")
+    assert results.open(tmp_path / "measured.nc")["lag"].size == recorded["lag"].size
     # An instrument without a receiver has the usual one.
     assert detect_waveforms(make(instrument="of my own")).attrs["receiver"] == "apd"
 
@@ -431,15 +433,17 @@ def test_a_record_behind_a_measured_response_is_written(tmp_path):
 def test_codes_in_a_file_are_volts_by_their_attributes(tmp_path):
     recorded = detect_waveforms(make(), CHAIN, shots=5)
     path = tmp_path / "codes.nc"
-    dump(recorded, path, encoding(recorded))
+    save(recorded, path)
     with xr.open_dataset(path, engine="h5netcdf", mask_and_scale=False) as raw:
         codes = raw["signal"]
         assert codes.dtype == np.uint16
         assert codes.values.max() < 4096
         volts = codes.values * codes.attrs["scale_factor"] + codes.attrs["add_offset"]
     np.testing.assert_allclose(volts, recorded["signal"].values, atol=1e-6)
-    np.testing.assert_allclose(open_waveforms(path)["signal"].values, recorded["signal"].values, atol=1e-6)
-    assert encoding(detect_waveforms(make(), "ideal")) == {}
+    np.testing.assert_allclose(results.open(path)["signal"].values, recorded["signal"].values, atol=1e-6)
+    # A mean over shots is not of codes.
+    save(recorded.assign(signal=recorded["signal"].mean("shot", keep_attrs=True)), path)
+    np.testing.assert_array_equal(results.open(path)["signal"], recorded["signal"].mean("shot"))
 
 
 def test_blocks_above_a_threshold_are_stored(tmp_path):
@@ -460,5 +464,5 @@ def test_blocks_above_a_threshold_are_stored(tmp_path):
     assert 0.2 < float(stored.mean()) < 0.8
     assert not recorded["saturated"].where(~stored, False).any()
     assert "of the samples are stored in blocks" in "\n".join(describe_recording(recorded))
-    dump(recorded, tmp_path / "blocks.nc", encoding(recorded))
-    np.testing.assert_allclose(open_waveforms(tmp_path / "blocks.nc")["signal"], recorded["signal"], atol=1e-6)
+    save(recorded, tmp_path / "blocks.nc")
+    np.testing.assert_allclose(results.open(tmp_path / "blocks.nc")["signal"], recorded["signal"], atol=1e-6)

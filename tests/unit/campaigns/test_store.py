@@ -131,36 +131,6 @@ def test_store_of_other_versions(store, caplog):
     assert "the result is of mitsuba_version = 1.0" in caplog.text
 
 
-@pytest.mark.parametrize("image", [False, True])
-def test_campaign_of_an_earlier_version(image, path):
-    """It had the right pixels before the left ones: it is read in the order of its angles, but not completed."""
-    dims, angles = (("column",), [-9.0, 0.0, 9.0]) if image else (("pixel",), [-5.0, 5.0])
-    arrays = {"waveform": Array((*dims, "time"), np.zeros((len(angles), 4), dtype=np.float32), {"units": "W"})}
-    coordinates = {"time": COORDINATES["time"], "angle_y": Array(dims, np.array(angles), {"units": "mrad"})}
-    renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
-    store = Store.create(path, renderer, CAMPAIGN.table(), arrays, coordinates, shard_size=4)
-    store.check_pixel_order()
-    del store._group.attrs["pixel_order"]
-    older = Store(path)
-    status, errors, read = older.read(0)
-    read["waveform"][:] = np.arange(len(angles))[:, None]
-    older.write(0, np.full_like(status, DONE), errors, read)
-    with pytest.raises(
-        UserError, match="whose pixels are in order from right to left: it can be read but not completed"
-    ):
-        older.check_pixel_order()
-    found = open_campaign(path)
-    assert found["angle_y"].values.tolist() == (angles[::-1] if image else angles)
-    assert found["waveform"].values[0, :, 0].tolist() == ([2.0, 1.0, 0.0] if image else [0.0, 1.0])
-
-
-def test_one_pixel_of_an_earlier_version_is_completed(path):
-    coordinates = {**COORDINATES, "angle_y": Array(("pixel",), np.array([1e-9, 0.0]), {"units": "mrad"})}
-    store = Store.create(path, RunRenderer(CAMPAIGN, RECORD, AXIS), CAMPAIGN.table(), ARRAYS, coordinates, shard_size=4)
-    del store._group.attrs["pixel_order"]
-    Store(path).check_pixel_order()
-
-
 def test_shards_are_written_and_read(store, path):
     status, errors, arrays = filled(store, 1, 7)
     status[:], errors[:] = DONE, ""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 
+from mitransient_lidar import results
 from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.results import netcdf
 
 #: The reference compiles one kernel, merging three.
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
@@ -163,8 +163,8 @@ def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
     table = tmp_path / "table.nc"
     options = [*few, "--ripples", 5, "-D", "altitude=120", "--angles", 20, "-o", table]
     check(run("depth-bias", "riegl_vq840g", *options))
-    bias = netcdf.read_netcdf(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
-    found = netcdf.read_netcdf(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
+    bias = results.open(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
+    found = results.open(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
     vertical = np.hypot(bias["bias"], bias["spread"]).where(bias["found"] >= 0.5)
     assert np.isfinite(vertical.sel(water="IB")).all()
     np.testing.assert_allclose(found["subaqueous_vertical"].sel(correction="none"), vertical)
@@ -188,9 +188,7 @@ def test_series_of_shots_from_end_to_end(scene, tmp_path):
     lines = echoes.read_text().splitlines()
     assert "true_surface_height" in lines[0]
     assert {line.split(",")[0] for line in lines[1:]} == {"0", "1"}
-    assert_refused(
-        run("retrieve", signals), "holds signals of a receiver; give the result that they were recorded from"
-    )
+    assert_refused(run("retrieve", signals), "holds signals of a receiver, but FILE must have waveforms of a render")
     check(run("retrieve", shots, "--figure", tmp_path / "slopes.png"))
     check(run("view", "--plot", shots))
     check(run("view", "--plot", signals, "--shot", 1))

@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from PIL import Image
 
+from mitransient_lidar import results
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
 from mitransient_lidar.results import netcdf
 
@@ -32,7 +33,7 @@ def file(request, tmp_path):
         frames = [Image.fromarray(np.full((8, 8), shade, np.uint8)) for shade in (0, 90, 200)]
         frames[0].save(path, save_all=True, append_images=frames[1:])
     elif request.param == ".nc":
-        netcdf.dump(xr.Dataset({"a": ("x", np.arange(1000.0))}, attrs={"scene": "table1"}), path, {})
+        netcdf.write(xr.Dataset({"a": ("x", np.arange(1000.0))}, attrs={"scene": "table1"}), path)
     else:
         path.write_text("<!doctype html><title>-- page --</title><p>text")
     return path
@@ -48,7 +49,7 @@ def contents(path):
                 frames.append(np.array(image.convert("RGB")))
             return np.stack(frames)
     if path.suffix == ".nc":
-        return netcdf.read_netcdf(path)["a"].values
+        return results.open(path)["a"].values
     return np.array([])
 
 
@@ -90,7 +91,7 @@ def test_mark_of_a_figure_stands_where_its_format_allows(tmp_path):
 
 def test_checksum_of_a_marked_file_is_checked(tmp_path):
     path = tmp_path / "a.nc"
-    netcdf.dump(xr.Dataset({"a": ("x", np.arange(1000.0))}), path, {})
+    netcdf.write(xr.Dataset({"a": ("x", np.arange(1000.0))}), path)
     write_mark(path, MARK)
     assert netcdf.check_sum(path)
     data = bytearray(path.read_bytes())

@@ -31,7 +31,7 @@ def test_extent_reaches_half_a_pixel_beyond_the_centres(rows, columns, extent):
 
 
 def test_images_are_pictures_taken_from_the_lidar_in_any_order_of_their_pixels():
-    """Far is up and +angle_y left; column 0 was the right one in results of earlier versions."""
+    """Far is up and +angle_y left."""
     pictures = []
     values = np.arange(20.0).reshape(4, 5)
     for order in ({}, {"column": slice(None, None, -1)}, {"row": slice(None, None, -1)}):

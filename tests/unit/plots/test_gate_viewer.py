@@ -141,17 +141,6 @@ def test_page_contains_all_data(scene, tmp_path):
     assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
 
 
-@pytest.mark.parametrize("angles_of_result", [True, False])
-def test_page_of_an_older_result_is_the_same(scene, tmp_path, angles_of_result):
-    """Column 0 was the right one in versions up to 0.1, as the angles of the pixels show."""
-    older = [dataset.isel(column=slice(None, None, -1)) for dataset in scene]
-    if not angles_of_result:
-        older[1] = older[1].drop_vars(["angle_x", "angle_y"])
-    write_page(scene[0], tmp_path / "page.html", scene[1])
-    write_page(older[0], tmp_path / "older.html", older[1])
-    assert (tmp_path / "older.html").read_bytes() == (tmp_path / "page.html").read_bytes()
-
-
 def test_page_contains_the_lines_of_sight(scene, tmp_path):
     path = tmp_path / "page.html"
     shape = (ROWS, COLUMNS)

@@ -11,9 +11,9 @@ import pytest
 from command_line import assert_refused, run
 
 import mitransient_lidar
+from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import dataset as results
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from mitransient_lidar.results import netcdf
 small = {"bin_count": 400, "time_start_ns": 1380}
 def record(shots):
     found = ml.record(result, "apd", shots=shots)
-    netcdf.dump(found, sys.argv[3], receiver.encoding(found))
+    netcdf.write(found, sys.argv[3])
 result = ml.render("table1", params=small, passes=2)
 def passive(pixels, **options):
     render_passive("passive_sea", params={"layout": f"{pixels}x{pixels}"}, passes=2, **options)

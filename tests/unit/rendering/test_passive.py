@@ -16,7 +16,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering import passive
-from mitransient_lidar.results.radiance import save_radiance
+from mitransient_lidar.results import save
 from mitransient_lidar.transport.daylight.renderer import DaylightLight
 from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -159,7 +159,7 @@ def test_frames_move_the_sea_and_fill_files(tmp_path):
     assert pictures["time_s"].values.tolist() == [0.0, 0.5]
     assert np.any(pictures["radiance"][0] != pictures["radiance"][1])
     for suffix in (".nc", ".exr"):
-        save_radiance(pictures, tmp_path / f"a{suffix}")
+        save(pictures, tmp_path / f"a{suffix}")
     with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as again:
         np.testing.assert_array_equal(again["radiance"], pictures["radiance"])
         np.testing.assert_array_equal(again["background_power"], pictures["background_power"])
@@ -167,11 +167,11 @@ def test_frames_move_the_sea_and_fill_files(tmp_path):
         assert [part.header["name"] for part in file.parts] == ["frame0000", "frame0001"]
         assert set(file.parts[1].channels) == {"Y", "Y.stderr"}
         np.testing.assert_array_equal(file.parts[1].channels["Y"].pixels, pictures["radiance"][1].astype(np.float32))
-    save_radiance(pictures.isel(frame=0), tmp_path / "b.exr")
+    save(pictures.isel(frame=0), tmp_path / "b.exr")
     with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
         assert len(file.parts) == 1
     with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
-        save_radiance(pictures, tmp_path / "a.txt")
+        save(pictures, tmp_path / "a.txt")
     # A flat sea has nothing that moves: frames differ by noise only.
     flat = no_none(scene())
     flat["sea"]["spectrum"] = "flat"

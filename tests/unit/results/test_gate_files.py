@@ -11,8 +11,9 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import gate_files
-from mitransient_lidar.results.gate_stack import add_gate_derivatives
+from mitransient_lidar.results import exr
+from mitransient_lidar.results.gate_stack import add_gate_derivatives, check_stack
+from mitransient_lidar.results.variables import label
 
 ATTRIBUTES = {
     "scene": "mine field",
@@ -51,6 +52,12 @@ def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):
     return xr.Dataset(variables, coords, attributes)
 
 
+def save_sequence(stack, folder, stem):
+    """Write a sequence, and return its files."""
+    exr.write_sequence(check_stack(stack), folder, stem)
+    return [folder / f"{stem}_gate{k:03d}.exr" for k in range(stack.sizes["gate"])]
+
+
 def parts_by_other_reader(path):
     """Read all parts with OpenImageIO: name, channel names, header attributes, values (row, column, channel)."""
     image = OpenImageIO.ImageInput.open(str(path))
@@ -85,7 +92,7 @@ def assert_parts_show(parts, stack):
 @pytest.mark.parametrize("rows", [4, 0])
 def test_another_reader_finds_one_part_a_gate(tmp_path, rows):
     stack = make(rows=rows)
-    gate_files.save_stack(stack, tmp_path / "a.exr")
+    results.save(stack, tmp_path / "a.exr")
     parts = parts_by_other_reader(tmp_path / "a.exr")
     assert_parts_show(parts, stack)
     assert parts[0][3].shape == (rows or 1, 5, 2)
@@ -100,7 +107,7 @@ def test_another_reader_finds_one_part_a_gate(tmp_path, rows):
 
 def test_another_reader_finds_every_file_of_a_sequence(tmp_path):
     stack = make()
-    paths = gate_files.save_sequence(stack, tmp_path / "new" / "folder", "sand")
+    paths = save_sequence(stack, tmp_path / "new" / "folder", "sand")
     assert [path.name for path in paths] == ["sand_gate000.exr", "sand_gate001.exr", "sand_gate002.exr"]
     assert sorted((tmp_path / "new" / "folder").iterdir()) == paths
     parts = [part for path in paths for part in parts_by_other_reader(path)]
@@ -113,8 +120,8 @@ def test_another_reader_finds_every_file_of_a_sequence(tmp_path):
 @pytest.mark.parametrize("rows", [4, 0])
 def test_stacks_are_read_back(tmp_path, rows, suffix):
     stack = make(rows=rows)
-    gate_files.save_stack(stack, tmp_path / f"a{suffix}")
-    back = gate_files.open_stack(tmp_path / f"a{suffix}")
+    results.save(stack, tmp_path / f"a{suffix}")
+    back = results.open(tmp_path / f"a{suffix}")
     xr.testing.assert_identical(back, stack)
     assert {type(value) for value in back.attrs.values()} == {str, int, float, list}
     assert back["gate"].dtype == stack["gate"].dtype
@@ -124,37 +131,37 @@ def test_values_beyond_32_bits_are_rounded_in_exr_only(tmp_path):
     stack = make()
     stack["gate_energy"] *= 1 / 3
     for suffix in (".exr", ".nc"):
-        gate_files.save_stack(stack, tmp_path / f"a{suffix}")
-    rounded = gate_files.open_stack(tmp_path / "a.exr")["gate_energy"]
+        results.save(stack, tmp_path / f"a{suffix}")
+    rounded = results.open(tmp_path / "a.exr")["gate_energy"]
     np.testing.assert_array_equal(rounded, stack["gate_energy"].astype(np.float32))
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.nc"), stack)
+    xr.testing.assert_identical(results.open(tmp_path / "a.nc"), stack)
 
 
 def test_sequence_is_read_from_its_folder_and_its_first_file(tmp_path):
     stack = make()
-    paths = gate_files.save_sequence(stack, tmp_path, "a_gate001.exr")  # a stem that looks like a number
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
-    xr.testing.assert_identical(gate_files.open_stack(paths[0]), stack)
+    paths = save_sequence(stack, tmp_path, "a_gate001.exr")  # a stem that looks like a number
+    xr.testing.assert_identical(results.open(tmp_path), stack)
+    xr.testing.assert_identical(results.open(paths[0]), stack)
     for path in paths:  # all files may be renamed in the same way
         path.rename(path.with_name(path.name.replace("a_gate001.exr", "b")))
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
+    xr.testing.assert_identical(results.open(tmp_path), stack)
 
 
 @pytest.mark.slow
 def test_a_thousand_gates_have_four_digits(tmp_path):
     stack = make(rows=0, columns=2, gates=1000)
-    gate_files.save_stack(stack, tmp_path / "a.exr")
+    results.save(stack, tmp_path / "a.exr")
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         assert [file.parts[k].header["name"] for k in (0, 999)] == ["gate0000", "gate0999"]
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
 
 
 def test_one_gate_and_unknown_depth(tmp_path):
     stack = make(gates=1).drop_vars("gate_depth")
-    gate_files.save_stack(stack, tmp_path / "a.exr")
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+    results.save(stack, tmp_path / "a.exr")
+    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
     assert "gateDepthM" not in parts_by_other_reader(tmp_path / "a.exr")[0][0]
-    xr.testing.assert_identical(gate_files.open_stack(gate_files.save_sequence(stack, tmp_path, "s")[0]), stack)
+    xr.testing.assert_identical(results.open(save_sequence(stack, tmp_path, "s")[0]), stack)
 
 
 @pytest.mark.parametrize("dim", ["origin", "parameter", "batch"])
@@ -162,17 +169,18 @@ def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
     """As of a render with gates and `components`, `derivatives` or `batches`, whose time bins another file holds."""
     more = {"waveform_more": ((dim, "row", "column", "time"), np.ones((2, 4, 5, 7)))}
     with_more = make().assign(more).assign_coords({f"{dim}_names": (dim, ["a", "b"])})
-    gate_files.save_stack(with_more, tmp_path / "gates.exr")
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "gates.exr"), make())
+    results.save(with_more, tmp_path / "gates.exr")
+    xr.testing.assert_identical(results.open(tmp_path / "gates.exr"), make())
 
 
 def test_derivatives_of_gates_need_netcdf(tmp_path):
-    stack = make()
+    stack = label(make())
     slopes, errors = np.random.default_rng(3).normal(size=(2, 2, 4, 5, 3))
     more = add_gate_derivatives(stack, slopes, errors).assign_coords(parameter=["attenuation", "bottom_depth"])
     for name, kept in (("a.nc", more), ("a.exr", stack)):
-        gate_files.save_stack(more.assign(waveform=(("row", "column", "time"), np.ones((4, 5, 7)))), tmp_path / name)
-        xr.testing.assert_identical(gate_files.open_stack(tmp_path / name), kept)
+        with_time = more.assign(waveform=(("row", "column", "time"), np.ones((4, 5, 7))))
+        results.save(check_stack(with_time), tmp_path / name)
+        xr.testing.assert_identical(results.open(tmp_path / name), kept)
     assert more["gate_energy_derivative"].dims == ("parameter", "row", "column", "gate")
 
 
@@ -181,27 +189,27 @@ def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
     both = stack.transpose("gate", "column", "row").assign(
         waveform=(("row", "column", "time"), np.ones((4, 5, 7))), time=("time", np.arange(7.0))
     )
-    gate_files.save_stack(both, tmp_path / "a.exr")
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+    results.save(both, tmp_path / "a.exr")
+    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
     more = stack.assign(contrast=("gate", [1.0, 2.0, 3.0]))
     with pytest.raises(UserError, match=r"cannot store the variable contrast; use a \.nc file"):
-        gate_files.save_stack(more, tmp_path / "b.exr")
+        results.save(more, tmp_path / "b.exr")
     assert not (tmp_path / "b.exr").exists()
-    gate_files.save_stack(more, tmp_path / "b.nc")
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "b.nc"), more)
+    results.save(more, tmp_path / "b.nc")
+    xr.testing.assert_identical(results.open(tmp_path / "b.nc"), more)
 
 
 @pytest.mark.long
 def test_imager_of_256_squared_and_64_gates(tmp_path):
     stack = make(256, 256, 64)
-    gate_files.save_stack(stack, tmp_path / "a.exr")
-    assert gate_files.open_stack(tmp_path / "a.exr").equals(stack)
+    results.save(stack, tmp_path / "a.exr")
+    assert results.open(tmp_path / "a.exr").equals(stack)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda stack: stack.drop_vars("gate_energy_stderr"), "no variable gate_energy_stderr"),
+        (lambda stack: stack.drop_vars("gate_energy_stderr"), "no variable gate_energy_stderr|an EXR file holds"),
         (lambda stack: stack.rename(row="line"), r"must have the dimensions \(row, column, gate\)"),
         (lambda stack: stack.isel(gate=slice(0)), "must not be empty"),
         (lambda stack: stack.drop_vars("gate_width"), r"no coordinate gate_width over \(gate\)"),
@@ -209,8 +217,8 @@ def test_imager_of_256_squared_and_64_gates(tmp_path):
 )
 def test_other_datasets_are_not_written_as_stacks(tmp_path, change, message):
     for write in (
-        lambda stack: gate_files.save_stack(stack, tmp_path / "a.exr"),
-        lambda stack: gate_files.save_sequence(stack, tmp_path, "a"),
+        lambda stack: results.save(stack, tmp_path / "a.exr"),
+        lambda stack: save_sequence(stack, tmp_path, "a"),
     ):
         with pytest.raises(UserError, match=message):
             write(change(make()))
@@ -219,29 +227,29 @@ def test_other_datasets_are_not_written_as_stacks(tmp_path, change, message):
 
 def test_wrong_names(tmp_path):
     with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
-        gate_files.save_stack(make(), tmp_path / "a.tif")
+        results.save(make(), tmp_path / "a.tif")
     with pytest.raises(UserError, match="without folders"):
-        gate_files.save_sequence(make(), tmp_path, "a/b")
+        save_sequence(make(), tmp_path, "a/b")
     with pytest.raises(UserError, match="No such file"):
-        gate_files.save_stack(make(), tmp_path / "missing" / "a.exr")
+        results.save(make(), tmp_path / "missing" / "a.exr")
     with pytest.raises(UserError, match="No such file"):
-        gate_files.open_stack(tmp_path / "a.exr")
+        results.open(tmp_path / "a.exr")
     (tmp_path / "file").write_text("text")
     with pytest.raises(UserError, match="neither an EXR nor a NetCDF-4 file"):
-        gate_files.open_stack(tmp_path / "file")
+        results.open(tmp_path / "file")
     with pytest.raises(UserError, match="cannot write"):
-        gate_files.save_sequence(make(), tmp_path / "file", "a")
+        save_sequence(make(), tmp_path / "file", "a")
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
 def test_damaged_files_are_rejected(tmp_path, suffix, capfd):
     whole, part = tmp_path / f"whole{suffix}", tmp_path / f"part{suffix}"
-    gate_files.save_stack(make(), whole)
+    results.save(make(), whole)
     data = whole.read_bytes()
     for length in {*range(8, len(data), 61), len(data) - 1}:
         part.write_bytes(data[:length])
         with pytest.raises(UserError, match=r"part\.\w+ is damaged or truncated"):
-            gate_files.open_stack(part)
+            results.open(part)
     assert capfd.readouterr() == ("", "")
 
 
@@ -249,57 +257,57 @@ def test_files_with_other_content(tmp_path):
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((2, 2), np.float32)}) as file:
         file.write(str(tmp_path / "foreign.exr"))
     with pytest.raises(UserError, match="not a result of mitransient-lidar"):
-        gate_files.open_stack(tmp_path / "foreign.exr")
+        results.open(tmp_path / "foreign.exr")
     xr.Dataset({"depth": ("x", [1.0])}).to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
-    with pytest.raises(UserError, match="holds no gate stack"):
-        gate_files.open_stack(tmp_path / "foreign.nc")
+    with pytest.raises(UserError, match=r"foreign\.nc is a NetCDF file, but not of mitransient-lidar"):
+        results.open(tmp_path / "foreign.nc")
 
     values = np.ones((1, 4))
     options = {"pixel_names": ["a"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": {}}
     waveforms = results.build(values, values, values, values, time=TimeAxis(0, 1, 4), **options)
     results.save(waveforms, tmp_path / "wave.exr")
-    with pytest.raises(UserError, match="holds no gates, but a result with time bins"):
-        gate_files.open_stack(tmp_path / "wave.exr")
+    with pytest.raises(UserError, match=r"wave\.exr holds waveforms of a render, but FILE must have a gate stack"):
+        results.dataset_of("FILE", tmp_path / "wave.exr", "gates")
     for gates in (1, 3):
-        gate_files.save_stack(make(gates=gates), tmp_path / "gates.exr")
-        with pytest.raises(UserError, match="no time bins"):
-            results.open(tmp_path / "gates.exr")
+        results.save(make(gates=gates), tmp_path / "gates.exr")
+        with pytest.raises(UserError, match=r"gates\.exr holds a gate stack, but FILE must have waveforms of a render"):
+            results.dataset_of("FILE", tmp_path / "gates.exr", "result")
 
 
 def test_incomplete_sequences_are_rejected(tmp_path, caplog):
-    old = gate_files.save_sequence(make(seed=1, gates=4), tmp_path, "a")
+    old = save_sequence(make(seed=1, gates=4), tmp_path, "a")
     with pytest.raises(UserError, match=r"is gate 2 of a sequence: open the folder or the first file, a_gate000\.exr"):
-        gate_files.open_stack(old[2])
+        results.open(old[2])
     of_old = old[1].read_bytes()
-    new = gate_files.save_sequence(make(seed=2), tmp_path, "a")
+    new = save_sequence(make(seed=2), tmp_path, "a")
     assert "a_gate003.exr does not belong to this sequence of 3 gates" in caplog.text
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path), make(seed=2))
+    xr.testing.assert_identical(results.open(tmp_path), make(seed=2))
     new[1].write_bytes(of_old)
     with pytest.raises(UserError, match="its 3 gates belong to different stacks"):
-        gate_files.open_stack(tmp_path)
+        results.open(tmp_path)
     new[1].unlink()
     with pytest.raises(UserError, match=r"a_gate001\.exr: gate 1 of the 3 gates of the sequence is missing"):
-        gate_files.open_stack(tmp_path)
+        results.open(tmp_path)
     new[0].rename(tmp_path / "first.exr")
     with pytest.raises(UserError, match=r"its name must end in _gate000\.exr"):
-        gate_files.open_stack(tmp_path / "first.exr")
+        results.open(tmp_path / "first.exr")
     with pytest.raises(UserError, match="holds no sequence of gates"):
-        gate_files.open_stack(tmp_path)
+        results.open(tmp_path)
     for stem in ("b", "c"):
-        gate_files.save_sequence(make(), tmp_path, stem)
+        save_sequence(make(), tmp_path, stem)
     with pytest.raises(UserError, match=r"2 sequences of gates: open the first file of one \(b_gate000\.exr, c_"):
-        gate_files.open_stack(tmp_path)
+        results.open(tmp_path)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    gate_files.save_stack(make(seed=1), tmp_path / "a.exr")
+    results.save(make(seed=1), tmp_path / "a.exr")
 
     def fail(path, parts):
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(gate_files.exr, "write_parts", fail)
+    monkeypatch.setattr(exr, "write", fail)
     with pytest.raises(UserError, match="No space left on device"):
-        gate_files.save_stack(make(seed=2), tmp_path / "a.exr")
+        results.save(make(seed=2), tmp_path / "a.exr")
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
-    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), make(seed=1))
+    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), make(seed=1))

@@ -11,7 +11,6 @@ from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results import gate_files
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
@@ -33,8 +32,7 @@ ATTRIBUTES = {
     "divergence_mrad": 10.0,
     "pulse_energy_mj": 5.0,
     "aperture_area": 0.025,
-    "scene.optical_efficiency": "0.9",
-    "scene.two_way_atmospheric_transmittance": "0.8",
+    "two_way_efficiency": 0.9**2 * 0.8,
 }
 
 
@@ -136,8 +134,8 @@ def test_lines_of_sight_survive_files_and_gates(tmp_path, suffix):
     results.save(dataset, tmp_path / f"a{suffix}")
     assert_same(LinesOfSight.from_dataset(results.open(tmp_path / f"a{suffix}")), lines)
     gates = cut_gates(dataset, GateTrain(1425.0, 5.0, 5.0, 3))
-    gate_files.save_stack(gates, tmp_path / f"b{suffix}")
-    stack = gate_files.open_stack(tmp_path / f"b{suffix}")
+    results.save(gates, tmp_path / f"b{suffix}")
+    stack = results.open(tmp_path / f"b{suffix}")
     assert_same(LinesOfSight.from_dataset(stack), lines)
     assert_same(LinesOfSight.from_dataset(dataset.transpose("time", "column", "row")), lines)
 

@@ -21,7 +21,7 @@ T = np.arange(60.0)
 SMALL = {"spectrum": "flat", "surface_size": 60, "surface_cell_size": 5}
 
 
-def light(_, *, params, derivatives, passes, seed):
+def light(_, *, params, derivatives, passes, seed, instrument=None):
     """Return counts of a decay, whose height is the energy of the pulse; four pixels share its light."""
     RenderOptions(passes=passes, seed=seed)  # refuses what a render would
     random = np.random.default_rng(seed)

@@ -11,7 +11,7 @@ from command_line import assert_refused, run
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering.passes import Progress
-from mitransient_lidar.results.netcdf import dump
+from mitransient_lidar.results import save
 from mitransient_lidar.studies import fit as study
 
 NAMES = ["attenuation", "bottom_reflectance"]
@@ -228,7 +228,7 @@ def test_the_command_refuses_files_that_it_cannot_read(tmp_path):
     free = ["--scene", "table1", "--free", "attenuation", "-q"]
     assert_refused(run("fit", tmp_path / "none.csv", *free), "none.csv")
     assert_refused(run("fit", tmp_path / "none.nc", *free), "none.nc")
-    dump(closed_form(TRUTH)[["waveform_derivative"]], tmp_path / "other.nc", {})
+    save(closed_form(TRUTH)[["waveform_derivative"]], tmp_path / "other.nc")
     assert_refused(run("fit", tmp_path / "other.nc", *free), "other.nc")
 
 

@@ -212,7 +212,7 @@ def test_train_before_a_record_of_unknown_surface():
 
 def test_stacks_without_histogram_are_rejected():
     stack = gating.cut_gates(record(), GateTrain(1420.0, 5.0, 5.0, 4))
-    with pytest.raises(UserError, match="has no waveform: gates can be cut only from a result that kept its histogram"):
+    with pytest.raises(UserError, match="dataset holds a gate stack, but must have waveforms over time"):
         gating.cut_gates(stack, GateTrain(1420.0, 5.0, 5.0, 2))
     with pytest.raises(UserError, match=r"dimensions \('time', 'pixel'\)"):
         gating.cut_gates(record().transpose("time", "pixel"), GateTrain(1420.0, 5.0, 5.0, 2))

@@ -153,7 +153,7 @@ def test_strengths_and_the_sea_count():
     across_wind = retrieve.surface_slopes(of_a_sea(), wind_direction_deg=90)
     np.testing.assert_allclose(across_wind.attrs["slope_prior_deviation"][:2], [0.04, 0.06], rtol=0.15)
     no_scale = of_a_sea()
-    del no_scale.attrs["scene.optical_efficiency"]
+    del no_scale.attrs["two_way_efficiency"]
     assert retrieve.surface_slopes(no_scale).attrs["slope_method"] == "times on a sea"
     flat = retrieve.surface_slopes(of_a_sea(**{"scene.spectrum": "height_map"}))
     assert flat.attrs["slope_method"] == "times"
@@ -428,7 +428,7 @@ def drop(name):
         (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
         (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
-        (lambda: retrieve.bottom(drop("scene.optical_efficiency"), LEVEL), "efficiency must be given"),
+        (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
         (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
         (lambda: retrieve.water(result(), efficiency=3), "efficiency = 3 must lie between"),
         (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),

@@ -9,7 +9,6 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
     corrections_for,
-    read_corrections,
     summarize_depths,
     turned_pixels,
 )
@@ -313,16 +312,16 @@ def test_files_without_corrections_are_refused(tmp_path):
         corrections_for("", "auto")
     with pytest.raises(UserError, match="no shipped corrections of the instrument mine"):
         corrections_for("mine", "auto")
-    echoes([5.0]).to_netcdf(tmp_path / "echoes.nc", engine="h5netcdf")
-    with pytest.raises(UserError, match="holds no corrections of depths"):
-        read_corrections(tmp_path / "echoes.nc")
+    echoes([5.0]).assign(time_ns=1.0).to_netcdf(tmp_path / "echoes.nc", engine="h5netcdf")
+    with pytest.raises(UserError, match="a table of echoes, but corrections must have a table of depth errors"):
+        corrections_for("", tmp_path / "echoes.nc")
     with pytest.raises(UserError, match="No such file"):
-        read_corrections(tmp_path / "other.nc")
+        corrections_for("", tmp_path / "other.nc")
     table().isel(depth=[2, 0, 1]).to_netcdf(tmp_path / "mixed.nc", engine="h5netcdf")
     with pytest.raises(UserError, match="depth that does not ascend"):
-        read_corrections(tmp_path / "mixed.nc")
+        corrections_for("", tmp_path / "mixed.nc")
     table().to_netcdf(tmp_path / "good.nc", engine="h5netcdf")
-    xr.testing.assert_allclose(read_corrections(tmp_path / "good.nc")["bias"], table()["bias"])
+    xr.testing.assert_allclose(corrections_for("", tmp_path / "good.nc")["bias"], table()["bias"])
 
 
 @pytest.mark.parametrize(

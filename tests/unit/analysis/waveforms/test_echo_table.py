@@ -243,7 +243,7 @@ def test_command_reads_what_a_receiver_recorded(tmp_path):
         found = [float(line["depth_m"]) for line in csv.DictReader(file) if line["echo"] == "bottom"]
     assert found == pytest.approx([70 * PER_NS] * 3, abs=0.05)
     shots.rename(signal="sound").to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    assert_refused(run("echoes", tmp_path / "other.nc"), "holds neither a signal nor a waveform over time.")
+    assert_refused(run("echoes", tmp_path / "other.nc"), "is a NetCDF file, but not of mitransient-lidar")
 
 
 def drop(name):
@@ -258,7 +258,7 @@ def drop(name):
         (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
         (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
         (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
-        (result().drop_vars("waveform"), {}, "neither signal nor waveform"),
+        (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
         (drop("altitude"), {}, "the dataset has no attribute altitude"),
         (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
         (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),

@@ -1,19 +1,21 @@
-"""Kinds and ranges of the attributes and arrays of results, checked where a result is read or used."""
+"""Attributes and coordinates of results: their types in files, kinds and ranges, checked where a result is read."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import limits
-from mitransient_lidar.core.validation import shown
-from mitransient_lidar.results.formats import PER_PIXEL
+from mitransient_lidar.core.validation import shown as printed
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
 
@@ -30,6 +32,9 @@ _NUMBERS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("gain", "optical_density", "noise_bandwidth_hz", "background_power_w"), _NOT_NEGATIVE),
 }
 
+#: Attributes that are a list over the pixels where they differ.
+PER_PIXEL = ("gain", "optical_density", "background_power_w", "fitting_gain", "fitting_optical_density")
+
 #: Those that count something, which is known.
 _COUNTS = ("passes", "most_passes", "pulses", "shots")
 
@@ -41,12 +46,8 @@ _LISTS: dict[str, int | None] = {
     "field_of_view_sides_mrad": 2,
     "surface_heights_m": 2,
     "slope_deviation": 2,
-    "error_inflation_bins": None,
-    "error_inflation": None,
-    "pulse_times_ns": None,
-    "pulse_power": None,
-    "wave_focusing_depths": None,
-    "wave_focusing": None,
+    **dict.fromkeys(("error_inflation_bins", "error_inflation", "pulse_times_ns", "pulse_power")),
+    **dict.fromkeys(("wave_focusing_depths", "wave_focusing")),
 }
 
 #: Those that are empty where there are none: views of hexagons and of separate pixels have no sides.
@@ -65,6 +66,88 @@ _COORDINATES = (
     *("true_bottom_depth_below_surface", "true_absorption", "true_scattering", "true_backscattering"),
     *("true_attenuation", "true_kd"),
 )
+
+#: Attributes of a file beside the one with all others, the most there may be, and those that go first.
+MOST_SHOWN = 39
+_FIRST = (
+    *("Conventions", "title", "source", "history", "comment", "references", "scene", "instrument", "receiver"),
+    *("time_start_ns", "bin_width_ns", "layout", "altitude", "off_nadir_deg", "wavelength_nm", "pulse_energy_mj"),
+    *("pulse_fwhm_ns", "divergence_mrad", "field_of_view_mrad", "aperture_area", "two_way_efficiency"),
+    *("refractive_index", "group_index", "surface_time_ns", "window_start_ns", "window_end_ns", "gate_step_ns"),
+    *("pulses", "shots", "seed", "passes", "error_median", "error_p95", "elapsed_s", "integrator", "variant"),
+    *("mitsuba_version", "drjit_version", "scene_xml"),
+)
+
+
+def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a result, checked, with ``title``, ``source`` and ``history`` added.
+
+    Raises
+    ------
+    ValueError
+        If an attribute is no int, float, str or list of one of those.
+    """
+    return {
+        "Conventions": "CF-1.11",
+        "title": titled("Received lidar power", attributes),
+        "source": f"mitransient-lidar {__version__}",
+        "history": step_of_history("rendered"),
+        **{text(name): attribute(name, value) for name, value in attributes.items()},
+    }
+
+
+def made_from(attributes: Mapping[Any, Any], title: str, done: str) -> dict[str, str]:
+    """Return ``title`` and ``history`` of a dataset that is made from one with these attributes."""
+    return {"title": titled(title, attributes), "history": step_of_history(done, attributes)}
+
+
+def titled(what: str, attributes: Mapping[Any, Any]) -> str:
+    """Return a title that names the scene in the attributes, if they have one."""
+    return f"{what}, scene {attributes['scene']}" if "scene" in attributes else what
+
+
+def step_of_history(done: str, attributes: Mapping[Any, Any] | None = None) -> str:
+    """Return the attribute ``history`` of a dataset with a line about what was done with it now."""
+    line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {done} by mitransient-lidar {__version__}"
+    return "\n".join(part for part in (str((attributes or {}).get("history", "")), line) if part)
+
+
+def shown(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes that other programs see: numbers and texts, at most 39, the most telling first."""
+    plain = {name: value for name, value in attributes.items() if not isinstance(value, list)}
+    if len(plain) > MOST_SHOWN:
+        first = {name: plain[name] for name in _FIRST if name in plain}
+        return dict(list(first.items())[:MOST_SHOWN])
+    return plain
+
+
+def attribute(name: str, value: Any) -> int | float | str | list[int] | list[float] | list[str]:
+    """Convert an attribute to a Python type that both file formats return unchanged.
+
+    Raises
+    ------
+    ValueError
+        If it is no int, float, str or list of one of those.
+    """
+    if isinstance(value, (tuple, list, np.ndarray)):
+        items = [attribute(name, item) for item in value]
+        if {type(item) for item in items} == {int, float}:
+            items = [float(item) for item in items]  # type: ignore[arg-type]
+        if len({type(item) for item in items}) <= 1 and not any(isinstance(item, list) for item in items):
+            return items  # type: ignore[return-value]
+    elif isinstance(value, (bool, int, np.bool_, np.integer)):
+        if -(2**63) <= int(value) < 2**63:
+            return int(value)
+    elif isinstance(value, (float, np.floating)):
+        return float(value)
+    elif isinstance(value, (str, Path)):
+        return text(value)
+    raise ValueError(f"attribute {name} = {value!r} must be a 64-bit int, a float, a str or a list of one of those.")
+
+
+def text(value: str | Path) -> str:
+    """Replace what UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
+    return str(value).replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
 
 
 def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
@@ -114,7 +197,7 @@ def check_coordinates(place: object, dataset: xr.Dataset, name: str) -> None:
 
 
 def _refusal(place: object, name: str, value: object, allowed: str) -> UserError:
-    return UserError(f"{place} has the attribute {name} = {shown(value)}: it must be {allowed}.")
+    return UserError(f"{place} has the attribute {name} = {printed(value)}: it must be {allowed}.")
 
 
 def _is_number(value: object) -> bool:
@@ -136,20 +219,20 @@ def _are_outlines(text: object, keys: tuple[str, ...] | None) -> bool:
     if not isinstance(listed, list):
         return False
     if keys is None:
-        return all(isinstance(one, list) and all(_is_line(line) for line in one) for one in listed)
-    return all(isinstance(one, dict) and set(keys) <= one.keys() and _has_lines(one) for one in listed)
-
-
-def _has_lines(described: Mapping[str, Any]) -> bool:
-    """Return whether the parts of an outline are a text, a number, numbers, a line or lines."""
-    kinds: dict[str, Callable[[Any], bool]] = {
+        return all(_are_lines(one) for one in listed)
+    parts: dict[str, Callable[[Any], bool]] = {
         "id": lambda value: isinstance(value, str),
         "share": _is_number,
         "z": lambda value: _are_numbers(value) and len(value) == 2,
+        "lines": _are_lines,
         **dict.fromkeys(("line", "seen", "shadow"), _is_line),
-        "lines": lambda value: isinstance(value, list) and all(map(_is_line, value)),
     }
-    return all(kinds[key](value) for key, value in described.items() if key in kinds)
+    known = [one for one in listed if isinstance(one, dict) and set(keys) <= one.keys()]
+    return known == listed and all(parts[key](one[key]) for one in known for key in parts.keys() & one.keys())
+
+
+def _are_lines(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_line, value))
 
 
 def _is_line(value: object) -> bool:
