@@ -82,9 +82,14 @@ def result(tmp_path_factory):
     path = tmp_path_factory.mktemp("result") / "result.nc"
     made = synthetic_shots.result()
     results.save(made.assign(waveform=made["waveform"].clip(0, keep_attrs=True)), path)
-    once = functools.cache(netcdf.read_netcdf)
+    once = functools.cache(netcdf.read)
+
+    def read(given):
+        dataset, foreign = once(given)
+        return dataset.copy(), foreign
+
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(netcdf, "read_netcdf", lambda given: once(given).copy())
+        patched.setattr(netcdf, "read", read)
         yield path
 
 
