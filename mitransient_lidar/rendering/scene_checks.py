@@ -33,6 +33,9 @@ _HEIGHTS = 64
 #: Sum of the areas of a mesh over their absolute values, below which it is closed.
 _CLOSED = 1e-3
 
+#: Most shapes that are named of those out of view or outside the beam.
+_MOST_NAMED = 5
+
 #: Widths of the pulse and of the receiver's response that an echo lasts at most.
 _PULSES = 5.0
 
@@ -61,8 +64,13 @@ def check_scene(probe: Probe) -> None:
     _check_reflection(scene, view)
     _check_solids(probe)
     _warn_of_axes(scene, view, beam)
-    for solid in scene.solids:
-        _warn_of_place(solid, view, beam)
+    solids = scene.solids
+    out = [said for solid in solids if (said := _out_of_place(solid, view, beam))]
+    for said in out[:_MOST_NAMED]:
+        logger.warning(said)
+    if len(out) > _MOST_NAMED:
+        logger.warning("%d more shapes lie out of view or outside the beam", len(out) - _MOST_NAMED)
+    for solid in solids:
         _warn_of_inside_out(solid)
     for echo in probe.echoes.solids:
         _warn_of_time(probe, echo)
@@ -231,23 +239,19 @@ def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:
         )
 
 
-def _warn_of_place(solid: mi.Shape, view: Rays, beam: Rays) -> None:
-    """Warn of a solid that lies out of view or outside the beam."""
+def _out_of_place(solid: mi.Shape, view: Rays, beam: Rays) -> str:
+    """Return what to say of a solid that lies out of view or outside the beam; nothing of others."""
     z = float(solid.bbox().center().z)
     for rays, problem, name in ((view, "out of view", "receiver"), (beam, "outside the beam", "laser")):
         if rays.meets(solid) or not np.isfinite(axis := rays.axis_at_height(rays.middle_height(solid))).all():
             continue
-        logger.warning(
-            "shape %r lies %s: it is %.1f m from the %s's axis, which passes x = %.1f m, y = %.1f m at its height of "
-            "z = %.1f m; move the shape there, or the lidar by aim_x and aim_y",
-            solid.id(),
-            problem,
-            float(gaps(axis[None], solid)[0]),
-            name,
-            *rays.scene.receiver.pose.in_scene(axis),
-            z,
+        x, y = rays.scene.receiver.pose.in_scene(axis)
+        return (
+            f"shape {solid.id()!r} lies {problem}: it is {gaps(axis[None], solid)[0]:.1f} m from the {name}'s axis, "
+            f"which passes x = {x:.1f} m, y = {y:.1f} m at its height of z = {z:.1f} m; move the shape there, or the "
+            "lidar by aim_x and aim_y"
         )
-        return
+    return ""
 
 
 def _warn_of_inside_out(solid: mi.Shape) -> None:

@@ -104,6 +104,13 @@ def test_target_out_of_view_is_told_with_its_distance(lidar_scene, caplog, targe
     assert (x, y, z) == (pytest.approx(on_axis(z), abs=0.06), 0, target[2])
 
 
+def test_only_some_of_many_shapes_out_of_view_are_named(lidar_scene, caplog):
+    balls = {f"ball{number}": BALL | {"center": [30.0 + number, 0, -6]} for number in range(12)}
+    *named, last = check(lidar_scene(extra=balls), caplog)
+    assert len(named) == 5
+    assert last == "7 more shapes lie out of view or outside the beam"
+
+
 @pytest.mark.slow
 def test_seabed_in_map_coordinates_is_told(lidar_scene, caplog):
     """Its nearest corner is 500 m nearer in x and y than its centre."""
