@@ -154,6 +154,15 @@ def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool
     return image
 
 
+def as_seen(dataset: xr.Dataset) -> xr.Dataset:
+    """Return an image as seen from the lidar, row 0 far and column 0 left, whichever way a user has turned it."""
+    for dim, name in (("row", "angle_x"), ("column", "angle_y")):
+        angle = dataset.get(name)
+        if angle is not None and angle.sizes.get(dim, 1) > 1 and bool((angle.diff(dim) > 0).all()):
+            dataset = dataset.isel({dim: slice(None, None, -1)})
+    return dataset
+
+
 def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
     """Return the edges of an image [mrad]: left, the largest angle_y, right, near and far."""
     angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values

@@ -293,7 +293,8 @@ def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
     outline = _draw_field(ax, dataset.attrs, ground)
     if len(outline) == 0 or not np.isfinite(outline).all():
         return outline
-    energy = dataset["impulse_response"].sum("time").values
+    seen = drawing.as_seen(dataset)
+    energy = seen["impulse_response"].sum("time").values
     rows, columns = energy.shape
     left, right, near, far = drawing.image_extent(dataset)
     angles = np.meshgrid(np.linspace(far, near, rows + 1), np.linspace(left, right, columns + 1), indexing="ij")

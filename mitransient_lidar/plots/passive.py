@@ -67,7 +67,7 @@ def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
         raise UserError(f"cannot write {path}: the file name must end in .gif.")
     if dataset["radiance"].dims != ("frame", "row", "column"):
         raise UserError("an animation needs frames of an imager: render several frames of a layout with many pixels")
-    radiance = dataset["radiance"].values
+    radiance = drawing.as_seen(dataset)["radiance"].values
     low, high = _levels(radiance)
     grey = np.nan_to_num(255 * np.clip((radiance - low) / max(high - low, 1e-300), 0, 1)).astype(np.uint8)
     scale = max(1, -(-_ANIMATION_WIDTH // radiance.shape[2]))

@@ -158,7 +158,7 @@ def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
     for values in images.values():
         identity.update(values.tobytes())
     count = stack.sizes[kind.dim]
-    digits = kind.digits if count < 10**kind.digits else len(str(count - 1))
+    digits = kind.digits if count < 10**kind.digits else max(kind.digits + 1, len(str(count - 1)))
     parts = []
     for index in range(count):
         own: dict[str, Any] = {

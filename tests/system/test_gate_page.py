@@ -120,7 +120,7 @@ def test_gates(show, scene):
 
 @needs_browser
 def test_left_is_left_as_seen_from_the_lidar(show, scene):
-    """Angles to the left fall along the axis, also of an earlier version, with the right edge in column 0."""
+    """Angles to the left fall along the axis, also of a stack whose columns a user has turned."""
     stack, result = scene
     for one in (stack, stack.isel(column=slice(None, None, -1))):
         page = show(one, result)

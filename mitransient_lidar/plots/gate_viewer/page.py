@@ -121,6 +121,7 @@ def page_text(
     else:
         gated = check_stack(stack)
         record = _record(gated, stack if result is None and "waveform" in stack else result)
+        gated = drawing.as_seen(gated)
     frame = _frame()
     room = 1e6 * limit_mb - sum(len(piece.encode()) for piece in frame) - _room_for_metadata(gated)
     gates, waveforms = _fit(gated, record, room, limit_mb, is_record=is_record)
@@ -153,7 +154,7 @@ def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
         raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}.")
     # A result without angles is in the order of the stack.
     known = {name: stack[name].variable for name in ("angle_x", "angle_y") if name not in result.coords}
-    return result.assign_coords(known)
+    return drawing.as_seen(result.assign_coords(known))
 
 
 def _fit(

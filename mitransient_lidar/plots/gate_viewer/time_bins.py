@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.plots.drawing import as_seen
 from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import record_dims, time_axis
@@ -52,7 +53,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     arrays = {"waveform": (values, about), "waveform_stderr": (error, {})}
     order = (*pixels, "time")
     data = {key: (order, one.transpose(*order).values, text) for key, (one, text) in arrays.items()}
-    return xr.Dataset(data, own, dataset.attrs)
+    return as_seen(xr.Dataset(data, own, dataset.attrs))
 
 
 def time_bins(record: xr.Dataset) -> xr.Dataset:

@@ -12,6 +12,8 @@ from mitransient_lidar.plots.passive import animate_passive, plot_passive
 def test_animation_shows_the_frames_in_their_time(tmp_path):
     radiances = frames()
     animate_passive(radiances, tmp_path / "a.gif")
+    animate_passive(radiances.isel(column=slice(None, None, -1)), tmp_path / "turned.gif")
+    assert (tmp_path / "turned.gif").read_bytes() == (tmp_path / "a.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as movie:
         assert (movie.n_frames, movie.info["duration"], movie.info["loop"]) == (3, 250, 0)
         assert movie.size == (400, 320)  # 8 x 8 points a pixel, for a width of at least 384
