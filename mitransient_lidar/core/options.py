@@ -98,6 +98,9 @@ class Option:
             assert isinstance(self.low, int)
             assert isinstance(self.high, int)
             return integer(name, value, self.low, self.high)
+        # Errors of other limits would state what these functions allow.
+        assert self.low == 0 or not (self.above or self.high is None)
+        assert not self.above or self.high in (None, 1)
         if self.above:
             return positive(name, value) if self.high is None else relative_error(name, value)
         if self.high is None:
