@@ -142,12 +142,12 @@ def _moved(session, integrator, base, parameter, step):
     """Return the renderer of a scene with another value of a parameter, with bins, points and cells of the base."""
     name, value = parameter.name, parameter.value + step
     if name == RIPPLES:
-        moved = open_scene(session.record)
+        moved = open_scene(session.source)
         _scale_ripples(moved.scene, value / parameter.value)
     else:
         known = parameter_of(name)
         params = {known: with_value(session.parameters, name, value)[known]}
-        moved = open_scene(session.record, params, model=session.scene)
+        moved = open_scene(session.source, params, model=session.scene)
     return integrator.prepare(moved.scene, moved.sensor, layout_of=base)
 
 

@@ -18,8 +18,8 @@ from mitransient_lidar.loading.document import SceneDocument, read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_known, values_of
-from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import open_scene, read_record
+from mitransient_lidar.loading.scene_source import SceneSource
+from mitransient_lidar.loading.scenes import open_scene, read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
@@ -67,7 +67,7 @@ class Renderer(Protocol):
         """What is rendered, as JSON."""
 
     @property
-    def scene(self) -> SceneRecord:
+    def scene(self) -> SceneSource:
         """The scene."""
 
     @property
@@ -106,7 +106,7 @@ class RunRenderer:
     """
 
     campaign: Campaign
-    scene: SceneRecord
+    scene: SceneSource
     axis: TimeAxis | None = None
 
     #: Name of one that is rendered, and of what a store of them is.
@@ -118,7 +118,7 @@ class RunRenderer:
         Campaign.from_json(text)
 
     @classmethod
-    def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> RunRenderer:
+    def restored(cls, text: str, scene: SceneSource, axis: TimeAxis | None) -> RunRenderer:
         """Return the renderer of a stored campaign."""
         return cls(Campaign.from_json(text), scene, axis)
 
@@ -141,9 +141,9 @@ class RunRenderer:
         UserError
             If the scene cannot be loaded, or lacks a parameter that the campaign sets.
         """
-        record = record_of(campaign)
-        _check_parameters(campaign, columns, record.document())
-        return cls(campaign, record, cls(campaign, record)._longest_record(columns))
+        source = source_of(campaign)
+        _check_parameters(campaign, columns, source.document())
+        return cls(campaign, source, cls(campaign, source)._longest_record(columns))
 
     def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters of a run that are its own: those of the table, and the random sea."""
@@ -322,12 +322,12 @@ class RunRenderer:
         return find_lidar_scene(session.scene, session.sensor).axis
 
 
-def record_of(campaign: Campaign) -> SceneRecord:
-    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be read.
+def source_of(campaign: Campaign) -> SceneSource:
+    """Return the source of the scene of a campaign, with its instrument; raise `UserError` if it cannot be read.
 
     It is not loaded: files that are its defaults may be missing where the runs have others.
     """
-    return read_record(campaign.scene, campaign.fixed, campaign.instrument)
+    return read_source(campaign.scene, campaign.fixed, campaign.instrument)
 
 
 def check_names(campaign: Campaign) -> None:

@@ -30,7 +30,7 @@ from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer, require_memory
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
@@ -166,7 +166,7 @@ class Store:
         axis = self.attributes["record"]
         return self._renderer_type().restored(
             self.text,
-            SceneRecord.from_attributes(self.attributes["scene"]),
+            SceneSource.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
 
@@ -180,14 +180,14 @@ class Store:
         module, name, _ = _RENDERERS[self.kind]
         return getattr(importlib.import_module(module), name)
 
-    def is_of(self, kind: str, text: str, columns: Mapping[str, Column], scene: Callable[[], SceneRecord]) -> bool:
+    def is_of(self, kind: str, text: str, columns: Mapping[str, Column], scene: Callable[[], SceneSource]) -> bool:
         """Return whether it is the store of a campaign or flight with these columns, and of its scene as it is now."""
         if self.kind != kind or json.loads(self.text) != json.loads(text):
             return False
         own = self.inputs(slice(0, self.count))
         if own.keys() != columns.keys() or not all(np.array_equal(own[name], columns[name]) for name in own):
             return False
-        return scene().attributes() == SceneRecord.from_attributes(self.attributes["scene"]).attributes()
+        return scene().attributes() == SceneSource.from_attributes(self.attributes["scene"]).attributes()
 
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
-from mitransient_lidar.campaigns.runs import RunRenderer, check_names, record_of
+from mitransient_lidar.campaigns.runs import RunRenderer, check_names, source_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path
 from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, LARGEST_SHARD, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.versions import check_versions
@@ -178,7 +178,7 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
     columns = campaign.table()
     if path.exists():
         store = Store(path)
-        if not store.is_of("campaign", campaign.text, columns, lambda: record_of(campaign)):
+        if not store.is_of("campaign", campaign.text, columns, lambda: source_of(campaign)):
             raise UserError(
                 f"{path} holds another campaign, or its scene has changed: choose another place, or remove it"
             )

@@ -49,7 +49,7 @@ def _check_places(folder: Path, targets: list[Path]) -> None:
 def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
     """Return name and text of a scene, or of that of a result of a command and then its attributes."""
     from mitransient_lidar.loading.catalogue import scene_path, scene_text
-    from mitransient_lidar.loading.scene_record import SceneRecord
+    from mitransient_lidar.loading.scene_source import SceneSource
     from mitransient_lidar.rendering import again
 
     if not again.is_result(scene):
@@ -57,8 +57,8 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
     attributes = again.read_attributes(scene)
     if (kind := again.result_kind(attributes)) != command:
         raise UserError(f"{scene} is a result of the command {kind}: use {kind} to render it again")
-    record = SceneRecord.from_attributes(attributes)
-    return record.name, record.text, attributes
+    source = SceneSource.from_attributes(attributes)
+    return source.name, source.text, attributes
 
 
 def check_targets(output: Path, targets: list[Path], scene: str) -> None:

@@ -16,7 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray
 from mitransient_lidar.flights.plan import SAME_PLACE_M, FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses, poses_of
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.shots.series import FARTHEST
@@ -93,7 +93,7 @@ def input_columns(poses: PulsePoses) -> dict[str, Column]:
     return {name: column[order] for name, column in columns.items()}
 
 
-def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column]) -> tuple[TimeAxis, int]:
+def axis_of(plan: FlightPlan, source: SceneSource, inputs: Mapping[str, Column]) -> tuple[TimeAxis, int]:
     """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
 
     The number is that of pulses which meet the bottom beyond its height map.
@@ -110,7 +110,7 @@ def record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column
 
     angle, height, *aim = lidar_of(inputs)
     params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": aim[0], "aim_y": aim[1]}
-    session = open_scene(record, params)
+    session = open_scene(source, params)
     check_maps(plan, session.scene)
     lidar = find_lidar_scene(session.scene, session.sensor)
     if lidar.receiver.pixels.grid is not None:

@@ -24,9 +24,9 @@ from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.poses.times import tell_time_system
 from mitransient_lidar.flights.preparation import (
+    axis_of,
     input_columns,
     lidar_of,
-    record_of,
     shot_poses,
     tell_forecast,
     telling_errors_alone,
@@ -43,8 +43,8 @@ from mitransient_lidar.flights.recording import (
 )
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.loading.scenes import read_record
+from mitransient_lidar.loading.scene_source import SceneSource
+from mitransient_lidar.loading.scenes import read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.geometry import LinesOfSight
@@ -80,7 +80,7 @@ class FlightRenderer:
     """
 
     plan: FlightPlan
-    scene: SceneRecord
+    scene: SceneSource
     axis: TimeAxis | None
 
     #: Name of one that is rendered, and of what a store of them is.
@@ -92,7 +92,7 @@ class FlightRenderer:
         FlightPlan.from_json(text)
 
     @classmethod
-    def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> FlightRenderer:
+    def restored(cls, text: str, scene: SceneSource, axis: TimeAxis | None) -> FlightRenderer:
         """Return the renderer of a stored flight."""
         return cls(FlightPlan.from_json(text), scene, axis)
 
@@ -126,7 +126,7 @@ class FlightRenderer:
         with contextlib.ExitStack() as quiet:
             for number, group in enumerate(groups):
                 rows = np.flatnonzero(columns["group"] == group)
-                own, missed = record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
+                own, missed = axis_of(plan, scene, {name: column[rows] for name, column in columns.items()})
                 beyond += missed
                 start[rows] = own.start_ns
                 if longest is None or own.bin_count > longest.bin_count:
@@ -301,19 +301,19 @@ class FlightRenderer:
         return series, 1e9 / C0 * (further - further % width)
 
 
-def scene_of(plan: FlightPlan) -> SceneRecord:
-    """Return the record of the scene of a flight, with its instrument.
+def scene_of(plan: FlightPlan) -> SceneSource:
+    """Return the source of the scene of a flight, with its instrument.
 
     Raises
     ------
     UserError
         If it cannot be read, or lacks a parameter.
     """
-    record = read_record(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
+    source = read_source(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
     for name in POSE_PARAMETERS:
-        if name not in record.values:
+        if name not in source.values:
             raise UserError(f"scene {plan.scene} has no parameter {name}, which the flight sets")
-    return record
+    return source
 
 
 @functools.lru_cache(maxsize=2)

@@ -1,7 +1,7 @@
 """Documents of XML scenes: a tree of elements without includes, its parameters, and the values of its attributes.
 
-A scene goes one way: a document is read from a file or a record, an instrument may be mounted (`instruments.mount`),
-its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_record`),
+A scene goes one way: a document is read from a file or a source, an instrument may be mounted (`instruments.mount`),
+its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_source`),
 and Mitsuba loads it (`scenes.open_scene`). Each step takes the document of the step before.
 """
 

@@ -22,7 +22,7 @@ from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters, values_of
-from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
+from mitransient_lidar.loading.scene_source import SceneSource, plugin_values
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ logger = logging.getLogger(__name__)
 class LoadedScene:
     """A loaded scene, its name, all parameters of an XML scene with their values as text, and what loads it again.
 
-    The record is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
+    The source is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
     """
 
     scene: mi.Scene
     name: str
     parameters: dict[str, str]
-    record: SceneRecord | None = None
+    source: SceneSource | None = None
     sensor_id: str = ""
 
     @cached_property
@@ -54,7 +54,7 @@ class LoadedScene:
         """The receiver; raise UserError if the scene has none, or none of that id."""
         from mitransient_lidar.transport.scene_parts import lidar_sensor
 
-        return lidar_sensor(self.scene, self.sensor_id or (self.record.sensor if self.record else ""))
+        return lidar_sensor(self.scene, self.sensor_id or (self.source.sensor if self.source else ""))
 
     def attributes(
         self,
@@ -63,12 +63,12 @@ class LoadedScene:
         used: Mapping[str, float] | None = None,
         **others: Any,
     ) -> dict[str, Any]:
-        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
+        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_source`.
 
         ``record_end`` is what the last light of a record of automatic length comes from. `used` are the values that
         were chosen for automatic parameters of the integrator.
         """
-        recorded = {} if self.record is None else self.record.attributes()
+        again = {} if self.source is None else self.source.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
         chosen: list[Any] = [(integrator or self.scene.integrator(), used or {})]
         if lidar is not None:
@@ -76,8 +76,8 @@ class LoadedScene:
             bins = {"time_start_ns": lidar.axis.start_ns, "bin_count": lidar.axis.bin_count}
             chosen.append((film, {name: value for name, value in bins.items() if getattr(film, name) is None}))
             own |= {"record_end": lidar.record_end} if lidar.record_end else {}
-        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, chosen)
-        return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
+        again["plugin_parameters"] = plugin_values(self.scene, integrator, chosen)
+        return {"scene": self.name, **variants.versions(), **own, **others, **again}
 
     def tell_axis(self, axis: TimeAxis, end: str) -> None:
         """Log time bins, and what ends them, where the film leaves their start or number to the scene."""
@@ -101,7 +101,7 @@ def open_scene(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
+        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the source of a
         scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
     params
         Values for the parameters of an XML scene, its own (``<default>``) and those of its plugins, as of
@@ -113,13 +113,13 @@ def open_scene(
     model
         Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
     sensor
-        Id of a receiver, by default that of a record, or the first one.
+        Id of a receiver, by default that of a source, or the first one.
 
     Raises
     ------
     UserError
         If there is no such scene, instrument or receiver, a parameter is unknown, not used or empty, a value is
-        invalid, a part is missing, or a file of a record is missing or has changed.
+        invalid, a part is missing, or a file of a source is missing or has changed.
     """
     if isinstance(scene, LoadedScene) and not params and not sensor:
         return scene
@@ -134,17 +134,17 @@ def open_scene(
     if isinstance(scene, mi.Scene):
         _no_parameters(params, instrument, "a loaded scene")
         loaded = LoadedScene(scene, scene.id() or "scene", {})
-    elif is_dict or (isinstance(scene, SceneRecord) and not scene.is_xml):
+    elif is_dict or (isinstance(scene, SceneSource) and not scene.is_xml):
         _no_parameters(params, instrument, "a dict")
         loaded = _load_dict(scene)
-    elif isinstance(scene, (SceneRecord, str, os.PathLike)):
+    elif isinstance(scene, (SceneSource, str, os.PathLike)):
         loaded = _load_xml(scene, params, instrument)
     else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     fit_seas(loaded.scene, model)
     if sensor:
-        record = loaded.record and replace(loaded.record, sensor=sensor)
-        loaded = replace(loaded, record=record, sensor_id=lidar_sensor(loaded.scene, sensor).id())
+        source = loaded.source and replace(loaded.source, sensor=sensor)
+        loaded = replace(loaded, source=source, sensor_id=lidar_sensor(loaded.scene, sensor).id())
     return loaded
 
 
@@ -183,7 +183,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
         given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
         check_dict(given)
         # The files of objects in it, which no integrator of ours has, are checked as well.
-        SceneRecord.of_dict(given)
+        SceneSource.of_dict(given)
         with as_user_error():
             chosen = mi.load_dict(given, parallel=False)
     if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
@@ -200,13 +200,13 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     return chosen
 
 
-def read_record(
+def read_source(
     scene: str | os.PathLike[str],
     params: Mapping[str, Any] | None,
     instrument: str | None,
     origin: tuple[float, float] | None = None,
-) -> SceneRecord:
-    """Return the record of an XML scene with an instrument, and of its files with given parameters, without loading it.
+) -> SceneSource:
+    """Return the source of an XML scene with an instrument, and of its files with given parameters, without loading it.
 
     Its parameters have the values of the scene and the instrument. Where the scene has an origin in map coordinates
     [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments, and
@@ -215,8 +215,8 @@ def read_record(
     check_params(params)
     document = _document(scene, instrument)
     filled = _filled(document, params)
-    record = SceneRecord.of_document(filled if origin is None else _with_maps_about(filled, origin))
-    return replace(record, parameters=dict(document.parameters))
+    source = SceneSource.of_document(filled if origin is None else _with_maps_about(filled, origin))
+    return replace(source, parameters=dict(document.parameters))
 
 
 def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> SceneDocument:
@@ -242,9 +242,9 @@ def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> Sc
     return replace(changed) if placed else document
 
 
-def _document(scene: SceneRecord | str | os.PathLike[str], instrument: str | None) -> SceneDocument:
+def _document(scene: SceneSource | str | os.PathLike[str], instrument: str | None) -> SceneDocument:
     """Return the document of an XML scene, with the laser and the receiver of an instrument."""
-    document = scene.document() if isinstance(scene, SceneRecord) else read_document(scene_path(scene))
+    document = scene.document() if isinstance(scene, SceneSource) else read_document(scene_path(scene))
     return document if instrument is None else mount(instrument, document)
 
 
@@ -255,19 +255,19 @@ def _filled(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneD
     return filled
 
 
-def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
-    """Load a scene given as a dict, or its record."""
+def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
+    """Load a scene given as a dict, or its source."""
     import mitsuba as mi
 
-    given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
+    given = scene.scene_dict() if isinstance(scene, SceneSource) else scene
     check_dict(given)
-    # Of a record, too: its files are those that it names, not those that it lists.
-    found = SceneRecord.of_dict(given)
-    record = scene if isinstance(scene, SceneRecord) else found
+    # Of a source, too: its files are those that it names, not those that it lists.
+    found = SceneSource.of_dict(given)
+    source = scene if isinstance(scene, SceneSource) else found
     with as_user_error(), _own_file_resolver():
         described = {"type": "scene", **_with_own_tensors(given)}
         loaded = _instantiate(lambda config: mi.parser.parse_dict(config, described))
-    return LoadedScene(loaded, "scene", {}, record)
+    return LoadedScene(loaded, "scene", {}, source)
 
 
 def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,17 +283,17 @@ def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _load_xml(
-    scene: SceneRecord | str | os.PathLike[str], params: Mapping[str, Any] | None, instrument: str | None
+    scene: SceneSource | str | os.PathLike[str], params: Mapping[str, Any] | None, instrument: str | None
 ) -> LoadedScene:
     """Load an XML scene by the steps of `loading.document`."""
     import mitsuba as mi
 
     document = _filled(_document(scene, instrument), params)
-    record = SceneRecord.of_document(document, scene if isinstance(scene, SceneRecord) else None)
-    text = record.place_files(document)
+    source = SceneSource.of_document(document, scene if isinstance(scene, SceneSource) else None)
+    text = source.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
-    return LoadedScene(loaded, document.name, values_of(document), record)
+    return LoadedScene(loaded, document.name, values_of(document), source)
 
 
 def _instantiate(parse: Callable[[Any], Any]) -> Any:

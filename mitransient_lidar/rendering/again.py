@@ -17,7 +17,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.parameters import check_params
-from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
+from mitransient_lidar.loading.scene_source import SceneSource, json_attribute
 from mitransient_lidar.rendering.options import KEPT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
 
@@ -77,7 +77,7 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     kind = result_kind(attributes)
     given = {name: value for name, value in options.items() if value is not None}
     folder = None if isinstance(result, xr.Dataset) else Path(result).parent
-    scene = SceneRecord.from_attributes(attributes, folder)
+    scene = SceneSource.from_attributes(attributes, folder)
     own = {name: _held(attributes, KEPT[name]) for name in _RECORDED[kind]}
     compare_versions(attributes)
     if kind == "shots":

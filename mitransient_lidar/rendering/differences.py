@@ -107,7 +107,7 @@ class Differences:
         steps: Mapping[str, float] | None = None,
         renderer: PassRenderer | None = None,
     ) -> None:
-        if session.record is None or not session.record.is_xml:
+        if session.source is None or not session.source.is_xml:
             raise UserError(f"derivatives by {', '.join(names)} need an XML scene, whose parameters can be changed")
         if others := [name for name in steps or {} if name not in names]:
             raise UserError(f"steps: {others[0]!r} is not among the parameters {', '.join(names)}")
@@ -139,7 +139,7 @@ class Differences:
         model, known = self._model, parameter_of(name)
         params = {known: with_value(model.parameters, name, value + step)[known]}
         try:
-            moved = open_scene(model.record, params, model=model.scene)
+            moved = open_scene(model.source, params, model=model.scene)
             renderer = self._integrator.prepare(moved.scene, moved.sensor, layout_of=self._base)
         except UserError as error:
             raise UserError(

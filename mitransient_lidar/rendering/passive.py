@@ -18,7 +18,7 @@ from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checke
 from mitransient_lidar.core.validation import FloatArray, require_memory, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.rendering.accuracy import RatioStatistics
@@ -232,7 +232,7 @@ def _render_frame(
 
 def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:
     """Return scene and parameters with the sea at a later time [s]."""
-    if isinstance(scene, SceneRecord) and not scene.is_xml:
+    if isinstance(scene, SceneSource) and not scene.is_xml:
         scene = scene.scene_dict()
     if isinstance(scene, Mapping):
         moved = {name: copy.copy(part) if isinstance(part, dict) else part for name, part in scene.items()}
@@ -242,7 +242,7 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
         if not seas:
             raise UserError("frames need an ocean_surface in the scene: nothing else changes with time")
         return moved, params
-    if isinstance(scene, SceneRecord):
+    if isinstance(scene, SceneSource):
         defaults = scene.values
     elif isinstance(scene, (str, os.PathLike)):
         defaults = catalogue.scene_parameters(scene, by_id=True)

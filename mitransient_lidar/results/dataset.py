@@ -4,7 +4,7 @@ A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per b
 standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
 time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
 the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes,
-among them the scene and all parameters of its plugins (`loading.scene_record`), from which it can be rendered again. A
+among them the scene and all parameters of its plugins (`loading.scene_source`), from which it can be rendered again. A
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
 by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
 by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and

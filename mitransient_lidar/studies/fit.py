@@ -29,7 +29,7 @@ from mitransient_lidar.core.parameters.water import LAYERED_WATER
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import MOST_PASSES
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -221,7 +221,7 @@ class _RenderedModel:
 
     def __init__(
         self,
-        scene: str | os.PathLike[str] | SceneRecord,
+        scene: str | os.PathLike[str] | SceneSource,
         params: Mapping[str, Any] | None,
         instrument: str | None,
         names: Sequence[str],
@@ -234,8 +234,8 @@ class _RenderedModel:
         self.between_bins = between_bins
         self.scene, self.params, self.instrument = scene, dict(params or {}), instrument
         self.names, self.passes, self.seed, self.progress = list(names), passes, seed, progress
-        own = scene.values if isinstance(scene, SceneRecord) else scene_parameters(scene, by_id=True)
-        self.name = scene.name if isinstance(scene, SceneRecord) else Path(scene).stem
+        own = scene.values if isinstance(scene, SceneSource) else scene_parameters(scene, by_id=True)
+        self.name = scene.name if isinstance(scene, SceneSource) else Path(scene).stem
         self.texts = {**own, **{name: str(value) for name, value in self.params.items()}}
         self.done, self.began = 0, time.perf_counter()
 
@@ -316,13 +316,13 @@ def _names(free: Sequence[str]) -> list[str]:
     return names
 
 
-def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) -> str | os.PathLike[str] | SceneRecord:
+def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) -> str | os.PathLike[str] | SceneSource:
     """Return the scene, or that of a result."""
     if scene is not None:
         return scene
     if not attributes:
         raise UserError("scene is missing: waveforms of a table do not hold theirs")
-    return SceneRecord.from_attributes(attributes)
+    return SceneSource.from_attributes(attributes)
 
 
 def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:

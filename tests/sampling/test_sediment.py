@@ -8,7 +8,7 @@ import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 from significance import assert_distribution, largest_z
 
-from mitransient_lidar.loading.scene_record import object_values
+from mitransient_lidar.loading.scene_source import object_values
 from mitransient_lidar.physics.water.sediments import HapkeSurface
 
 OBLIQUE = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])

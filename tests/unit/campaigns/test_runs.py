@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
-from mitransient_lidar.campaigns.runs import RunRenderer, record_of
+from mitransient_lidar.campaigns.runs import RunRenderer, source_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
@@ -49,7 +49,7 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
     )
     np.save(tmp_path / "map.npy", np.full((3, 3), -5.0))
     fixed = {"map_file": str(tmp_path / "map.npy")}
-    record = record_of(Campaign.of({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
+    record = source_of(Campaign.of({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
     assert record.parameters == {"map_file": "nowhere.npy"}
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "map.npy")]
 
@@ -77,7 +77,7 @@ def asked(monkeypatch):
 
 def test_what_is_asked_of_a_run(asked):
     campaign, _columns = planned({"bottom_depth": [3.0, 4.0]}, kind="random", count=5, shots=40, seed=2)
-    runs = RunRenderer(campaign, record_of(campaign), TimeAxis(1300, 1, 300))
+    runs = RunRenderer(campaign, source_of(campaign), TimeAxis(1300, 1, 300))
     for number in (3, 4, 3):
         runs.series(number, {"bottom_depth": 4.0})
     (_, params, first), (_, _, other), (_, again, same) = asked
@@ -104,7 +104,7 @@ def test_time_of_a_run_without_all_shots_is_refused(monkeypatch):
         return xr.Dataset(coords={"shot": np.arange(3)})
 
     monkeypatch.setattr("mitransient_lidar.campaigns.runs.render_shots", render_shots)
-    runs = RunRenderer(campaign, record_of(campaign), TimeAxis(1300, 1, 300))
+    runs = RunRenderer(campaign, source_of(campaign), TimeAxis(1300, 1, 300))
     with pytest.raises(UserError, match=r"^max_time = 2 s ended after 3 of 4 shots of the run: it must be longer$"):
         runs.arrays(0, {"bottom_depth": 3.0})
     assert asked == [2.0]

@@ -27,7 +27,7 @@ from mitransient_lidar.campaigns.store import (
 from mitransient_lidar.campaigns.sweep import describe_campaign
 from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
@@ -55,7 +55,7 @@ def path(tmp_path):
     return tmp_path / "campaign.zarr"
 
 
-RECORD = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
+RECORD = SceneSource("table1", "<scene/>", True, {"time": "0"}, {})
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def test_a_given_start_of_the_gates_replaces_that_of_the_scene():
     opened = open_scene("gated_mine", {**FLAT, "layout": "2x2", "gate_start_ns": 1500})
     assert opened.scene.sensors()[0].film().gates.start_ns == 1500
     assert opened.parameters["gate_start_depth"] == ""
-    assert open_scene(opened.record).parameters == opened.parameters
+    assert open_scene(opened.source).parameters == opened.parameters
 
 
 @pytest.mark.parametrize(

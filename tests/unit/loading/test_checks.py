@@ -13,7 +13,7 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 
 #: A library outside, reached from each folder in which Mitsuba looks for plugins.
@@ -60,7 +60,7 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
 )
 def test_damaged_records_are_refused(attributes, message):
     with pytest.raises(UserError, match=message):
-        open_scene(SceneRecord.from_attributes(attributes))
+        open_scene(SceneSource.from_attributes(attributes))
 
 
 def stranger(folder, name, text):
@@ -87,7 +87,7 @@ def test_includes_in_results_are_refused(tmp_path, tag):
     part = stranger(tmp_path, "part.xml", PART)
     text = f'<scene version="3.0.0"><{tag} filename="{part}"/></scene>'
     with pytest.raises(UserError, match=r"includes .*part.xml': only the file of a scene may include others"):
-        open_scene(SceneRecord.from_attributes({"scene_xml": text}))
+        open_scene(SceneSource.from_attributes({"scene_xml": text}))
 
 
 def test_a_part_that_is_an_include_is_refused(tmp_path):
@@ -116,7 +116,7 @@ def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
     scene = {"type": "scene", "folder": {"type": "resources", "path": str(tmp_path)}, "shape": {"type": "evil"}}
-    record = SceneRecord.from_attributes({"scene_dict": json.dumps(scene)})
+    record = SceneSource.from_attributes({"scene_dict": json.dumps(scene)})
     for one in (scene, record):
         with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
             open_scene(one)
@@ -175,7 +175,7 @@ def test_a_dict_with_tensors_is_loaded_twice():
 def test_the_name_of_the_scene_of_a_result_is_that_of_a_file(name):
     """Files of the result's repetition begin with it: a path led out of the folder of ``-o``."""
     with pytest.raises(UserError, match=r"the attribute scene = .* of the result is damaged") as caught:
-        SceneRecord.from_attributes({"scene": name, "scene_xml": "<scene/>"})
+        SceneSource.from_attributes({"scene": name, "scene_xml": "<scene/>"})
     assert str(caught.value).isprintable()
 
 
@@ -197,7 +197,7 @@ def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
         with pytest.raises(UserError, match=f"pipe{folder}: it is a named pipe"):
             open_scene(tmp_path / "a.xml")
     given = {"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}}
-    for one in (given, SceneRecord.from_attributes({"scene_dict": json.dumps(given)})):
+    for one in (given, SceneSource.from_attributes({"scene_dict": json.dumps(given)})):
         with pytest.raises(UserError, match="pipehere: it is a named pipe"):
             open_scene(one)
     with pytest.raises(UserError, match="pipehere: it is a named pipe"):

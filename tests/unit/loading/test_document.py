@@ -232,10 +232,10 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
     own.write_text(text)
     for given in (path.name, str(path)):
         loaded = scenes.open_scene(own, {"file": given})
-        for again in (loaded, scenes.open_scene(loaded.record)):
+        for again in (loaded, scenes.open_scene(loaded.source)):
             assert again.scene.shapes()[0].parameters["filename"] == str(path)
             assert again.scene.bbox().max.z == pytest.approx(-6)
-            assert again.record.parameters["file"] == given
+            assert again.source.parameters["file"] == given
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
     with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
         scenes.open_scene(own)

@@ -114,7 +114,7 @@ def test_the_scene_keeps_gates_integrator_place_and_target():
     loaded = scenes.open_scene("gated_mine", params, "riegl_vq840g")
     assert loaded.parameters["gate_count"] == "20"
     assert loaded.parameters["aim_y"] == "3"
-    assert loaded.record.instrument == "riegl_vq840g"
+    assert loaded.source.instrument == "riegl_vq840g"
     assert loaded.scene.integrator().parameters["cell_size"] == 0.015
     assert {"blur_mrad", "field_of_view_shape"}.isdisjoint(loaded.parameters)
     film = loaded.scene.sensors()[0].film()

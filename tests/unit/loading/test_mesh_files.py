@@ -10,7 +10,7 @@ from array_inputs import mesh
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.mesh_files import check_ply
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 
 
@@ -52,13 +52,13 @@ def test_faces_without_a_vertex_are_refused(square, index):
 def test_the_mesh_of_a_result_is_checked(square):
     """Its SHA-256 is right: whoever makes the result makes the mesh."""
     good = {"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}
-    record = SceneRecord.of_dict(good)
+    record = SceneSource.of_dict(good)
     with_index(square, 4)
     digest = hashlib.sha256(square.read_bytes()).hexdigest()
     rows = [{"plugin": "ply", "name": str(square), "path": str(square), "sha256": digest}]
     changed = {**record.attributes(), "scene_files": json.dumps(rows)}
     with pytest.raises(UserError, match="has a face with the vertex 4"):
-        open_scene(SceneRecord.from_attributes(changed))
+        open_scene(SceneSource.from_attributes(changed))
 
 
 @pytest.mark.parametrize(

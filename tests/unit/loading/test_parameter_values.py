@@ -117,7 +117,7 @@ def test_results_state_the_parameters_of_plugins(tmp_path):
     assert not {"attenuation", "kd", "sea_wind_speed", "seabed_depth"} & found.keys()
     assert value_of(loaded.parameters, "seabed.depth") == 6
     assert value_of(loaded.parameters, "bottom_depth") == value_of(loaded.parameters, "depth") == 6
-    assert open_scene(loaded.record).parameters == loaded.parameters
+    assert open_scene(loaded.source).parameters == loaded.parameters
 
 
 def test_values_that_plugins_have_are_the_defaults():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 
 NUMBERS = np.random.default_rng(1).random((4, 4, 4, 1), np.float32)
@@ -36,7 +36,7 @@ def test_textures_of_python_are_restored(texture):
     """They were not stored, so that no result of such a scene was rendered again."""
     solid = {"type": "cube", "to_world": BOX, "bsdf": {"type": "diffuse", "reflectance": texture}}
     loaded = open_scene({"solid": solid})
-    again = open_scene(SceneRecord.from_attributes(loaded.record.attributes()))
+    again = open_scene(SceneSource.from_attributes(loaded.source.attributes()))
     values = [dict(mi.traverse(one.scene)) for one in (loaded, again)]
     assert list(values[0]) == list(values[1])
     for name, value in values[0].items():
@@ -46,7 +46,7 @@ def test_textures_of_python_are_restored(texture):
 def test_a_grid_of_distances_is_restored():
     grid = {"type": "sdfgrid", "grid": mi.TensorXf(NUMBERS - 0.5), "to_world": BOX}
     loaded = open_scene({"solid": grid})
-    again = open_scene(SceneRecord.from_attributes(loaded.record.attributes()))
+    again = open_scene(SceneSource.from_attributes(loaded.source.attributes()))
     found = [np.array(mi.traverse(one.scene)["solid.grid"]) for one in (loaded, again)]
     np.testing.assert_array_equal(*found)
 
@@ -54,10 +54,10 @@ def test_a_grid_of_distances_is_restored():
 def test_large_images_and_damaged_ones_are_refused():
     noise = np.random.default_rng(1).random((600, 600, 1), np.float32)
     scene = {"type": "bitmap", "bitmap": mi.Bitmap(noise), "raw": True}
-    assert SceneRecord.of_dict({"image": scene}) is None
+    assert SceneSource.of_dict({"image": scene}) is None
     scene["bitmap"] = mi.Bitmap(NUMBERS[0])
-    stored = json.loads(SceneRecord.of_dict({"image": scene}).text)
+    stored = json.loads(SceneSource.of_dict({"image": scene}).text)
     for damage in ({"data": "AAAA"}, {"shape": [5, 5, 1]}, {"dtype": "O"}, {"pixel_format": "None"}, {"data": "*"}):
         text = json.dumps({"image": {**scene, "bitmap": {**stored["image"]["bitmap"], **damage}}})
         with pytest.raises(UserError, match="the scene of the result is damaged"):
-            open_scene(SceneRecord.from_attributes({"scene_dict": text}))
+            open_scene(SceneSource.from_attributes({"scene_dict": text}))

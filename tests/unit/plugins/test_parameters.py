@@ -12,7 +12,7 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import PLUGINS as DECLARED
-from mitransient_lidar.loading.scene_record import object_values, plugin_values
+from mitransient_lidar.loading.scene_source import object_values, plugin_values
 from mitransient_lidar.loading.scenes import as_user_error
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 

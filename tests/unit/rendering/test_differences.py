@@ -137,7 +137,7 @@ def test_the_sea_of_a_changed_scene_has_the_same_cells_and_waves():
         return np.array(mesh.vertex_positions_buffer())
 
     own, same = (
-        open_scene(session.record, {"divergence_mrad": 20}, model=model).scene for model in (None, session.scene)
+        open_scene(session.source, {"divergence_mrad": 20}, model=model).scene for model in (None, session.scene)
     )
     assert np.array_equal(vertices(same), vertices(session.scene))
     assert not np.array_equal(vertices(own), vertices(session.scene))
@@ -148,7 +148,7 @@ def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
     session = open_scene("fig02_mine", {"spectrum": "flat", "surface_size": 1000})
     integrator = choose_integrator(session.scene, FEW)
     base = integrator.prepare(session.scene, session.sensor)
-    moved = open_scene(session.record, {"target_depth": 8.9}, model=session.scene)
+    moved = open_scene(session.source, {"target_depth": 8.9}, model=session.scene)
     renderer = integrator.prepare(moved.scene, moved.sensor, layout_of=base)
     layout = renderer.layout
     shift, points = (
@@ -175,7 +175,7 @@ def test_cells_go_with_the_surfaces_and_the_beam_that_is_refracted():
     session = open_scene("table1", {"spectrum": "flat", "surface_size": 1000})
     integrator = choose_integrator(session.scene, FEW)
     base = integrator.prepare(session.scene, session.sensor)
-    moved = open_scene(session.record, {"surface_slope_x_deg": 2, "bottom_depth": 8.5}, model=session.scene)
+    moved = open_scene(session.source, {"surface_slope_x_deg": 2, "bottom_depth": 8.5}, model=session.scene)
     cells = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout.cells
     rings, x, y = cells.rings, mi.Float(-1.5, 0.2, 2), mi.Float(0.5, 0, -1)
     height, slope = cells.heights.surface_at(x, y)

@@ -59,7 +59,7 @@ _MOST_VALUES = 16
 
 
 @dataclass(frozen=True)
-class SceneRecord:
+class SceneSource:
     """What loads a scene again.
 
     Parameters
@@ -89,8 +89,8 @@ class SceneRecord:
     sensor: str = ""
 
     @classmethod
-    def of_document(cls, document: SceneDocument, former: SceneRecord | None = None) -> SceneRecord:
-        """Return the record of an XML scene, with the files of the record that it was read from.
+    def of_document(cls, document: SceneDocument, former: SceneSource | None = None) -> SceneSource:
+        """Return the source of an XML scene, with the files of the source that it was read from.
 
         Files that given parameters name are found as in any scene. Raises UserError for a file that is no regular one,
         or a damaged mesh.
@@ -102,8 +102,8 @@ class SceneRecord:
         return cls(document.name, document.text, True, dict(document.parameters), files, document.instrument, sensor)
 
     @classmethod
-    def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
-        """Return the record of a scene given as a dict, None if it holds loaded objects or other unknown values.
+    def of_dict(cls, scene: Mapping[str, Any]) -> SceneSource | None:
+        """Return the source of a scene given as a dict, None if it holds loaded objects or other unknown values.
 
         Raises UserError as `of_document`.
         """
@@ -114,8 +114,8 @@ class SceneRecord:
             return None
 
     @classmethod
-    def from_attributes(cls, attributes: Mapping[str, Any], folder: Path | None = None) -> SceneRecord:
-        """Return the record that `attributes` has written.
+    def from_attributes(cls, attributes: Mapping[str, Any], folder: Path | None = None) -> SceneSource:
+        """Return the source that `attributes` has written.
 
         A file that is missing or has changed is looked for by its name and SHA-256 in the `folder` of the result, and
         in the working folder.
@@ -161,7 +161,7 @@ class SceneRecord:
         return values_of(self.document()) if self.is_xml else {}
 
     def attributes(self) -> dict[str, str]:
-        """Return the attributes of a result from which `from_attributes` returns this record."""
+        """Return the attributes of a result from which `from_attributes` returns this source."""
         values = values_of(self.document(), by_id=False) if self.is_xml else {}
         given = {**{name: value for name, value in values.items() if value}, **self.parameters}
         described = {f"scene.{name}": value for name, value in given.items()}
