@@ -76,7 +76,7 @@ class Call:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """Let sentences of errors name options where they state parameters with values, or begin with one."""
+        """Name parameters in errors as the options that the user typed, where they have a value or begin the text."""
         try:
             yield
         except UserError as error:

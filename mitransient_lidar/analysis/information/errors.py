@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray, FloatArray
+from mitransient_lidar.physics.receiver.electronics import Digitiser
 
 _DEGENERATE = 0.999  # correlation of two parameters above which only one combination of them is known
 _SMOOTHED = 9  # samples over which variances are smoothed
+_TERMS = 20  # of the series of errors by rounding
 #: Said where errors are too small, because nothing tells how those of far samples agree.
 NO_BATCHES = (
     "stated errors are too small: errors of a render agree over its whole record, and neither the waveforms nor the "
@@ -296,3 +298,20 @@ def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
                 element += correlation[lag] * deviation[:, lag:] * deviation[:, : count - lag]
         total += (1 if lag == 0 else 2) * float(np.sum(element**2))
     return total
+
+
+def noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int) -> FloatArray:
+    """Return the variance of the mean of records from that of one record.
+
+    Rounding errs alike in all records where the noise before it is less than half a step. The mean square of this
+    error, over voltages within a step q with noise of the variance s^2, is q^2 / (2 pi^2) times the sum over k = 1, 2,
+    ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
+    doi:10.1017/CBO9780511754661), which is q^2/12 without noise.
+    """
+    if digitiser is None or shots == 1:
+        return variance / shots
+    step = digitiser.step_v**2
+    exponent = 4 * np.pi**2 * np.maximum(variance / step - 1 / 12, 0)
+    terms = np.arange(1, _TERMS + 1)
+    alike = np.exp(-np.multiply.outer(exponent, terms**2)) @ (1 / terms**2)
+    return np.asarray(np.maximum(variance / shots, step / (2 * np.pi**2) * alike))

@@ -15,12 +15,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.information.errors import smoothed_variance
+from mitransient_lidar.analysis.information.errors import noise_of_mean, smoothed_variance
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, positive, shown
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
-from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
@@ -29,7 +28,6 @@ from mitransient_lidar.results.variables import described
 
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
-_TERMS = 20  # of the series of errors by rounding
 _SATURATED = 1e-3  # probability of saturation above which a sample is left out
 
 
@@ -266,7 +264,7 @@ def _recorded(
         count = len(steps)
         rise = expected.mean[2 : 2 + count] - expected.mean[2 + count : 2 + 2 * count]
         slope = np.divide(rise, 2 * reach[:, pixel], out=np.zeros_like(rise), where=reach[:, pixel] > 0)
-        noise = _noise_of_mean(expected.variance[0], chain.digitiser, shots)
+        noise = noise_of_mean(expected.variance[0], chain.digitiser, shots)
         level = expected.mean[-1] if receiver.above_dark else 0.0
         one = expected.mean[0] - level, slope, (expected.mean[1] - expected.mean[0]) ** 2, noise
         moved = expected.mean[2 + 2 * count : -1] - expected.mean[0]
@@ -283,23 +281,6 @@ def _recorded(
         lags[::stride],
         None if batches is None else np.stack(moved, axis=1),
     )
-
-
-def _noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int) -> FloatArray:
-    """Return the variance of the mean of records from that of one record.
-
-    Rounding errs alike in all records where the noise before it is less than half a step. The mean square of this
-    error, over voltages within a step q with noise of the variance s^2, is q^2 / (2 pi^2) times the sum over k = 1, 2,
-    ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
-    doi:10.1017/CBO9780511754661), which is q^2/12 without noise.
-    """
-    if digitiser is None or shots == 1:
-        return variance / shots
-    step = digitiser.step_v**2
-    exponent = 4 * np.pi**2 * np.maximum(variance / step - 1 / 12, 0)
-    terms = np.arange(1, _TERMS + 1)
-    alike = np.exp(-np.multiply.outer(exponent, terms**2)) @ (1 / terms**2)
-    return np.asarray(np.maximum(variance / shots, step / (2 * np.pi**2) * alike))
 
 
 def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:

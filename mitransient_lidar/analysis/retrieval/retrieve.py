@@ -31,14 +31,11 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
-from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import (
-    LinesOfSight,
     lidar_geometry,
     lidar_system,
-    optional_number,
     required_number,
     share_in_view,
     spot_diameter,
@@ -46,7 +43,6 @@ from mitransient_lidar.results.geometry import (
 from mitransient_lidar.results.variables import flagged, label
 
 _LOG = logging.getLogger(__name__)
-_STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
 
 
 def surface_slopes(
@@ -115,7 +111,7 @@ def surface_slopes(
     time, error = (surface[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
     light = surface_inputs.pixel_light(dataset)
     plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error, facets=facets)
-    refused, limit = np.zeros(len(time), dtype=bool), _steepest_sea(dataset)
+    refused, limit = np.zeros(len(time), dtype=bool), surface_inputs.steepest_sea(dataset)
     wind = None if slope_deviation is not None else surface_inputs.wind(dataset, wind_speed, wind_direction_deg)
     if wind is not None:
         scale = surface_inputs.energy_scale(dataset, efficiency)
@@ -172,12 +168,6 @@ def surface_slopes(
     found = _labelled(dataset, table, shape)
     found = found.assign_attrs(slope_method=method, slope_prior_deviation=[float(one) for one in prior])
     return found.assign_attrs({"steepest_slope": limit}) if math.isfinite(limit) else found
-
-
-def _steepest_sea(dataset: xr.Dataset) -> float:
-    """Return the largest slope [1] that the sea can have in one direction, infinite if its slopes are unknown."""
-    variance = optional_number(dataset.attrs, "surface_slope_variance")
-    return math.inf if variance is None else _STEEPEST * math.sqrt(0.5 * variance)
 
 
 def bottom(
@@ -237,7 +227,7 @@ def bottom(
     known.
     """
     lidar = lidar_geometry(dataset.attrs)
-    summed = _summed(dataset)
+    summed = surface_inputs.summed_pixels(dataset)
     echoes = echo_table.extract(summed, depth_from="mean", layers=2).isel(pixel=0)
     margin = 0.5 * float(echoes.attrs["echo_fwhm_ns"]) * lidar.depth_per_ns
     flags, hidden = bottom_errors.target_flags(echoes, dataset.attrs, margin, one_place="shot" not in echoes.dims)
@@ -369,7 +359,7 @@ def water(
         If the view is too narrow, the dataset lacks an attribute or a number is out of range.
     """
     lidar = lidar_geometry(dataset.attrs)
-    summed = _summed(dataset)
+    summed = surface_inputs.summed_pixels(dataset)
     end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
     factor = None if phase_factor is None else positive("phase_factor", phase_factor)
     in_range("spot_diameter", spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
@@ -485,26 +475,6 @@ def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
     prior = [float(one) for one in surface_inputs.largest_deviations(dataset)]
     found = _labelled(dataset, table, np.shape(time))
     return found.assign_attrs(slope_method="no times of other pixels", slope_prior_deviation=prior)
-
-
-def _summed(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with the sum of its pixels as the only pixel."""
-    if "waveform" not in dataset:
-        raise UserError("the dataset has no waveform: the energy of echoes needs a result in W")
-    if "pixel" not in dataset["waveform"].dims:
-        raise UserError(f"waveform has the dimensions {dataset['waveform'].dims}; they must be pixel and time, or shot")
-    summed = dataset[["waveform"]].sum("pixel")
-    if sum_errors.VARIABLE in dataset:
-        summed[sum_errors.VARIABLE] = dataset[sum_errors.VARIABLE]
-    if "waveform_stderr" in dataset:
-        summed["waveform_stderr"] = (dataset["waveform_stderr"] ** 2).sum("pixel") ** 0.5
-    summed = summed.expand_dims(pixel=["all"]).transpose(..., "pixel", "time")
-    summed["waveform"].attrs.update(dataset["waveform"].attrs)
-    if "surface_time" in dataset.coords and "shot" not in dataset["surface_time"].dims:
-        summed = summed.assign_coords(LinesOfSight.from_dataset(dataset).combined().coordinates(("pixel",), (1,)))
-    if "shot" in summed.dims and "shot" not in summed.coords:
-        summed = summed.assign_coords(shot=np.arange(summed.sizes["shot"]))
-    return summed.assign_attrs(dataset.attrs)
 
 
 def _labelled(

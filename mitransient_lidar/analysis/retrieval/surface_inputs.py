@@ -15,9 +15,11 @@ from mitransient_lidar.core.validation import FloatArray, finite
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import lidar_system, pose_of, required_number
+from mitransient_lidar.results import sum_errors
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_system, optional_number, pose_of, required_number
 
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
+_STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
 
 
 def pixel_light(dataset: xr.Dataset) -> PixelLight:
@@ -107,3 +109,29 @@ def outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:
     """Return the outlines of the pixels of a result [rad]; an empty list without them."""
     lines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
     return [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in lines]
+
+
+def steepest_sea(dataset: xr.Dataset) -> float:
+    """Return the largest slope [1] that the sea can have in one direction, infinite if its slopes are unknown."""
+    variance = optional_number(dataset.attrs, "surface_slope_variance")
+    return math.inf if variance is None else _STEEPEST * math.sqrt(0.5 * variance)
+
+
+def summed_pixels(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with the sum of its pixels as the only pixel."""
+    if "waveform" not in dataset:
+        raise UserError("the dataset has no waveform: the energy of echoes needs a result in W")
+    if "pixel" not in dataset["waveform"].dims:
+        raise UserError(f"waveform has the dimensions {dataset['waveform'].dims}; they must be pixel and time, or shot")
+    summed = dataset[["waveform"]].sum("pixel")
+    if sum_errors.VARIABLE in dataset:
+        summed[sum_errors.VARIABLE] = dataset[sum_errors.VARIABLE]
+    if "waveform_stderr" in dataset:
+        summed["waveform_stderr"] = (dataset["waveform_stderr"] ** 2).sum("pixel") ** 0.5
+    summed = summed.expand_dims(pixel=["all"]).transpose(..., "pixel", "time")
+    summed["waveform"].attrs.update(dataset["waveform"].attrs)
+    if "surface_time" in dataset.coords and "shot" not in dataset["surface_time"].dims:
+        summed = summed.assign_coords(LinesOfSight.from_dataset(dataset).combined().coordinates(("pixel",), (1,)))
+    if "shot" in summed.dims and "shot" not in summed.coords:
+        summed = summed.assign_coords(shot=np.arange(summed.sizes["shot"]))
+    return summed.assign_attrs(dataset.attrs)

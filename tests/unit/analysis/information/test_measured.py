@@ -8,8 +8,8 @@ from scipy.special import ndtr
 from significance import largest_z
 
 from mitransient_lidar import results
+from mitransient_lidar.analysis.information.errors import noise_of_mean
 from mitransient_lidar.analysis.information.measured import (
-    _noise_of_mean,
     batch_deviations,
     correlation,
     measured,
@@ -117,8 +117,8 @@ def test_noise_of_the_mean_of_many_records_holds_rounding(noise):
     upper, lower = (ndtr((codes + edge - volts[:, np.newaxis]) / max(noise, 1e-9)) for edge in (0.5, -0.5))
     wanted = np.mean(((upper - lower) @ codes - volts) ** 2)
     variance = np.array([noise**2 + 1 / 12])
-    assert _noise_of_mean(variance, converter, 10**6)[0] == pytest.approx(max(wanted, variance[0] / 1e6), rel=0.05)
-    assert _noise_of_mean(variance, converter, 1) == variance
+    assert noise_of_mean(variance, converter, 10**6)[0] == pytest.approx(max(wanted, variance[0] / 1e6), rel=0.05)
+    assert noise_of_mean(variance, converter, 1) == variance
 
 
 def in_batches(dataset, deviations, passes):
