@@ -30,7 +30,7 @@ FRAME_ORIGIN = "_frame_origin"
 _OPTICS = tuple(each.name for each in fields(ReceiverOptics))
 
 
-class RecordedProperties(mi.Properties):
+class DeclaredProperties(mi.Properties):
     """Copy of a plugin's parameters that keeps each value that is read, the default where none is given.
 
     Parameters whose value may be an empty text are removed where it is: they count as not given. Two ways to describe
@@ -49,7 +49,7 @@ class RecordedProperties(mi.Properties):
             if parameter.may_be_empty and parameter.name in self and super().get(parameter.name) == "":
                 del self[parameter.name]
         ways = {name for several in plugin.alternatives for way in several for name in way}
-        given = {name: super(RecordedProperties, self).get(name) for name in ways.intersection(self.keys())}
+        given = {name: super(DeclaredProperties, self).get(name) for name in ways.intersection(self.keys())}
         nested = {"a nested sensor": one for _, one in self.objects(False) if isinstance(one, mi.Sensor)}  # noqa: B035
         plugin.check_ways({name: one for name, one in {**given, **nested}.items() if str(one).lower() != "false"})
         for name in given:
@@ -86,7 +86,7 @@ class RecordedProperties(mi.Properties):
 
 
 def register(
-    kind: str, plugin: Plugin, make: Callable[[RecordedProperties], Any], described: type | None = None
+    kind: str, plugin: Plugin, make: Callable[[DeclaredProperties], Any], described: type | None = None
 ) -> None:
     """Register a plugin of a kind of Mitsuba, made by its class or a function of the class that describes it.
 
@@ -100,7 +100,7 @@ def register(
         manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
 
     def construct(props: mi.Properties) -> Any:
-        own = RecordedProperties(props, plugin)
+        own = DeclaredProperties(props, plugin)
         children = dict(props.objects(False))
         made = make(own)
         type(made).to_string = _described
@@ -182,9 +182,9 @@ class PassIntegrator(mi.CppADIntegrator):
             When the scene lacks a part or has one that the integrator does not support.
         """
 
-    def develop(self, record: Any, sensor: mi.Sensor) -> mi.TensorXf:
+    def develop(self, received: Any, sensor: mi.Sensor) -> mi.TensorXf:
         """Return the energy [J] of a pass, and store it in the sensor's film."""
-        sensor.film().store(record.histogram)
+        sensor.film().store(received.histogram)
         return sensor.film().develop()
 
     def render(
@@ -234,7 +234,7 @@ class PassIntegrator(mi.CppADIntegrator):
 class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
-    def __init__(self, props: RecordedProperties, pixels: PixelArray) -> None:
+    def __init__(self, props: DeclaredProperties, pixels: PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
         self.receiver = Receiver(read_pose(props), ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props))
@@ -252,7 +252,7 @@ class ReceiverSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def read_pose(props: RecordedProperties) -> KernelPose:
+def read_pose(props: DeclaredProperties) -> KernelPose:
     """Return the pose of a lidar in the frame: of ``to_world``, or of height, angle and aim."""
     if "to_world" not in props:
         pose = KernelPose.from_angles(*(props.get(each.name, each.default) for each in ANGLES))
@@ -261,7 +261,7 @@ def read_pose(props: RecordedProperties) -> KernelPose:
     return KernelPose.from_matrix(f"{props.plugin_name()}: to_world", matrix).in_frame(props.frame_origin)
 
 
-def _blur(props: RecordedProperties) -> PointSpread | None:
+def _blur(props: DeclaredProperties) -> PointSpread | None:
     """Return the point-spread function of a receiver; None for sharp optics."""
     if "blur_file" not in props:
         if "blur_file_mrad" in props:

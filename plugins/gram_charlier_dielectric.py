@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
@@ -52,7 +52,7 @@ class GramCharlierDielectric(mi.BSDF):
         {'type': 'gram_charlier_dielectric', 'variance_u': 0.02, 'variance_v': 0.015, 'c03': -0.16}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         variances = list(map(props.read, ("variance_u", "variance_v")))
         series = GramCharlierSeries(*map(props.read, _TERMS))

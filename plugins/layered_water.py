@@ -16,7 +16,7 @@ from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.water_types import water_of
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -73,7 +73,7 @@ class LayeredWater(mi.Medium):
         {'type': 'layered_water', 'attenuation': 0.3, 'scattering': 0.15, 'backscattering': 0.006}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         bubbles = phases.pop("plume_phase", None)
         if bubbles is not None:
@@ -108,7 +108,7 @@ class LayeredWater(mi.Medium):
 
 
 def _read_water(
-    props: RecordedProperties,
+    props: DeclaredProperties,
     nested: dict[str, mi.PhaseFunction],
     bubbles: mi.PhaseFunction | None,
 ) -> Water:
@@ -160,7 +160,7 @@ def _read_water(
     )
 
 
-def _column(props: RecordedProperties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
+def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
     """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
 
     That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
@@ -193,7 +193,7 @@ def _column(props: RecordedProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
 
 
-def _bubbles(props: RecordedProperties) -> tuple[BubblePlume | BubbleLayer | None, float]:
+def _bubbles(props: DeclaredProperties) -> tuple[BubblePlume | BubbleLayer | None, float]:
     """Return the bubbles, behind a ship or below a windy sea, and their bb/b."""
     read = props.read
     scattering, x, y, bearing, *extent = map(read, _PLUME)
@@ -214,7 +214,7 @@ def _bubbles(props: RecordedProperties) -> tuple[BubblePlume | BubbleLayer | Non
     return BubbleLayer(bubbles.scattering, bubbles.depth), bubbles.backscatter_ratio(backscatter)
 
 
-def _is_given(props: RecordedProperties, name: str) -> bool:
+def _is_given(props: DeclaredProperties, name: str) -> bool:
     """Return whether a parameter has a value; ``false`` counts as not given for ``pure``."""
     if name == "pure":
         value = props.get(name, "false")

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
@@ -90,7 +90,7 @@ class LidarMerging(PassIntegrator):
 
     plugin = "lidar_merging"
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         given = [name for name in ("paths_per_pass", "photons_per_pass") if name in props]
         counts = {name: props.read(name) for name in given}

@@ -10,7 +10,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
 from mitransient_lidar.physics.lidar.divergence import WIDTHS, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, read_pose, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, read_pose, register
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import read_image
@@ -52,7 +52,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         {'type': 'lidar_transmitter', 'altitude': 200.0, 'off_nadir_deg': 20.0, 'divergence_mrad': 10.0}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         read = props.read
         self.pose = read_pose(props)
@@ -128,7 +128,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         return mi.Spectrum(0)
 
 
-def _profile(props: RecordedProperties, kind: str) -> BeamProfile:
+def _profile(props: DeclaredProperties, kind: str) -> BeamProfile:
     """Return the beam profile of the plugin's parameters."""
     read = props.read
     image_names = ("profile_file", "profile_mrad")

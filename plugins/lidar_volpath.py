@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import LIDAR_VOLPATH
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import PassIntegrator, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -17,7 +17,7 @@ from mitransient_lidar.transport.volpath import VolpathOptions, VolpathRenderer
 class VolpathIntegrator(PassIntegrator):
     """Integrator with the options of the path tracer."""
 
-    def __init__(self, props: RecordedProperties, complement_only: bool = False) -> None:
+    def __init__(self, props: DeclaredProperties, complement_only: bool = False) -> None:
         super().__init__(props)
         self.paths_per_pass = props.read("paths_per_pass")
         names = ("max_scatterings", "roulette_threshold", "guiding_probability")
@@ -56,7 +56,7 @@ class LidarVolpath(VolpathIntegrator):
 
     plugin = "lidar_volpath"
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props, props.read("complement_only"))
 
     def prepare(

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER
-from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, ReceiverSensor, register
 from mitransient_lidar.plugins.pixel_fov import PixelFov
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
@@ -47,7 +47,7 @@ class MultipixelReceiver(ReceiverSensor):
          'film': {'type': 'time_gated_film'}}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         nested = [child for _, child in props.objects() if isinstance(child, mi.Sensor)]
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
@@ -64,7 +64,7 @@ def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     return ShapedPixels([pixel.field for pixel in nested], names)
 
 
-def _own_pixels(props: RecordedProperties) -> PixelArray:
+def _own_pixels(props: DeclaredProperties) -> PixelArray:
     """Build the pixels from a layout or a map."""
     field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
@@ -82,7 +82,7 @@ def _own_pixels(props: RecordedProperties) -> PixelArray:
     return LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
 
 
-def _sides_of_lens(props: RecordedProperties, layout: str) -> tuple[float, float]:
+def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float]:
     """Return the sides (angle_x, angle_y) [rad] of the field of view of a detector behind a lens."""
     for name in _LENS:
         if name not in props:

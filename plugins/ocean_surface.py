@@ -14,7 +14,7 @@ from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
-from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
 
@@ -107,7 +107,7 @@ class OceanSurface(mi.Mesh):
         {'type': 'ocean_surface', 'wind_speed': 3.0, 'interior': {'type': 'layered_water'}}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         self._values: dict[str, Any] = {}
         #: Footprints for which automatic values are chosen; None before `fit`.
         self.footprints: Sequence[Footprint] | None = None

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import PASSIVE_VOLPATH
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.lidar_volpath import VolpathIntegrator
-from mitransient_lidar.transport.daylight.renderer import DaylightRecord, DaylightRenderer
+from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, ReceivedDaylight
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 
 
@@ -45,7 +45,7 @@ class PassiveVolpath(VolpathIntegrator):
     plugin = "passive_volpath"
     passive = True
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         self.options = dataclasses.replace(
             self.options,
@@ -58,10 +58,10 @@ class PassiveVolpath(VolpathIntegrator):
         """Return the renderer of passes of a scene; raise UserError when a part is missing or not supported."""
         return DaylightRenderer(DaylightScene.from_scene(scene, sensor), self.options, self.paths_per_pass)
 
-    def develop(self, record: DaylightRecord, sensor: mi.Sensor) -> mi.TensorXf:
+    def develop(self, received: ReceivedDaylight, sensor: mi.Sensor) -> mi.TensorXf:
         """Return the radiance [W m^-2 sr^-1 nm^-1] of a pass, 0 where no path started."""
         pixels = sensor.receiver.pixels
-        radiance = dr.select(record.sampled > 0, record.found / record.sampled, 0)
+        radiance = dr.select(received.sampled > 0, received.found / received.sampled, 0)
         return mi.TensorXf(mi.Float(radiance), shape=pixels.grid or (pixels.count,))
 
 

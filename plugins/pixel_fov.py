@@ -8,7 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import PIXEL_FOV
 from mitransient_lidar.core.validation import finite_array, in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, ReceiverSensor, register
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 
@@ -36,7 +36,7 @@ class PixelFov(ReceiverSensor):
          'film': {'type': 'time_gated_film'}}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         self.field = _field(props)
         self.pixel_name = str(props.read("pixel_name"))
         level = mi.log_level()
@@ -48,7 +48,7 @@ class PixelFov(ReceiverSensor):
             mi.set_log_level(level)
 
 
-def _field(props: RecordedProperties) -> FovShape:
+def _field(props: DeclaredProperties) -> FovShape:
     """Build the shape from the plugin's parameters."""
     read = props.read
     shape = read("shape")

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import RETROREFLECTOR
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
 
@@ -48,7 +48,7 @@ class Retroreflector(mi.BSDF):
         {'type': 'retroreflector', 'reflectance': 0.6, 'width_deg': 2.0, 'diffuse_share': 0.1}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         self.reflectance, self.diffuse_share = props.read("reflectance"), props.read("diffuse_share")
         self.width = math.radians(props.read("width_deg"))

@@ -14,7 +14,7 @@ from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
-from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
@@ -234,7 +234,7 @@ class Seabed(mi.Mesh):
         {'type': 'seabed', 'depth': 8.0, 'ripple_height': 0.03, 'ripple_length': 0.2}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         self.bottom = Bottom(props.read)
         if not any(isinstance(child, mi.BSDF) for _, child in props.objects()):
             props["reflection"] = create_object(

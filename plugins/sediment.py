@@ -8,7 +8,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEDIMENT
 from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
@@ -57,7 +57,7 @@ class Sediment(mi.BSDF):
         {'type': 'sediment', 'model': 'hapke', 'reflectance': 'coral_sand'}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         particles = _particles(props)
         if "single_scattering_albedo" in props:
@@ -132,9 +132,9 @@ class Sediment(mi.BSDF):
 
 
 class LambertianSediment(mi.BSDF):
-    """The Lambertian model of `Sediment`: Mitsuba's ``diffuse``, with parameters that a result can record."""
+    """The Lambertian model of `Sediment`: Mitsuba's ``diffuse``, with parameters that a result can hold."""
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         if "single_scattering_albedo" in props:
             albedo = props["single_scattering_albedo"]
@@ -185,17 +185,17 @@ class LambertianSediment(mi.BSDF):
         self._diffuse.traverse(callback)
 
 
-def _reflectance(props: RecordedProperties) -> float:
+def _reflectance(props: DeclaredProperties) -> float:
     """Return the reflectance at vertical incidence."""
     return bottom_reflectance("reflectance", props.read("reflectance", 0.1), props.read("wavelength_nm"))
 
 
-def _particles(props: RecordedProperties) -> HapkeSurface:
+def _particles(props: DeclaredProperties) -> HapkeSurface:
     """Return a surface of particles without their albedo."""
     return HapkeSurface(0.0, *map(props.read, _PARTICLES))
 
 
-def _create(props: RecordedProperties) -> mi.BSDF:
+def _create(props: DeclaredProperties) -> mi.BSDF:
     """Return the BSDF of the parameter ``model``."""
     return Sediment(props) if props.read("model") == "hapke" else LambertianSediment(props)
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SKY
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
 from mitransient_lidar.transport.daylight.sky import SKIES, direction_of, relative_irradiance
 
 
@@ -36,7 +36,7 @@ class Sky(EmitterWithoutExtent):
     #: Kind of daylight, by which integrators identify it.
     daylight = "sky"
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         self.distribution = props.read("distribution")
         for name in ("sun_zenith_deg", "sun_azimuth_deg"):

@@ -8,7 +8,7 @@ import numpy as np
 
 from mitransient_lidar.core.parameters.bottom import SUN
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
 from mitransient_lidar.transport.daylight.sky import direction_of
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
@@ -37,7 +37,7 @@ class Sun(EmitterWithoutExtent):
     #: Kind of daylight, by which integrators identify it.
     daylight = "sun"
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         self.zenith_deg = props.read("zenith_deg")
         self.direction = direction_of(self.zenith_deg, props.read("azimuth_deg"))

@@ -10,7 +10,7 @@ from mitransient_lidar.core.parameters.fields import AUTO
 from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.histogram import TransientHistogram
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
@@ -55,7 +55,7 @@ class TimeGatedFilm(mi.Film):
         {'type': 'time_gated_film', 'time_start_ns': 1390.0, 'bin_width_ns': 0.5, 'bin_count': 'auto'}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         start, count = map(props.read, ("time_start_ns", "bin_count"))
         #: Parameters of the record; None for a start [ns] or a number of bins that is chosen.
         self.time_start_ns = None if start == AUTO else start
@@ -119,7 +119,7 @@ class TimeGatedFilm(mi.Film):
         """Do nothing: passes are stored evaluated."""
 
 
-def _gate_plan(props: RecordedProperties) -> GatePlan | None:
+def _gate_plan(props: DeclaredProperties) -> GatePlan | None:
     """Read the gates of the film, or None; raise UserError where parameters contradict each other."""
     read, count = props.read, props.read("gate_count")
     given = [name for name in (*_GATE_SHAPE, *_GATE_START, "gate_step_ns", "gate_profile", "pulses") if name in props]

@@ -273,7 +273,7 @@ class FlightRenderer:
         self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
     ) -> tuple[xr.Dataset, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
-        from mitransient_lidar.rendering.shots.batches import ShotRecord
+        from mitransient_lidar.rendering.shots.batches import ReceivedShots
         from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan
@@ -291,11 +291,11 @@ class FlightRenderer:
             batches.set_time(time_s)
             sea = sea if sea is None else sea.at(time_s)
         pulses = inputs["pulse"].astype(np.int64)
-        records = [
+        rendered = [
             batches.render(poses.part(part), [plan.seed * 2**20 + int(pulse) for pulse in pulses[part]])
             for part in batches.parts(len(poses))
         ]
-        joined = ShotRecord.joined(records)
+        joined = ReceivedShots.joined(rendered)
         attributes = scene.attributes(used=batches.used_values, passes=int(joined.passes.max()))
         series = scene.dataset(joined, attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
         return series, 1e9 / C0 * (further - further % width)

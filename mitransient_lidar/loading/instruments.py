@@ -30,7 +30,7 @@ from mitransient_lidar.loading.document import (
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
-_RECORD = ("time_start_ns", "bin_count")
+_TIME_AXIS = ("time_start_ns", "bin_count")
 _SEA = ("refined_size", "cell_size", "shortest_wave")
 
 
@@ -118,7 +118,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     scene = scene.copied()
     root = scene.root
     shared, former = parameters_of(part), values_of(scene)
-    values = {record: shared[record] for record in _RECORD} | parameters_of(own)
+    values = {name: shared[name] for name in _TIME_AXIS} | parameters_of(own)
     for plugin in plugins_of(scene):
         for size in {*_SEA} & plugin.settings.keys() if plugin.declared.name == "ocean_surface" else ():
             drop_line(plugin.settings[size].element)

@@ -261,9 +261,9 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
     import mitsuba as mi
 
     from mitransient_lidar.plugins.bases import exposed
-    from mitransient_lidar.transport.plugin_types import Recorded
+    from mitransient_lidar.transport.plugin_types import OwnPlugin
 
-    if not isinstance(part, Recorded):
+    if not isinstance(part, OwnPlugin):
         values, objects = exposed(part)
         small = {name: _plain(value) for name, value in values.items() if dr.width(value) <= _MOST_VALUES}
         if isinstance(part, (mi.Shape, mi.Sensor)):

@@ -24,7 +24,7 @@ from mitransient_lidar.rendering.passive import MOST_FRAMES
 logger = logging.getLogger(__name__)
 
 #: Options that a result holds, by the command that rendered it.
-_RECORDED = {
+_HELD = {
     "render": ("seed", "variant", "max_memory", "passes", "pass_share"),
     "passive": ("seed", "variant"),
     "shots": ("passes", "pass_share"),
@@ -78,7 +78,7 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     given = {name: value for name, value in options.items() if value is not None}
     folder = None if isinstance(result, xr.Dataset) else Path(result).parent
     scene = SceneSource.from_attributes(attributes, folder)
-    own = {name: _held(attributes, KEPT[name]) for name in _RECORDED[kind]}
+    own = {name: _held(attributes, KEPT[name]) for name in _HELD[kind]}
     compare_versions(attributes)
     if kind == "shots":
         own |= _series_options(result, attributes, given)

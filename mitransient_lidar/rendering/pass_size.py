@@ -11,7 +11,7 @@ import mitsuba as mi
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.transport.histogram import GateWeights
-from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ _PATHS_PER_THREAD, _PATHS_ON_GPU = 2**14, 2**17
 
 def fit_to_time(
     renderer: PassRenderer, max_time: float, start_ns: float, *, seed: int, gates: GateWeights | None
-) -> tuple[PassRenderer, float, PassRecord | None]:
+) -> tuple[PassRenderer, float, ReceivedLight | None]:
     """Return a renderer of passes that fit into a time limit, with fewer paths where full passes do not.
 
     Kernels cannot be interrupted. Where the expected number of rays is large for the time, a trial with 1/512 of the
@@ -61,10 +61,10 @@ def fit_to_time(
         return renderer, 1.0, None
     began = time.perf_counter()
     trial = renderer.scaled(SMALLEST_SHARE)
-    record, kernels, rest = timed_pass(trial, seed, gates)
+    received, kernels, rest = timed_pass(trial, seed, gates)
     if _SMALL_PASSES * kernels < max_time:
         # Without the enlargement of buffers and the compilation of kernels in the first trial.
-        record, kernels, rest = timed_pass(trial, seed, gates)
+        received, kernels, rest = timed_pass(trial, seed, gates)
     left = max_time - (time.perf_counter() - began)
 
     def kernels_of(share: float) -> float:
@@ -76,7 +76,7 @@ def fit_to_time(
     while share > SMALLEST_SHARE and kernels_of(share) > max(left / _SMALL_PASSES - rest, rest):
         share *= 0.5
     logger.info("passes have 1/%d of the paths, so that they fit into max_time = %g s", round(1 / share), max_time)
-    return (renderer.scaled(share), share, None) if share > SMALLEST_SHARE else (trial, share, record)
+    return (renderer.scaled(share), share, None) if share > SMALLEST_SHARE else (trial, share, received)
 
 
 def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
@@ -89,18 +89,18 @@ def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
     return 2.0 + scattering * length
 
 
-def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[PassRecord, float, float]:
+def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[ReceivedLight, float, float]:
     """Render a pass; return it, the time of its kernels, and the other time except for their compilation [s]."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         began = time.perf_counter()
-        record = renderer.render_pass(seed, gates=gates)
+        received = renderer.render_pass(seed, gates=gates)
         dr.sync_thread()
         total = time.perf_counter() - began
         history = dr.kernel_history()
     kernels = 1e-3 * sum(kernel["execution_time"] for kernel in history)
     compilation = 1e-3 * sum(kernel.get("codegen_time", 0.0) + kernel.get("backend_time", 0.0) for kernel in history)
-    return record, kernels, max(total - kernels - compilation, 0.0)
+    return received, kernels, max(total - kernels - compilation, 0.0)
 
 
 def _at_once(paths: float) -> float:

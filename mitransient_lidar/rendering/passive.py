@@ -205,11 +205,11 @@ def _render_frame(
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal received
-        record = renderer.render_pass(seed)
-        found = np.array(record.found)
-        statistics.add(found, np.array(record.sampled))
+        daylight = renderer.render_pass(seed)
+        found = np.array(daylight.found)
+        statistics.add(found, np.array(daylight.sampled))
         received += float(np.sum(found))
-        return float(record.edge_loss[0])
+        return float(daylight.edge_loss[0])
 
     def require_light(passes: int) -> None:
         # A sum that is not finite is reported with the image.

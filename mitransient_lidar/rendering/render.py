@@ -246,11 +246,11 @@ def _render(
         if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
-        record = first or fitted.render_pass(seed, gates=gates)
-        accumulator.add(record.histogram)
+        received = first or fitted.render_pass(seed, gates=gates)
+        accumulator.add(received.histogram)
         if differences is not None:
             differences.add_pass(seed, share)
-        return record.edge_loss
+        return received.edge_loss
 
     log = run_passes(
         render_pass,

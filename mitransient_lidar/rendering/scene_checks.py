@@ -12,9 +12,9 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.transport.fitted_axis import total_reflection_ns
 from mitransient_lidar.transport.opaque import shape_number
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
-from mitransient_lidar.transport.records import total_reflection_ns
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.solids import box_of, met_numbers
@@ -60,7 +60,7 @@ def check_scene(probe: Probe) -> None:
     _check_rays(view, "no pixel sees the sea or a solid: the receiver")
     _check_rays(beam, "the beam misses the sea and every solid: the laser")
     _check_overlap(scene, view, beam)
-    _check_record(probe)
+    _check_axis_under_water(probe)
     _check_reflection(scene, view)
     _check_solids(probe)
     _warn_of_axes(scene, view, beam)
@@ -103,7 +103,7 @@ def _place(scene: WaterScene, point: FloatArray) -> str:
     return f"({x:.1f}, {y:.1f})"
 
 
-def _check_record(probe: Probe) -> None:
+def _check_axis_under_water(probe: Probe) -> None:
     """Refuse a record that ends before the surface echo, or begins after the echo of a bottom below all pixels."""
     axis, surface = probe.scene.axis, probe.echoes.surface_ns[:, 0]
     first = float(np.nanmin(surface)) if np.isfinite(surface).any() else np.nan

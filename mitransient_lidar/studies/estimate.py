@@ -171,7 +171,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     """Return the depth of the bottom, or of the last light [m], and its reflectance."""
     import mitsuba as mi
 
-    from mitransient_lidar.transport.plugin_types import Recorded
+    from mitransient_lidar.transport.plugin_types import OwnPlugin
     from mitransient_lidar.transport.solids import scene_of_shapes
 
     column = lidar.required_water.column
@@ -179,7 +179,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
         darkest = _DARK / max(float((column.absorption + column.backscattering).min()), 1e-3)
         return min(darkest, 1e-9 * C0 / 2 * (lidar.axis.end_ns - lidar.axis.start_ns)), 0.0
     bsdf = lidar.bottoms[0].bsdf()
-    if isinstance(bsdf, Recorded) and bsdf.parameters.get("model") == "hapke":
+    if isinstance(bsdf, OwnPlugin) and bsdf.parameters.get("model") == "hapke":
         raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
     start = mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1]))

@@ -1,4 +1,4 @@
-"""Independent passes over one scene, and their records."""
+"""Independent passes over one scene, and the light that they receive."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
-class PassRecord:
+class ReceivedLight:
     """Received light of one pass: a histogram by pixel, or by class of a pixel, and time.
 
     Attributes
@@ -38,7 +38,7 @@ class PassRecord:
         self.clear()
 
     def clear(self) -> None:
-        """Empty the record."""
+        """Remove all light."""
         self.histogram.clear()
         self.rays = mi.Float64(0)
 
@@ -72,7 +72,7 @@ class PassRecord:
         return self.histogram.lost
 
     def evaluate(self) -> None:
-        """Compute the record."""
+        """Compute the energies."""
         self.histogram.evaluate()
         dr.eval(self.rays)
 
@@ -115,7 +115,7 @@ class PassRenderer(ABC):
         return changed(self, classes=replace(classes, counted=self.classes.counted))
 
     def perturbed(self, perturbations: Sequence[Perturbation]) -> PassRenderer:
-        """Return a renderer whose records hold perturbations, too."""
+        """Return a renderer whose light has perturbations, too."""
         scene = replace(self.scene, perturbations=Perturbations(perturbations))
         focusing = None if self.focusing is None else self.focusing.perturbed(perturbations)
         return changed(self, scene=scene, focusing=focusing)
@@ -130,7 +130,7 @@ class PassRenderer(ABC):
 
     def render_pass(
         self, seed: int | Sequence[int], *, paths: int | None = None, gates: GateWeights | None = None
-    ) -> PassRecord:
+    ) -> ReceivedLight:
         """Render one pass, of one shot or, with several seeds, of several.
 
         Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given.
@@ -147,15 +147,15 @@ class PassRenderer(ABC):
         scene = self.scene
         emitted, length = scene.transmitter.energy, scene.reference_length
         histogram = TransientHistogram(scene.axis, shape, emitted, gates, length, scene.perturbations)
-        record = PassRecord(histogram, self.classes, self.focusing)
+        received = ReceivedLight(histogram, self.classes, self.focusing)
         with dr.suspend_grad():
-            self.trace(record, shots, self.paths if paths is None else paths)
-        record.evaluate()
-        return record
+            self.trace(received, shots, self.paths if paths is None else paths)
+        received.evaluate()
+        return received
 
     @abstractmethod
-    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
-        """Trace the paths of one pass into a record, a number of them for each shot."""
+    def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
+        """Trace a number of paths of one pass for each shot, and add their light."""
 
 
 @runtime_checkable

@@ -21,7 +21,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 @runtime_checkable
-class Recorded(Protocol):
+class OwnPlugin(Protocol):
     """Any plugin of this package, with its name as ``type`` and the values of its parameters."""
 
     parameters: dict[str, Any]

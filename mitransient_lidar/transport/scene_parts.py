@@ -16,6 +16,7 @@ from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.contacts import separate_contacts
+from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import (
@@ -27,7 +28,6 @@ from mitransient_lidar.transport.plugin_types import (
     WaterMedium,
 )
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.records import fitted_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
@@ -86,7 +86,7 @@ def find_lidar_scene(
     axis, end = film.axis or axis, ""
     if axis is None:
         # The bins are those of the sensor, whatever replaces its receiver.
-        axis, end = fitted_record(replace(parts, receiver=find_receiver(sensor)), transmitters[0], film, shifts)
+        axis, end = fitted_axis(replace(parts, receiver=find_receiver(sensor)), transmitters[0], film, shifts)
     end = end if film.bin_count is None else ""
     return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis, gates=film.gates, record_end=end)
 

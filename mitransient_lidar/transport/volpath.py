@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.path import ConnectedPath, PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Sums, joined
@@ -80,7 +80,7 @@ class VolpathOptions:
 
 
 class PathLight:
-    """Light to which the vertices of paths are connected, and its record.
+    """Emitters to which the vertices of paths are connected, and the light received from them.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class PathLight:
         return mi.Float(0)
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
-        """Return the numbers of solids as `PathClasses.solid`; 0 where the record has no such classes."""
+        """Return the numbers of solids as `PathClasses.solid`; 0 where light has no such classes."""
         return mi.UInt32(0)
 
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
@@ -146,10 +146,10 @@ class PathLight:
 
 
 class LaserLight(PathLight):
-    """The laser, and the record of a pass."""
+    """The laser, and the light of a pass."""
 
-    def __init__(self, scene: LidarScene, record: PassRecord, weight: mi.Float) -> None:
-        self.scene, self.record, self.weight = scene, record, weight
+    def __init__(self, scene: LidarScene, received: ReceivedLight, weight: mi.Float) -> None:
+        self.scene, self.received, self.weight = scene, received, weight
         self.submerged = scene.submerged
         self.sampler = SubmergedLaserSampler(scene) if scene.submerged else RefractedLaserSampler(scene)
         self._to_laser = scene.relative(scene.transmitter_pose)
@@ -174,8 +174,8 @@ class LaserLight(PathLight):
         return path.length + self._to_laser.distance(path.point)
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
-        """Return the numbers of solids among the classes of the record."""
-        return self.record.classes.solid(shape)
+        """Return the numbers of solids among the classes of the light."""
+        return self.received.classes.solid(shape)
 
     def receive(
         self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
@@ -185,7 +185,7 @@ class LaserLight(PathLight):
         upward = self.scene.transmitter_pose.point.z - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
-        self.record.receive(path.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
+        self.received.receive(path.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
@@ -193,7 +193,7 @@ class LaserLight(PathLight):
         offset = pose.point - crossing
         intensity = self.scene.transmitter.intensity_at(*pose.tangent(-dr.normalize(offset)))
         missing = share * level_transmittance(self.scene, emitter) * intensity / dr.squared_norm(offset)
-        self.record.histogram.lose(missing, missing > 0)
+        self.received.histogram.lose(missing, missing > 0)
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths whose light would arrive after the record."""
@@ -463,17 +463,22 @@ class PathTracer:
 
 
 def trace_connected(
-    scene: LidarScene, sampler: SensorSampler, options: VolpathOptions, record: PassRecord, shots: Shots, paths: int
+    scene: LidarScene,
+    sampler: SensorSampler,
+    options: VolpathOptions,
+    received: ReceivedLight,
+    shots: Shots,
+    paths: int,
 ) -> None:
-    """Trace a number of paths from the receiver for each shot and connect them to the laser, into a record."""
+    """Trace a number of paths from the receiver for each shot, connect them to the laser, and add their light."""
     require_memory(f"{shots.count * paths} paths", BYTES_PER_PATH * shots.count * paths, "take fewer paths_per_pass")
     lanes = shots.paths(paths)
     scene, rng = lanes.pick(scene), shots.streams(_STREAM, lanes)
     start = sampler.sample_shots(lanes, paths, rng)
     found = start.weight > 0
     path = ConnectedPath.start(scene, scene.receiver_pose, start.angles, mi.Float(1), found, pixel=start.pixel)
-    light = LaserLight(scene, record, start.weight)
-    record.rays += PathTracer(scene, options, light).trace(path, rng)
+    light = LaserLight(scene, received, start.weight)
+    received.rays += PathTracer(scene, options, light).trace(path, rng)
 
 
 class VolpathRenderer(PassRenderer):
@@ -483,6 +488,6 @@ class VolpathRenderer(PassRenderer):
         super().__init__(scene, classes, paths)
         self.options = options
 
-    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
+    def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
         """Trace paths and connect them to the laser."""
-        trace_connected(self.scene, self.sampler, self.options, record, shots, paths)
+        trace_connected(self.scene, self.sampler, self.options, received, shots, paths)

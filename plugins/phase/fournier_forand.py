@@ -6,7 +6,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import FOURNIER_FORAND
 from mitransient_lidar.physics.water.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 
@@ -33,7 +33,7 @@ class FournierForand(TabulatedPhaseFunction):
         {'type': 'fournier_forand', 'backscatter_ratio': 0.04}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         if "refractive_index" in props or "junge_slope" in props:
             if "backscatter_ratio" in props or not ("refractive_index" in props and "junge_slope" in props):
                 raise UserError("fournier_forand: give backscatter_ratio, or both refractive_index and junge_slope")

@@ -7,7 +7,7 @@ import logging
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import MEASURED_PHASE
 from mitransient_lidar.physics.water.phase_file import read_phase_table
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class MeasuredPhase(TabulatedPhaseFunction):
         {'type': 'measured_phase', 'filename': 'harbour.csv'}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         if "filename" not in props:
             raise UserError("measured_phase: filename is missing: the file of angles and values")
         self.filename = props["filename"]

@@ -6,7 +6,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import PETZOLD
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_average_particle, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 _AVERAGE = "average_particle"
@@ -32,7 +32,7 @@ class Petzold(TabulatedPhaseFunction):
         {'type': 'petzold', 'water': 'coastal'}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         self.water = props.read("water")
         if self.water != _AVERAGE and self.water not in PETZOLD_WATERS:
             raise UserError(f"water = {self.water!r} must be one of {', '.join([_AVERAGE, *PETZOLD_WATERS])}")

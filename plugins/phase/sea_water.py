@@ -7,7 +7,7 @@ from functools import partial
 from mitransient_lidar.core.parameters.water import SEA_WATER
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
-from mitransient_lidar.plugins.bases import RecordedProperties, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 
@@ -28,7 +28,7 @@ class SeaWater(TabulatedPhaseFunction):
         {'type': 'sea_water'}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         self.depolarisation = props.read("depolarisation")
         phase = partial(water_phase_function, depolarisation=self.depolarisation)
         super().__init__(props, PowerLawTable.from_function(phase))

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.water import TWO_TERM_HENYEY_GREENSTEIN
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio
-from mitransient_lidar.plugins.bases import RecordedProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 
 
@@ -34,7 +34,7 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         {'type': 'two_term_henyey_greenstein', 'weight': 0.98, 'g_forward': 0.93, 'g_backward': 0.3}
     """
 
-    def __init__(self, props: RecordedProperties) -> None:
+    def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
         self.weight, self.g_forward, self.g_backward = map(props.read, ("weight", "g_forward", "g_backward"))
         forward, backward = (henyey_greenstein_backscatter_ratio(g) for g in (self.g_forward, -self.g_backward))

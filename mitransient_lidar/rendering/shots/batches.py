@@ -170,7 +170,7 @@ def _vectors(horizontal: FloatArray) -> mi.Vector3f:
 
 
 @dataclass(frozen=True)
-class ShotRecord:
+class ReceivedShots:
     """Means over the passes of shots, and their standard errors.
 
     Attributes
@@ -199,14 +199,14 @@ class ShotRecord:
     missed: int = 0
 
     @classmethod
-    def joined(cls, records: Sequence[ShotRecord]) -> ShotRecord:
-        """Return the record of all shots of several ones."""
+    def joined(cls, several: Sequence[ReceivedShots]) -> ReceivedShots:
+        """Return the light of all shots of several batches."""
         whole, parts, derivatives = (
-            tuple(np.concatenate(arrays) for arrays in zip(*(getattr(one, name) for one in records), strict=True))
+            tuple(np.concatenate(arrays) for arrays in zip(*(getattr(one, name) for one in several), strict=True))
             for name in ("whole", "parts", "derivatives")
         )
-        passes = np.concatenate([one.passes for one in records])
-        lost, missed = (sum(getattr(one, name) for one in records) for name in ("lost", "missed"))
+        passes = np.concatenate([one.passes for one in several])
+        lost, missed = (sum(getattr(one, name) for one in several) for name in ("lost", "missed"))
         return cls(whole, lost, passes, parts, derivatives, missed)
 
 
@@ -308,7 +308,7 @@ class ShotBatches:
         other.passes, other._seconds = passes, seconds
         return other
 
-    def render(self, poses: ShotPoses, seeds: Sequence[int]) -> ShotRecord:
+    def render(self, poses: ShotPoses, seeds: Sequence[int]) -> ReceivedShots:
         """Render the shots of a batch, each with its own seed."""
         shots, done, copies, lost, needed = len(poses), 0, 0, 0.0, self._together
         ends = [time.perf_counter()]
@@ -319,12 +319,12 @@ class ShotBatches:
                 if (here := min(self._together, self.passes - done, needed)) != copies:
                     renderer, copies = several(here), here
                 numbers = [pass_seed(seed, done + number) for seed in seeds for number in range(here)]
-                record = renderer.render_pass(numbers)
-                lost += record.edge_loss
+                received = renderer.render_pass(numbers)
+                lost += received.edge_loss
                 shape = shots, here, -1, self._origins, renderer.scene.axis.bin_count
-                found, changes = record.histogram.energy().reshape(shape), None
+                found, changes = received.histogram.energy().reshape(shape), None
                 if self._perturbations:
-                    changes = np.moveaxis(record.histogram.perturbed().reshape(self._perturbations, *shape), 0, 2)
+                    changes = np.moveaxis(received.histogram.perturbed().reshape(self._perturbations, *shape), 0, 2)
                 for number in range(here):
                     light.add(found[:, number], None if changes is None else changes[:, number])
                 done += here
@@ -340,7 +340,7 @@ class ShotBatches:
             raise_if_out_of_memory(error)
             raise
         missed, passes = shots if self._goal is not None and needed > 0 else 0, np.full(shots, done)
-        return ShotRecord(light.arrays, lost / done, passes, light.parts.arrays, light.perturbed.arrays, missed)
+        return ReceivedShots(light.arrays, lost / done, passes, light.parts.arrays, light.perturbed.arrays, missed)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotRecord
+    from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Parameters of the scene that shots replace, and those that they replace to move the target.
@@ -137,24 +137,24 @@ class ShotScene:
             if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
         }
 
-    def dataset(self, record: ShotRecord, attributes: Mapping[str, Any]) -> xr.Dataset:
+    def dataset(self, received: ReceivedShots, attributes: Mapping[str, Any]) -> xr.Dataset:
         """Return the labelled result."""
         from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
-            *record.whole,
+            *received.whole,
             time=self.lidar.axis,
             pixel_names=pixels.names,
             pixel_centres_mrad=1e3 * pixels.centres(),
             grid=pixels.grid,
             attributes=attributes,
         )
-        if record.parts:
+        if received.parts:
             names = self._renderer.classes.names
-            dataset = results.add_components(dataset, names, *record.parts).transpose("shot", ...)
-        if record.derivatives:
-            first = (np.moveaxis(values, 1, 0) for values in record.derivatives)
+            dataset = results.add_components(dataset, names, *received.parts).transpose("shot", ...)
+        if received.derivatives:
+            first = (np.moveaxis(values, 1, 0) for values in received.derivatives)
             dataset = results.add_derivatives(dataset, *described(self.parameters), *first).transpose("shot", ...)
         return with_lines_of_sight(dataset, self.lidar)
 

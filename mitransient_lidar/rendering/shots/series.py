@@ -34,7 +34,7 @@ from mitransient_lidar.results.variables import described
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.rendering.shots.batches import ShotRecord
+    from mitransient_lidar.rendering.shots.batches import ReceivedShots
 
 _LOG = logging.getLogger(__name__)
 
@@ -158,7 +158,12 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, ShotPoses, ShotRecord, share_for_error
+    from mitransient_lidar.rendering.shots.batches import (
+        MOST_PASSES_FOR_ERROR,
+        ReceivedShots,
+        ShotPoses,
+        share_for_error,
+    )
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
@@ -186,20 +191,20 @@ def render_shots(
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
     batches = series.batches(passes, share, wanted)
     most = _checked_passes(shot_passes, len(places), passes)
-    records: list[ShotRecord] = []
+    found: list[ReceivedShots] = []
     errors: list[FloatArray] = []
     began, done, interrupted = time.perf_counter(), 0, False
     try:
         with DeferredInterrupt() as interruption:
             for part in batches.parts(len(places)):
                 left = (options.max_time or math.inf) - (time.perf_counter() - began)
-                if records and left <= 0:
+                if found and left <= 0:
                     break
                 seconds = left * (part.stop - part.start) / (len(places) - part.start)
                 batch = batches.limited(int(most[part].max()), seconds)
                 seeds = range(first_seed + part.start, first_seed + part.stop)
-                records.append(batch.render(ShotPoses(places[part]), seeds))
-                errors.append(series.window.relative_errors(*records[-1].whole[2:]))
+                found.append(batch.render(ShotPoses(places[part]), seeds))
+                errors.append(series.window.relative_errors(*found[-1].whole[2:]))
                 done = part.stop
                 if progress is not None:
                     progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], options))
@@ -207,18 +212,18 @@ def render_shots(
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
             raise
-        if not records:
+        if not found:
             raise KeyboardInterrupt from error
         interrupted = True
-    _warn_of_the_end(records, done, len(places), options, interrupted)
+    _warn_of_the_end(found, done, len(places), options, interrupted)
     median, p95 = np.quantile(np.concatenate(errors), [0.5, 0.95], method="higher")
-    lost, received = sum(one.lost for one in records), sum(one.whole[0].sum() for one in records)
-    lost = lost / (lost + received) if lost > 0 else 0.0
-    record = ShotRecord.joined(records)
+    lost, energy = sum(one.lost for one in found), sum(one.whole[0].sum() for one in found)
+    lost = lost / (lost + energy) if lost > 0 else 0.0
+    received = ReceivedShots.joined(found)
     warn_of_edge_loss(lost)
     attributes = series.attributes(
         used=batches.used_values,
-        passes=int(record.passes.max()),
+        passes=int(received.passes.max()),
         most_passes=passes,
         pass_share=share,
         elapsed_s=time.perf_counter() - began,
@@ -238,8 +243,8 @@ def render_shots(
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
-    known["shot_passes"] = ("shot", record.passes, described("shot_passes"))
-    return series.dataset(record, attributes).assign_coords(known)
+    known["shot_passes"] = ("shot", received.passes, described("shot_passes"))
+    return series.dataset(received, attributes).assign_coords(known)
 
 
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
@@ -296,12 +301,12 @@ def _checked_passes(given: npt.ArrayLike | None, shots: int, passes: int) -> Int
 
 
 def _warn_of_the_end(
-    records: Sequence[ShotRecord], done: int, planned: int, options: RenderOptions, interrupted: bool
+    found: Sequence[ReceivedShots], done: int, planned: int, options: RenderOptions, interrupted: bool
 ) -> None:
     """Warn of shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
     if done < planned and not interrupted:
         _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
-    if missed := sum(record.missed for record in records):
+    if missed := sum(one.missed for one in found):
         _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
 
 

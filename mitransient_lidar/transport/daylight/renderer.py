@@ -31,7 +31,7 @@ _LONG, _LONG_SURVIVAL = 100, 0.9
 
 
 @dataclass
-class DaylightRecord:
+class ReceivedDaylight:
     """Daylight of one pass.
 
     Attributes
@@ -53,18 +53,18 @@ class DaylightRecord:
 
 
 class DaylightLight(PathLight):
-    """Sun and sky, and the record of a pass; uniform random numbers `u` choose a point of the sun's disc per path."""
+    """Sun and sky, and the light of a pass; uniform random numbers `u` choose a point of the sun's disc per path."""
 
-    def __init__(self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f, weight: mi.Float) -> None:
-        self.scene, self.record, self.weight = scene, record, weight
+    def __init__(self, scene: DaylightScene, received: ReceivedDaylight, u: mi.Point2f, weight: mi.Float) -> None:
+        self.scene, self.received, self.weight = scene, received, weight
         self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
-        self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
+        self.invalid = dr.zeros(mi.Bool, dr.width(received.found))
 
     def add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
         """Add radiance to pixels, and mark those that it makes invalid."""
         # Sums leave out values that are not finite; the pixel is marked instead.
         dr.scatter(self.invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
-        dr.scatter_add(self.record.found, mi.Float64(found), pixel, active & (found > 0))
+        dr.scatter_add(self.received.found, mi.Float64(found), pixel, active & (found > 0))
 
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
@@ -109,7 +109,7 @@ class DaylightLight(PathLight):
         sun = self.scene.sun
         if sun is not None:
             missing = share * level_transmittance(self.scene, emitter) * sun.sampled_irradiance
-            dr.scatter_add(self.record.edge_loss, mi.Float64(missing), mi.UInt32(0), missing > 0)
+            dr.scatter_add(self.received.edge_loss, mi.Float64(missing), mi.UInt32(0), missing > 0)
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End very long paths at random."""
@@ -124,7 +124,7 @@ class DaylightRenderer:
         self.scene, self.options, self.paths = scene, options, paths
         self.sampler = FovSampler(scene.receiver)
 
-    def render_pass(self, seed: int, *, paths: int | None = None) -> DaylightRecord:
+    def render_pass(self, seed: int, *, paths: int | None = None) -> ReceivedDaylight:
         """Render one pass; passes of different seeds are independent."""
         count = self.paths if paths is None else paths
         require_memory(f"{count} paths", BYTES_PER_PATH * count, "take fewer paths_per_pass")
@@ -135,23 +135,23 @@ class DaylightRenderer:
             path = ConnectedPath.start(self.scene, pose, start.angles, mi.Float(1), found, pixel=start.pixel)
             return self.follow(path, rng, start.weight)
 
-    def follow(self, path: ConnectedPath, rng: mi.PCG32, weight: mi.Float) -> DaylightRecord:
+    def follow(self, path: ConnectedPath, rng: mi.PCG32, weight: mi.Float) -> ReceivedDaylight:
         """Trace paths from their last vertices to their ends, with the weight [sr] of each."""
         pixels = self.scene.receiver.pixels.count
         found, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, 1))
-        record = DaylightRecord(found, sampled, lost, mi.Float64(0))
-        dr.scatter_add(record.sampled, mi.Float64(weight), path.pixel, weight > 0)
+        received = ReceivedDaylight(found, sampled, lost, mi.Float64(0))
+        dr.scatter_add(received.sampled, mi.Float64(weight), path.pixel, weight > 0)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        light = DaylightLight(self.scene, record, u, weight)
+        light = DaylightLight(self.scene, received, u, weight)
         options = self.options
         if self.scene.sun is None:
             # Nothing to be guided to.
             options = replace(options, samples_emitter=False, expects_emitter=False, solid_guiding_probability=None)
             options = replace(options, guiding_probability=0.0)
-        record.rays = PathTracer(self.scene, options, light).trace(path, rng)
-        record.found = dr.select(light.invalid, dr.nan, record.found)
-        dr.eval(record.found, record.sampled, record.edge_loss, record.rays)
-        return record
+        received.rays = PathTracer(self.scene, options, light).trace(path, rng)
+        received.found = dr.select(light.invalid, dr.nan, received.found)
+        dr.eval(received.found, received.sampled, received.edge_loss, received.rays)
+        return received
 
 
 @runtime_checkable

@@ -20,7 +20,7 @@ from mitransient_lidar.transport.merging.photon_map import PhotonBuffer
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import opaque, opaque_index
-from mitransient_lidar.transport.passes import PassRecord
+from mitransient_lidar.transport.passes import ReceivedLight
 from mitransient_lidar.transport.path import PathPoint, interaction_at
 from mitransient_lidar.transport.perturbations import joined
 from mitransient_lidar.transport.rng import Lanes, Shots
@@ -79,9 +79,9 @@ class WaterConnections:
     """Connections of a scene's pass with independent random numbers for each pass and shot."""
 
     def __init__(
-        self, scene: LidarScene, record: PassRecord, rates: ConnectionRates, points: SegmentBuffer, shots: Shots
+        self, scene: LidarScene, received: ReceivedLight, rates: ConnectionRates, points: SegmentBuffer, shots: Shots
     ) -> None:
-        self.scene, self.record, self.rates = scene, record, rates
+        self.scene, self.received, self.rates = scene, received, rates
         self._water, self._points, self._shots = scene.required_water, points, shots
         self._group = self._water.index_layers.group(mi.UInt32(0))
 
@@ -141,7 +141,7 @@ class WaterConnections:
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_event(sums, other.depth, other.direction, -direction)
         length = point.length + other.length + distance * self._group
-        receive(self.record, point, other, 2, length, energy, active, sums, between=[direction])
+        receive(self.received, point, other, 2, length, energy, active, sums, between=[direction])
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some photons on solids."""
@@ -167,8 +167,9 @@ class WaterConnections:
         sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_solid(sums, met_shape(si))
-        solid, length = self.record.classes.solid(met_shape(si)), point.length + photon.length + distance * self._group
-        receive(self.record, point, photon, 1, length, energy, active, sums, solid, [direction])
+        solid = self.received.classes.solid(met_shape(si))
+        length = point.length + photon.length + distance * self._group
+        receive(self.received, point, photon, 1, length, energy, active, sums, solid, [direction])
 
     def _segment(self, point: PathPoint, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""

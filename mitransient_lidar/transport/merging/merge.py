@@ -12,7 +12,7 @@ from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
-from mitransient_lidar.transport.passes import PassRecord
+from mitransient_lidar.transport.passes import ReceivedLight
 from mitransient_lidar.transport.path import PathPoint, interaction_at
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
@@ -23,7 +23,7 @@ from mitransient_lidar.transport.solids import met_shape
 
 def merge_in_water(
     scene: LidarScene,
-    record: PassRecord,
+    received: ReceivedLight,
     points: PathPoint,
     cells: WaterCells | SphericalCells,
     photons: PhotonMap,
@@ -68,7 +68,7 @@ def merge_in_water(
         depth, light = -points.point.z, -photon.direction
         sums = perturbations.about(joined(points.sums, photon.sums), depth, beyond)
         sums = perturbations.at_event(sums, depth, points.direction, light, by_water)
-        receive(record, points, photon, 1, length, energy, active, sums)
+        receive(received, points, photon, 1, length, energy, active, sums)
         return (index + 1,)
 
     dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
@@ -76,7 +76,7 @@ def merge_in_water(
 
 def merge_on_solids(
     patches: SolidPatches,
-    record: PassRecord,
+    received: ReceivedLight,
     photons: PhotonMap | None,
     connections: mi.Float,
     rng: mi.PCG32,
@@ -93,7 +93,7 @@ def merge_on_solids(
         patch, random = patches.locate(si), mi.PCG32(rng)
         first, end = photons.find(patch.bucket, active)
         shape = met_shape(si)
-        solid, sums = record.classes.solid(shape), record.histogram.perturbations.at_solid(path.sums, shape)
+        solid, sums = received.classes.solid(shape), received.histogram.perturbations.at_solid(path.sums, shape)
         covered = patches.inverse_share(patch, shape, random, active & (first < end))
         weight = path.throughput * covered / patch.area
         typical = patches.typical_area(si)
@@ -112,7 +112,7 @@ def merge_on_solids(
             share = typical / (connected + typical)
             energy = weight * photon.throughput * bsdf * share
             lit, length = within & (bsdf > 0), path.length + photon.length
-            receive(record, path, photon, 0, length, energy, lit, joined(sums, photon.sums), solid)
+            receive(received, path, photon, 0, length, energy, lit, joined(sums, photon.sums), solid)
             return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge on solids")
@@ -121,7 +121,7 @@ def merge_on_solids(
 
 
 def receive(
-    record: PassRecord,
+    received: ReceivedLight,
     point: PathPoint,
     light: PathPoint,
     events: int,
@@ -132,19 +132,19 @@ def receive(
     solid: mi.UInt32 | None = None,
     between: Sequence[mi.Vector3f] = (),
 ) -> None:
-    """Add complete paths to a record, of a part from the receiver up to a point and one from the laser.
+    """Add the light of complete paths, of a part from the receiver up to a point and one from the laser.
 
     The parts meet with a number of scattering `events`, or on the `solid` of a number; `between` are the directions of
     segments between them. `sums` are those of the perturbations of the complete paths. Paths with a lost part are lost.
     """
     lost = point.lost | light.lost
     order, reversals = point.scatterings + events + light.scatterings, point.reversals
-    if record.classes.by_order:
+    if received.classes.by_order:
         # Light continues against the directions of the receiver's part.
         course = [point.direction.z, *(direction.z for direction in between), -light.direction.z]
         for here, following in pairwise(course):
             reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
         reversals = reversals + light.reversals
     echo, number = Echo(point.surface_length, solid is not None), mi.UInt32(0) if solid is None else solid
-    record.receive(point.pixel, order, reversals, number, length, energy, active & ~lost, echo, sums)
-    record.histogram.lose(energy, active & lost)
+    received.receive(point.pixel, order, reversals, number, length, energy, active & ~lost, echo, sums)
+    received.histogram.lose(energy, active & lost)

@@ -17,7 +17,7 @@ from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.opaque import changed, opaque
-from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.refracted_connection import connect_laser, perturbed_to_laser
@@ -98,13 +98,13 @@ class MergingRenderer(PassRenderer):
         """Return a renderer of each shot several times in turn, which meet a scene in parts."""
         return changed(self, scene=scene, layout=tiled(self.layout, copies))
 
-    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
-        """Trace the paths of one pass into a record."""
-        while not self._attempt(record, shots, paths):
-            record.clear()
+    def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
+        """Trace the paths of one pass, and add their light."""
+        while not self._attempt(received, shots, paths):
+            received.clear()
             dr.flush_malloc_cache()  # with the buffers that were too small
 
-    def _attempt(self, record: PassRecord, shots: Shots, paths: int) -> bool:
+    def _attempt(self, received: ReceivedLight, shots: Shots, paths: int) -> bool:
         """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
         self._fit_segments(shots, paths)
@@ -113,17 +113,17 @@ class MergingRenderer(PassRenderer):
         patches = layout.patches.of_pass(scene, mi.Point2f(shifts[4:]))
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
-        light = self._trace_light(record, shots, patches, rates)
-        found = None if light is None else self._trace_sensor(record, shots, paths, patches, rates, light.on_patches)
+        light = self._trace_light(received, shots, patches, rates)
+        found = None if light is None else self._trace_sensor(received, shots, paths, patches, rates, light.on_patches)
         if light is None or found is None:
             return False
         segments, points = found
         if points > 0:
-            self._join(record, shots, segments, points, patches, rates, light)
+            self._join(received, shots, segments, points, patches, rates, light)
         # The path tracer adds the light that merging leaves out.
         if not scene.has_specular_or_dry_solids:
             paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, _COMPLEMENT_PATHS // shots.count)
-        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)
+        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), received, shots, paths)
         return True
 
     def _fit_segments(self, shots: Shots, paths: int) -> None:
@@ -144,7 +144,7 @@ class MergingRenderer(PassRenderer):
             layout.light_segments, layout.sensor_segments = np.add(needed, share * np.subtract(wanted, needed)).tolist()
 
     def _trace_light(
-        self, record: PassRecord, shots: Shots, patches: SolidPatches, rates: ConnectionRates
+        self, received: ReceivedLight, shots: Shots, patches: SolidPatches, rates: ConnectionRates
     ) -> _StoredLight | None:
         """Trace light from the laser; return it, or None when a buffer was too small."""
         layout, lanes, count = self.layout, shots.paths(self.photons), shots.count * self.photons
@@ -165,8 +165,8 @@ class MergingRenderer(PassRenderer):
             hits.add(path, si.p, patches.locate(si), active, active & once & path.before_first_solid)
 
         path = walk.run(path, rng, segments, on_solid=store, past_solids=True)
-        record.rays = dr.sum(mi.Float64(path.rays))
-        dr.schedule(record.rays)
+        received.rays = dr.sum(mi.Float64(path.rays))
+        dr.schedule(received.rays)
         points, wanted = segments.finalize()
         on_patches, met = hits.sort(shots.count * patches.buckets, shots)
         if wanted > segments.capacity or met > hits.capacity:
@@ -187,7 +187,7 @@ class MergingRenderer(PassRenderer):
 
     def _trace_sensor(
         self,
-        record: PassRecord,
+        received: ReceivedLight,
         shots: Shots,
         paths: int,
         patches: SolidPatches,
@@ -217,13 +217,13 @@ class MergingRenderer(PassRenderer):
             order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(met_shape(si))
             sums, length = scene.perturbations.at_solid(path.sums, met_shape(si)), path.length + length
             sums = perturbed_to_laser(scene, sums, si.p, si, active)
-            record.receive(path.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
+            received.receive(path.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 
         random = shots.streams(_MERGE_STREAM, lanes)
-        merge = merge_on_solids(patches_of_paths, record, light, rates.on_solids, random)
+        merge = merge_on_solids(patches_of_paths, received, light, rates.on_solids, random)
         path = walk.run(path, rng, segments, on_solid=merge, on_first_hit=connect, past_solids=False)
-        record.rays += dr.sum(mi.Float64(path.rays))
-        dr.schedule(record.rays)
+        received.rays += dr.sum(mi.Float64(path.rays))
+        dr.schedule(received.rays)
         points, wanted = segments.finalize()
         if wanted > segments.capacity:
             layout.least_segments = layout.least_segments[0], (wanted + 1) / count
@@ -233,7 +233,7 @@ class MergingRenderer(PassRenderer):
 
     def _join(
         self,
-        record: PassRecord,
+        received: ReceivedLight,
         shots: Shots,
         segments: SegmentBuffer,
         points: int,
@@ -245,9 +245,9 @@ class MergingRenderer(PassRenderer):
         if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
             cells = segments.lanes(index).pick(rates.cells)
-            merge_in_water(self.scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
+            merge_in_water(self.scene, received, segments.points(index), cells, light.in_cells, rates.in_water)
         if rates.per_path:
-            connections = WaterConnections(self.scene, record, rates, segments, shots)
+            connections = WaterConnections(self.scene, received, rates, segments, shots)
             if light.points > 0:
                 connections.to_light(light.segments, _CONNECTION_STREAM)
             if light.on_patches is not None:

@@ -203,7 +203,7 @@ def test_parameters_are_freed_when_their_object_is_made():
     gc.disable()
     try:
         made = mi.load_dict({"type": "seabed", "bsdf": {"type": "retroreflector"}})
-        assert not [one for one in gc.get_objects() if type(one).__name__ == "RecordedProperties"]
+        assert not [one for one in gc.get_objects() if type(one).__name__ == "DeclaredProperties"]
     finally:
         gc.enable()
     assert made.bsdf().parameters["width_deg"] == 2

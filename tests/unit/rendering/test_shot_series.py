@@ -160,7 +160,7 @@ def rendered(monkeypatch):
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
-        return shot_batches.ShotRecord(2 * (power, 0.1 * power), 0.0, np.full(len(places), batches.passes))
+        return shot_batches.ReceivedShots(2 * (power, 0.1 * power), 0.0, np.full(len(places), batches.passes))
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", render)
     return asked

@@ -19,7 +19,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
+from mitransient_lidar.transport.plugin_types import GatedFilm, OwnPlugin, Transmitter
 from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -35,7 +35,7 @@ _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
 _QUIET_BINS, _LONGEST_NS = 10, 100.0
 
 
-def fitted_record(
+def fitted_axis(
     scene: WaterScene, transmitter: Transmitter, film: GatedFilm, shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),)
 ) -> tuple[TimeAxis, str]:
     """Return time bins of a film for all light that returns, and what the last light comes from.
@@ -162,7 +162,7 @@ def _kd(column: WaterColumn) -> FloatArray:
 
 def _name(shape: mi.Shape) -> str:
     """Return the id of a shape, else its type."""
-    return str(shape.id() or (shape.parameters["type"] if isinstance(shape, Recorded) else shape.class_name()))
+    return str(shape.id() or (shape.parameters["type"] if isinstance(shape, OwnPlugin) else shape.class_name()))
 
 
 def _triangles(shape: mi.Shape) -> FloatArray:
