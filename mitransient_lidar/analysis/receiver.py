@@ -262,7 +262,9 @@ def _record_channel(
     stride = receiver.stride(width)
     time = dataset["time"][::stride]
     forms = [expected.mean, np.sqrt(expected.variance), snr, expected.saturation]
-    coords = {name: coordinate for name, coordinate in dataset.coords.items() if "time" not in coordinate.dims}
+    # Without those of gates and of errors, which a record has not.
+    kept = {*dims[:-1]}
+    coords = {name: coordinate for name, coordinate in dataset.coords.items() if kept.issuperset(coordinate.dims)}
     if series:
         # The records of a shot follow each other, and its closed forms and coordinates are repeated.
         merged = (number * len(light), *signal.shape[2:])

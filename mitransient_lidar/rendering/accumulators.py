@@ -331,16 +331,9 @@ def choose_accumulator(
 
 def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
     """Return the gates of the scene at their times."""
-    plan = scene.gates
-    if plan is None:
+    if scene.gates is None:
         return None
-    if plan.start_ns is None and surface_time_ns is None:
-        raise UserError(
-            f"gate_start_depth = {plan.start_depth:g} m counts from the surface echo, and the receiver sees no "
-            "surface: give gate_start_ns"
-        )
-    surface = 0.0 if surface_time_ns is None else surface_time_ns
-    train = plan.placed(surface, scene.depth_per_ns)
-    echo = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": start_ns}
+    train = scene.gate_train(scene.gates)
+    echo = {} if surface_time_ns is None else {"surface_time_ns": surface_time_ns, "window_start_ns": start_ns}
     check_train(train, echo, scene.axis)
     return train

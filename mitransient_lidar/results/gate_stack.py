@@ -41,7 +41,8 @@ def train_from_options(
     *,
     start_ns: Annotated[float | None, Option("Start of the first gate, at half height [ns], any number")] = None,
     start_depth_m: Annotated[
-        float | None, Option("Depth of its start on the axis [m], any number, instead of a time", flag="--start-depth")
+        float | None,
+        Option("Depth below the mean sea level on the axis [m], any number, instead of a time", flag="--start-depth"),
     ] = None,
     width_ns: Annotated[float | None, positive_option("Width of a gate between half heights", "ns")] = None,
     step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
@@ -63,8 +64,8 @@ def train_from_options(
     attributes : mapping
         Attributes of a result, with the lidar geometry if the start is a depth.
     start_ns, start_depth_m : float, optional
-        Half height of the first gate's rising edge, as a time [ns] or a depth on the receiver's axis [m]; exactly one
-        of them.
+        Half height of the first gate's rising edge, as a time [ns] or a depth below the mean sea level on the
+        receiver's axis [m]; exactly one of them.
 
     Raises
     ------
@@ -78,7 +79,7 @@ def train_from_options(
     if start_ns is not None and start_depth_m is None:
         start = start_ns
     elif start_depth_m is not None and start_ns is None:
-        start = float(lidar_geometry(attributes, surface="measured").time_of_depth(start_depth_m))
+        start = float(lidar_geometry(attributes, surface="level").time_of_depth(start_depth_m))
     else:
         raise UserError("a gate train needs one start: either start_ns or start_depth_m")
     if profile_file is not None and width_ns is None:
@@ -90,9 +91,9 @@ def train_from_options(
 
 
 def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
-    """Return the depths [m] of the gates' middles on the axis, NaN if an attribute of the geometry is missing."""
+    """Return the depths [m] of the gates' middles below the mean sea level on the axis, NaN if one is unknown."""
     try:
-        return lidar_geometry(attributes, surface="measured").depth_of_time(train.middles_ns)
+        return lidar_geometry(attributes, surface="level").depth_of_time(train.middles_ns)
     except UserError:
         return np.full(train.count, np.nan)
 

@@ -75,10 +75,9 @@ def _light_above_water(
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
     if gates is not None:
-        for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = gates.placed(time, scene.depth_per_ns).spans_ns
-            end = "after the last gate" if spans[-1, 1] > limits[1] else end
-            limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
+        spans = scene.gate_train(gates).spans_ns
+        end = "after the last gate" if spans[-1, 1] > limits[1] else end
+        limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
     return *limits, end
 
 

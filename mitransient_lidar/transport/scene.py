@@ -13,7 +13,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.gate_train import GatePlan
+from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -241,6 +241,23 @@ class WaterScene:
         """Depth per delay of echoes on the receiver's axis [m/ns]."""
         down = refract_level(self.receiver.pose.axis, self.refractive_index)
         return 0.5e-9 * C0 / self.group_index * -float(down[2])
+
+    def gate_train(self, plan: GatePlan) -> GateTrain:
+        """Return the gates of a plan at their times, which waves do not change.
+
+        Raises
+        ------
+        UserError
+            If they start at a depth, and the receiver's axis does not meet the mean sea level.
+        """
+        pose = self.receiver.pose
+        if plan.start_ns is None and not (self.surfaces and pose.looks_down):
+            what = "the axis of the receiver does not meet it" if self.surfaces else "the scene has none"
+            raise UserError(
+                f"gate_start_depth = {plan.start_depth:g} m counts from the mean sea level, and {what}: "
+                "give gate_start_ns"
+            )
+        return plan.placed(2e9 / C0 * pose.ground_range, self.depth_per_ns)
 
     def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""

@@ -1,5 +1,7 @@
 """Gates in renders: against the waveform, against one another, and where geometry puts a target."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,9 +16,11 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.results import gate_stack
 from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Bytes of the histogram of four pixels and 300 bins, with its means and errors.
 HISTOGRAM = 4 * 300 * 116
+WAVES = {"spectrum": "elfouhaily", "wind_speed": 8.0, "slope_variance": "cox_munk"}
 GATES = {"gate_start_ns": 1425.0, "gate_width_ns": 8.0, "gate_step_ns": 5.0, "gate_count": 20, "gate_rise_ns": 2.0}
 
 
@@ -105,16 +109,29 @@ def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     assert "gates of 1 of 4 pixels hold values that are not finite" in caplog.text
 
 
-@pytest.mark.slow
-def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene):
+@pytest.mark.parametrize("changes", [{}, {"rx": {"field_of_view_mrad": 100.0}}, {"sea": WAVES}])
+def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene, changes):
+    """Whatever the view and the waves: the depth is that below the mean sea level on the axis."""
     gates = {"gate_start_depth": 3.0, "gate_width_ns": 8.0, "gate_count": 6}
-    result = render(lidar_scene(film={"bin_width_ns": 0.5, "bin_count": 300, **gates}), passes=2)
-    cosine = np.cos(np.arcsin(np.sin(np.radians(20.0)) / 1.34))
-    expected = result.attrs["surface_time_ns"] + 2e9 * 1.34 * 3.0 / (C0 * cosine)
-    assert float(result["gate_start"][0]) == pytest.approx(expected, abs=1e-6)
-    # The middle of the gate is 4 ns later, and the next gate, by default, a width.
-    assert float(result["gate_depth"][0]) == pytest.approx(3.0 + 4.0 / 9.24576, abs=1e-4)
-    assert float(result["gate_start"][1]) == pytest.approx(expected + 8.0, abs=1e-6)
+    scene = lidar_scene(film={"bin_width_ns": 0.5, "bin_count": 300, **gates}, **changes)
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
+    train = lidar.gate_train(lidar.gates)
+    angle, in_water = np.radians(20.0), np.arcsin(np.sin(np.radians(20.0)) / 1.34)
+    expected = 2e9 / C0 * (200.0 / np.cos(angle) + 1.34 * 3.0 / np.cos(in_water))
+    assert train.start_ns == pytest.approx(expected, abs=1e-3)
+    # By default the next gate opens a width later; the middle of the first one is 4 ns after its start.
+    assert train.starts_ns[1] == pytest.approx(expected + 8.0, abs=1e-3)
+    lidar = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": 1.34, "group_index": 1.34}
+    assert gate_stack.gate_depths(train, lidar)[0] == pytest.approx(3.0 + 4.0 / 9.24576, abs=1e-4)
+
+
+def test_gates_by_depth_need_an_axis_that_meets_the_sea(lidar_scene):
+    pose = {"altitude": -5.0, "off_nadir_deg": 0.0}
+    scene = lidar_scene(film={"gate_start_depth": 3.0, "gate_count": 2}, tx=pose, rx=pose)
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
+    for one, words in ((lidar, "the axis of the receiver"), (replace(lidar, surfaces=[]), "the scene has none")):
+        with pytest.raises(UserError, match=f"gate_start_depth = 3 m .* sea level, and {words}.*: give gate_start_ns"):
+            one.gate_train(one.gates)
 
 
 @pytest.mark.slow

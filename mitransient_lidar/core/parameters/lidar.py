@@ -169,7 +169,7 @@ TIME_GATED_FILM = plugin(
     count("gate_count", 0, 0, 100_000, "Number of gates, 0 for none"),
     number("gate_start_ns", None, "ns", -1e9, 1e9, "Half height of the first gate's rising edge"),
     number("gate_start_depth", None, "m", -1e5, 1e5,
-        "Instead: depth of the echoes that arrive at that time, on the receiver's axis"),
+        "Instead: depth below the mean sea level of the echoes that arrive at that time, on the receiver's axis"),
     number("gate_width_ns", 10.0, "ns", 1e-6, 1e9, "Time between the half heights of a gate's edges"),
     number("gate_step_ns", None, "ns", 1e-6, 1e9, "Time from gate to gate", otherwise="the width"),
     number("gate_rise_ns", 0.0, "ns", 0, 1e9, "10-90 % time of a raised-cosine rising edge, 0 for a sharp one"),

@@ -341,12 +341,14 @@ class GatePlan:
 
     train: GateTrain
     start_ns: float | None = None  #: Time of the half height of the first gate's rising edge [ns].
-    start_depth: float | None = None  #: Depth of the echoes that arrive at that time [m], without `start_ns`.
+    #: Depth below the mean sea level, on the receiver's axis, of the echoes that arrive at that time [m], without
+    #: `start_ns`.
+    start_depth: float | None = None
 
-    def placed(self, surface_time_ns: float, depth_per_ns: float) -> GateTrain:
-        """Return the train with its start, from the arrival of the surface echo [ns] and the scale of depth [m/ns]."""
+    def placed(self, level_time_ns: float, depth_per_ns: float) -> GateTrain:
+        """Return the train with its start, from the time of depth 0 [ns] and the scale of depth [m/ns]."""
         start = self.start_ns
         if start is None:
             assert self.start_depth is not None
-            start = surface_time_ns + self.start_depth / depth_per_ns
+            start = level_time_ns + self.start_depth / depth_per_ns
         return replace(self.train, start_ns=start)

@@ -157,7 +157,11 @@ class Pose:
         """Distance to the ground point [m]."""
         return float(np.linalg.norm(self.ground_point() - self.origin))
 
+    @property
+    def looks_down(self) -> bool:
+        """Whether the axis meets the mean sea level from above."""
+        return bool(self.origin[2] > 0 and self.axis[2] < -_SMALLEST_DESCENT)
+
     def nearby_point(self) -> FloatArray:
         """Return the point in view to which lengths of paths are relative [m]: on the mean sea level, or the origin."""
-        down = self.origin[2] > 0 and self.axis[2] < -_SMALLEST_DESCENT
-        return self.ground_point() if down else self.origin
+        return self.ground_point() if self.looks_down else self.origin

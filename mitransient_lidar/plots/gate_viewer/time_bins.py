@@ -7,7 +7,6 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.drawing import as_seen
-from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
@@ -44,8 +43,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
         error = (error**2).sum("shot", skipna=False) ** 0.5 / values.sizes["shot"]
         values = values.mean("shot")
     pixels = [dim for dim in dims if dim not in ("shot", "time")]
-    others = {"shot", "origin", "parameter", "batch", *sum_errors.DIMS}
-    own = {key: one for key, one in dataset.coords.items() if not others & {*one.dims}}
+    own = {key: one for key, one in dataset.coords.items() if {*one.dims} <= {*pixels, "time"}}
     for angle in ("angle_x", "angle_y"):
         if angle not in own or set(own[angle].dims) != set(pixels):
             raise UserError(f"the result has no coordinate {angle} over ({', '.join(pixels)}): it has no map to draw")

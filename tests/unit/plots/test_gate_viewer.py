@@ -82,6 +82,14 @@ def test_page_of_waveforms(scene, tmp_path):
     assert metadata["shapes"] is None
 
 
+def test_page_of_a_record_of_a_gated_scene(scene, tmp_path):
+    """A record that still has the coordinates of the gates, of another number than its bins."""
+    of_gates = {name: one for name, one in scene[0].coords.items() if one.dims == ("gate",)}
+    gated = numbered(scene[1]).assign_coords({"gate": np.arange(GATES), **of_gates})
+    write_page(gated.rename(waveform="signal", waveform_stderr="signal_mean_stderr"), tmp_path / "page.html")
+    assert len(embedded(tmp_path / "page.html")[0]["gate_start"]) == BINS
+
+
 def test_large_pages_of_waveforms_show_means(scene, tmp_path):
     result = numbered(scene[1])
     path = tmp_path / "page.html"

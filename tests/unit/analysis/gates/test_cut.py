@@ -142,8 +142,9 @@ def test_stack_is_labelled():
     np.testing.assert_array_equal(stack["gate"], np.arange(5))
     np.testing.assert_array_equal(stack["gate_start"], [1418, 1421, 1424, 1427, 1430])
     np.testing.assert_array_equal(stack["gate_width"], np.full(5, 6.0))
-    # Gate 0 has its middle at 1421 ns: 1 ns after the surface, c0/(2 n_g) cos(asin(sin 20/1.34)) = 0.10625 m.
-    np.testing.assert_allclose(stack["gate_depth"], 0.106252 * (1 + 3 * np.arange(5)), rtol=1e-4)
+    # Gate 0 has its middle at 1421 ns, and the mean sea level is at 1419.886 ns on the axis; 1 ns is
+    # c0/(2 n_g) cos(asin(sin 20/1.34)) = 0.106252 m.
+    np.testing.assert_allclose(stack["gate_depth"], 0.106252 * (1.11407 + 3 * np.arange(5)), rtol=1e-4)
     expected = {"gate_rise_ns": 1.0, "gate_fall_ns": 2.0, "gate_step_ns": 3.0, "pulses": 3, "scene": "fig09"}
     assert expected.items() <= stack.attrs.items()
     assert stack.attrs["history"].startswith(dataset.attrs["history"])
@@ -222,7 +223,8 @@ def test_train_from_options(tmp_path):
     train = gate_stack.train_from_options(GEOMETRY, start_ns=1430.0, width_ns=6.0, count=3, rise_ns=1.0, pulses=5)
     assert train == GateTrain(1430.0, 6.0, 6.0, 3, 1.0, 0.0, 5)
     deep = gate_stack.train_from_options(GEOMETRY, start_depth_m=0.106252 * 10, width_ns=6.0, step_ns=2.0, count=3)
-    assert deep.start_ns == pytest.approx(1430.0, abs=1e-3)
+    # The mean sea level on the axis is at 1419.886 ns, whatever the waves at `surface_time_ns`.
+    assert deep.start_ns == pytest.approx(1429.886, abs=1e-3)
     assert deep.step_ns == 2.0
     path = tmp_path / "gate.txt"
     path.write_text("0 0\n1 1\n3 0\n")
@@ -252,5 +254,5 @@ def test_options_that_do_not_go_together(options, message):
 
 
 def test_depths_need_the_geometry():
-    with pytest.raises(UserError, match="no attribute surface_time_ns"):
+    with pytest.raises(UserError, match="no attribute altitude"):
         gate_stack.train_from_options({}, start_depth_m=2.0, width_ns=5.0)
