@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import largest_chi2, largest_error, largest_z, mean_and_error
+from significance import assert_equal, largest_chi2, largest_error, largest_z, mean_and_error
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
@@ -247,6 +247,38 @@ def test_inverse_share_counts_edges_in_full(lidar_scene, height):
     assert np.abs(z).max() < largest_z(10**6, z.size)
     # Without it, edges would be missed.
     assert covered[known].mean() < 0.9
+
+
+def test_light_on_curved_sides_is_merged_in_full(lidar_scene):
+    """On the steep sides of a sphere, which curve within a patch: the irradiance is that of parallel light.
+
+    Merged without regard to the slopes at either place it is 0.72 +- 0.04 of that.
+    """
+    ball = {"type": "sphere", "center": [0.0, 0.0, -4.0], "radius": 0.1, "bsdf": {"type": "diffuse"}}
+    scene = lidar_scene(integrator=MERGING, extra={"target": ball})
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
+    solids = SolidPatches(lidar, Region.of_probe(Probe(lidar)), BeamRings(lidar.transmitter.pose, 1.0, 1.34), 8.0, 0.1)
+    numbers, count, down, ratios = np.random.default_rng(5), 2**12, mi.Vector3f(0, 0, -1), []
+    for batch in range(16):
+        patches = solids.of_pass(lidar, mi.Point2f(numbers.uniform(size=(2, 1))))
+        rng, found = pass_streams(batch, 0, count), []
+        for _ in range(2):
+            x, y = (0.1 * (2 * rng.next_float32() - 1) for _ in range(2))
+            si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, -3), down))
+            patch = patches.locate(si)
+            share = patches.inverse_share(patch, si.shape, rng, si.is_valid())
+            values = np.array([patch.area / share, patches.foreshortening(si, down), si.n.z], np.float64)
+            number = np.array(patch.tag).astype(np.uint64) << 32 | np.array(patch.bucket)
+            steep = np.array((si.p.z > -4.5) & (patch.axis != 2))
+            found.append((number[steep], values[:, steep]))
+        (light, (_, lit, _)), (seen, (area, view, slope)) = found
+        # Rays of light and of view are as dense: energies are in units of one of light, areas of one across the rays.
+        patch, inverse = np.unique(seen, return_inverse=True)
+        place = np.searchsorted(patch, light)
+        known = patch[np.minimum(place, len(patch) - 1)] == light
+        energy = np.bincount(place[known], 1 / lit[known], len(patch))
+        ratios.append(np.sum(energy[inverse] * view / area) * 0.2**2 / count / np.sum(slope))
+    assert_equal(np.array(ratios), 1.0, error=0.02)
 
 
 @pytest.mark.slow

@@ -162,6 +162,7 @@ class WaterConnections:
         total = patches.typical_area(si) + connection
         scale = self.rates.on_solids * weight
         energy = scale * point.throughput * photon.throughput * bsdf * transmittance / total
+        energy *= patches.foreshortening(si, photon.direction)
         active &= (bsdf > 0) & dr.isfinite(total)
         depth, perturbed = point.depth, self.scene.perturbations
         sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)

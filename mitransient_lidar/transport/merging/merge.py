@@ -83,8 +83,9 @@ def merge_on_solids(
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
-    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF, weighted
-    against `connections`, a share of all pairs, that make the same path.
+    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF, and times the
+    ratio of foreshortening at both places. They are weighted against `connections`, a share of all pairs, that make the
+    same path.
     """
 
     def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
@@ -110,7 +111,7 @@ def merge_on_solids(
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             connected = dr.select(connectable > 0, connection, 0)
             share = typical / (connected + typical)
-            energy = weight * photon.throughput * bsdf * share
+            energy = weight * photon.throughput * patches.foreshortening(si, photon.direction) * bsdf * share
             lit, length = within & (bsdf > 0), path.length + photon.length
             receive(received, path, photon, 0, length, energy, lit, joined(sums, photon.sums), solid)
             return (index + 1,)

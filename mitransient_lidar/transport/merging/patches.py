@@ -28,6 +28,9 @@ _LEVEL_WIDTHS = 8
 #: Component of a normal along the beam, over the larger horizontal one, below which a surface counts as steep.
 _STEEP = 0.3
 
+#: Least foreshortening of surfaces: that of less light is not evened out between places of a patch.
+_LEAST_FORESHORTENING = 0.02
+
 #: Number of rays at each of several places that find solids of several levels.
 _PROBE_RAYS_OF_SHOTS = 512
 
@@ -107,8 +110,8 @@ class SolidPatches:
     """Patches in projection along the beam, or along x or y where steep.
 
     In projection along the refracted beam patches are sectors of rings about it, whatever their depth, along the others
-    squares. The beam's light is even over its own projection, however curved the surface is. Along x or y it is not:
-    there the merged light of surfaces that curve within a patch is too weak.
+    squares. What arrives from one direction is even over areas across that direction, however curved the surface is
+    (`foreshortening`).
 
     Parameters
     ----------
@@ -233,6 +236,14 @@ class SolidPatches:
         scale = dr.square(core) + along * along + across * across
         sector = dr.square(ring_width) * scale / self.rings.cosine
         return dr.select(axis == 2, sector, self._side * self._side) / dr.abs(normal)
+
+    def foreshortening(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
+        """Return areas of surfaces across a direction over their areas across the projection of their patch.
+
+        At least 0.02: light that grazes a surface is stored divided by this number at its place, and merged times that
+        of another place of the patch, so that the light of curved surfaces is right.
+        """
+        return dr.maximum(dr.abs(dr.dot(si.n, direction) / self._projection(si)[1]), _LEAST_FORESHORTENING)
 
     def _projection(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         """Return the direction of projection at points on solids, and the normal's component against it."""

@@ -132,11 +132,20 @@ class PhotonBuffer:
         self._of_path = dr.zeros(mi.UInt32, photons * shots)
 
     def add(
-        self, path: RandomWalkPath, place: mi.Point3f, patch: SolidPatch, active: mi.Bool, connectable: mi.Bool
+        self,
+        path: RandomWalkPath,
+        throughput: mi.Float,
+        place: mi.Point3f,
+        patch: SolidPatch,
+        active: mi.Bool,
+        connectable: mi.Bool,
     ) -> None:
-        """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
+        """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`.
+
+        Its `throughput` is that of the path over the foreshortening of its place.
+        """
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
-        values = {**vars(path), "point": place, "bucket": patch.bucket, "tag": patch.tag}
+        values = {**vars(path), "throughput": throughput, "point": place, "bucket": patch.bucket, "tag": patch.tag}
         values |= {"connectable": connectable, "label": self._classes.pack(path)}
         self._hits.write(values, slot, active & (slot < self._capacity))
         dr.scatter(self._of_path, slot + 1, path.lane, connectable)

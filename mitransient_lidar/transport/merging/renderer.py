@@ -162,7 +162,9 @@ class MergingRenderer(PassRenderer):
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
             once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
-            hits.add(path, si.p, patches.locate(si), active, active & once & path.before_first_solid)
+            connectable = active & once & path.before_first_solid
+            even = path.throughput / patches.foreshortening(si, path.direction)
+            hits.add(path, even, si.p, patches.locate(si), active, connectable)
 
         path = walk.run(path, rng, segments, on_solid=store, past_solids=True)
         received.rays = dr.sum(mi.Float64(path.rays))
