@@ -23,7 +23,7 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue, variants
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress
-from mitransient_lidar.studies import bench
+from mitransient_lidar.studies.bench import integrators as bench
 
 
 @pytest.fixture
