@@ -39,11 +39,11 @@ logger = logging.getLogger(__name__)
 @alone
 def fov_sweep(
     scene: Scene,
+    params: Mapping[str, Any] | None = None,
+    *,
     fov_mrad: Annotated[
         Numbers, Option("Full angles of the fields of view", 0, unit="mrad", above=True, form="N,N,...")
     ] = (2, 5, 10, 20, 50, 100),
-    params: Mapping[str, Any] | None = None,
-    *,
     instrument: Instrument = None,
     min_depth: Annotated[
         float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")

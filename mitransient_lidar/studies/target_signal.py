@@ -19,8 +19,9 @@ from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import described, label
+from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -169,18 +170,15 @@ def target_map(
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
     places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
     cells: list[xr.Dataset] = []
-    began = time.perf_counter()
-    for place_x, place_y in itertools.product(*places):
+    cases = Cases(list(itertools.product(*places)), "places", unit="place", progress=progress)
+    end = time.perf_counter() + (max_time or 0)
+    for place_x, place_y in cases:
         moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
         if max_time is not None:
-            left = max(max_time - (time.perf_counter() - began), 1e-3)
-            options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
-        cell = target_signal(scene, moved, **options).drop_dims("time")
-        if cell.attrs.get("interrupted"):
-            raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
+            options["max_time"] = max(end - time.perf_counter(), 1e-3) / (1 + cases.left_out)
+        cell = cases.keep(target_signal(scene, moved, **options)).drop_dims("time")
         cells.append(cell.assign(place_passes=((), cell.attrs["passes"], described("place_passes"))))
-        if progress is not None:
-            progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
+        cases.step()
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
     lines = [xr.concat(row, "target_y", combine_attrs="drop_conflicts") for row in rows]
     maps = xr.concat(lines, "target_x", combine_attrs="drop_conflicts")

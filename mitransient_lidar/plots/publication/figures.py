@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
 from mitransient_lidar.plots.publication import waves as wave_drawings
 from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.publication import quantities
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.statements import Measured, Statement, statements_of, write_statements
@@ -110,8 +109,6 @@ def figures(
         If a file cannot be written.
     """
     chosen = check_names(names)
-    limit = max_time or math.inf
-    began = time.perf_counter()
     renders = Renders(target_error, seed, progress)
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,11 +116,9 @@ def figures(
     found: list[Statement] = []
     interrupted = False
     try:
-        for number, name in enumerate(chosen, start=1):
-            if files and time.perf_counter() - began > limit:
-                _LOG.warning("max_time = %g s ended after %d of %d figures", limit, len(files), len(chosen))
-                break
-            _LOG.info("%s, %d of %d", name, number, len(chosen))
+        cases = Cases(chosen, "figures", max_time=max_time)
+        for name in cases:
+            _LOG.info("%s, %d of %d", name, cases.begun, len(chosen))
             figure = _FIGURES[name]
             stated = statements_of(name, figure.measure(renders))
             path = folder / f"{name}.png"
@@ -132,6 +127,7 @@ def figures(
                 drawing.save(figure.draw(renders), path)
                 write_statements([*found, *stated], folder / TABLE)
             files.append(path)
+            cases.kept += 1
             found += stated
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):

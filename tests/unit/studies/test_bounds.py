@@ -1,6 +1,7 @@
 """Bounds of designs from closed-form light in place of renders: ratios, table, figures and the command."""
 
 import csv
+import time
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_designs_after_the_time_are_left_out_and_counted(monkeypatch, caplog):
         return light(scene, **options)
 
     monkeypatch.setattr(study, "render", render)
-    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     energies = {"pulse_energy_mj": [5, 20, 1.25]}
     options = {"free": ["attenuation"], "receiver": "ideal", "passes": 2, "renders": 2}
     found = study.bounds("table1", SMALL, over=energies, max_time=3, **options)
@@ -178,7 +179,7 @@ def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
     small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
     done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
     assert done.exit_code == 130
-    assert done.stderr == "interrupted; bounds need all renders, and none is kept.\n"
+    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept.\n"
     assert not list(tmp_path.iterdir())
 
 

@@ -1,5 +1,7 @@
 """Tables of errors of depths: which cells are rendered, and refusals."""
 
+import time
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,7 +16,7 @@ from mitransient_lidar.studies.tpu import tpu
 def clock(monkeypatch):
     """The time of the studies in a list [s], which renders advance by a second each."""
     now = [0.0]
-    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     return now
 
 

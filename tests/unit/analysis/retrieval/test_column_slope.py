@@ -131,17 +131,17 @@ SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_s
 )
 def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
     with pytest.raises(UserError, match=message):
-        fov_sweep("table1", fields, {**SCENE, "bin_count": 110, **params}, **{"passes": 4, **options})
+        fov_sweep("table1", {**SCENE, "bin_count": 110, **params}, fov_mrad=fields, **{"passes": 4, **options})
 
 
 @pytest.mark.slow
 def test_the_time_leaves_out_the_widest_fields_of_view(caplog, tmp_path):
     options, scene = {"passes": 4, "seed": 1}, few_paths("table1", tmp_path)
-    found = fov_sweep(scene, [15, 10, 20], {**SCENE, "bin_count": 110}, max_time=0.01, **options)
+    found = fov_sweep(scene, {**SCENE, "bin_count": 110}, fov_mrad=[15, 10, 20], max_time=0.01, **options)
     assert found["field_of_view"].values.tolist() == [10]
     assert found.attrs["left_out_mrad"] == "15, 20"
     assert "fields of view of 15, 20 mrad are left out" in caplog.text
-    whole = fov_sweep(scene, [10], {**SCENE, "bin_count": 110}, **options)
+    whole = fov_sweep(scene, {**SCENE, "bin_count": 110}, fov_mrad=[10], **options)
     assert whole.attrs["left_out_mrad"] == ""
 
 
@@ -150,5 +150,5 @@ def test_a_small_surface_is_warned_of(caplog):
     params = {**SCENE, "off_nadir_deg": 20, "time_start_ns": 1400, "attenuation": 1, "scattering": 0.9}
     params |= {"surface_size": 4, "surface_cell_size": 0.25}
     with caplog.at_level(logging.WARNING):
-        fov_sweep("table1", [15], params, passes=4, max_depth=3)
+        fov_sweep("table1", params, fov_mrad=[15], passes=4, max_depth=3)
     assert "the surface is smaller than the spread of the light" in caplog.text
