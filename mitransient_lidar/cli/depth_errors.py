@@ -34,7 +34,7 @@ def _depth_bias(
     with announced():
         write_netcdf(found, target)
         if figure is not None:
-            from mitransient_lidar.plots.studies.depth_bias import plot_depth_bias
+            from mitransient_lidar.plots.studies.depths import plot_depth_bias
 
             figure.parent.mkdir(parents=True, exist_ok=True)
             plot_depth_bias(found, figure)
@@ -49,7 +49,7 @@ def _tpu(
     """Write the uncertainties of an instrument, with figures and fits of each altitude and angle."""
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
     from mitransient_lidar.loading.instruments import read_instrument
-    from mitransient_lidar.plots.studies.depth_uncertainty import plot_orders, plot_uncertainty
+    from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
     from mitransient_lidar.studies.tpu import describe_tpu
 
     instrument = call.arguments["instrument"]

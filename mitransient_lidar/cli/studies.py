@@ -20,8 +20,8 @@ def _study(
 ) -> Command:
     """Return the command of a module of studies, and of its function, by default that of the same name.
 
-    `plot` is the function that draws the result, in the module of the same name in ``plots.studies`` or in another one;
-    `describe` returns the lines of a result; `table` writes a CSV file.
+    `plot` is the function that draws the result, as ``module:name`` of ``plots``; `describe` returns its lines; `table`
+    writes a CSV file.
     """
     suffixes = (".nc",) * has_data + (".csv",) * bool(table)
 
@@ -30,7 +30,7 @@ def _study(
         found = call()
         output.parent.mkdir(parents=True, exist_ok=True)
         with announced():
-            function_at(plot if ":" in plot else f"plots.studies.{name}:{plot}")(found, output)
+            function_at(f"plots.{plot}")(found, output)
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
@@ -55,7 +55,7 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
 STUDIES = {
     "find-shots": _study(
         "find_shots",
-        "plot_found_shots",
+        "studies.shots:plot_found_shots",
         "describe_found_shots",
         """Find places of the sea where the beam meets given slopes.
 
@@ -65,7 +65,7 @@ STUDIES = {
     ),
     "target-signal": _study(
         "target_signal",
-        "plot_target_signal",
+        "studies.targets:plot_target_signal",
         "describe_target",
         """Measure the signal of a target in each pixel.
 
@@ -74,7 +74,7 @@ STUDIES = {
     ),
     "detect": _study(
         "detection",
-        "plot_detection",
+        "studies.targets:plot_detection",
         "describe_detection",
         """Compute how well a target is detected.
 
@@ -84,7 +84,7 @@ STUDIES = {
     ),
     "estimate": _study(
         "estimate",
-        "plots.waveforms:plot_components",
+        "waveforms:plot_components",
         "describe_estimate",
         """Estimate the waveforms in a second, over a level sea and without targets.
 
@@ -93,7 +93,7 @@ STUDIES = {
     ),
     "bounds": _study(
         "bounds",
-        "plot_bounds",
+        "studies.parameters:plot_bounds",
         "describe_bounds",
         """Compute the least errors of parameters from a shot, and rank designs.
 
@@ -104,7 +104,7 @@ STUDIES = {
     ),
     "beam-spread": _study(
         "beam_spread",
-        "plot_beam_spread",
+        "studies.light:plot_beam_spread",
         "describe_spread",
         """Measure the spread of the laser's light at depths.
 
@@ -113,13 +113,13 @@ STUDIES = {
     ),
     "fov-sweep": _study(
         "fov_sweep",
-        "plot_fov_sweep",
+        "studies.light:plot_fov_sweep",
         "describe_fov_sweep",
         "Measure the water's attenuation for several fields of view.",
     ),
     "scattering-orders": _study(
         "scattering_orders",
-        "plot_scattering_orders",
+        "studies.light:plot_scattering_orders",
         "describe_orders",
         """Separate the received light by the number of scatterings.
 

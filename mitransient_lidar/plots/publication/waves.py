@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mitransient_lidar.physics.lidar.refraction import refract
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
-from mitransient_lidar.plots.studies.find_shots import draw_sea
+from mitransient_lidar.plots.studies.shots import draw_sea
 from mitransient_lidar.studies.find_shots import render_found_shots
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.scenes import SHOTS, System, shot_places, three_shots

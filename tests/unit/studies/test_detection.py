@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.plots.studies.detection import plot_detection
+from mitransient_lidar.plots.studies.targets import plot_detection
 from mitransient_lidar.studies import detection
 
 NAMES = ["red", "green", "blue", "black"]
