@@ -73,27 +73,25 @@ def example(renders: Renders) -> Figure:
 
 def mine(renders: Renders) -> Figure:
     """Draw the echo of a sphere (figure 2)."""
-    figure = drawing.new_figure(None, 6.0, 3.4)
-    ax = figure.subplots()
-    result = renders.shot(scenes.MINE)
-    draw_waveforms(ax, result, (-1.5, 14.0), log=True)
-    draw_waveforms(ax, result, (-1.5, 14.0), log=True, origin="target", color="#7a3fb0", label="sphere alone")
-    _show_decades([ax])
-    ax.legend(frameon=False)
-    ax.set_title("2  sphere of 1 m at 9 m", fontsize="medium")
+    figure = _with_part(renders.shot(scenes.MINE), (-1.5, 14.0), "2  sphere of 1 m at 9 m", "sphere alone", log=True)
+    _show_decades(figure.axes)
     return figure
 
 
 def mast(renders: Renders) -> Figure:
     """Draw the echo of a target below a mast (figure 4)."""
+    summed = renders.shot(scenes.MAST).sum("pixel", keepdims=True, keep_attrs=True)
+    return _with_part(summed, (-0.5, 2.5), "4  target of 1 m² at 1 m, grazing angle 5.4°", "target alone")
+
+
+def _with_part(result: xr.Dataset, limits: tuple[float, float], title: str, label: str, *, log: bool = False) -> Figure:
+    """Draw waveforms and the light of the target alone."""
     figure = drawing.new_figure(None, 6.0, 3.4)
     ax = figure.subplots()
-    result = renders.shot(scenes.MAST)
-    summed = result.sum("pixel", keepdims=True, keep_attrs=True)
-    draw_waveforms(ax, summed, (-0.5, 2.5))
-    draw_waveforms(ax, summed, (-0.5, 2.5), origin="target", color="#7a3fb0", label="target alone")
+    draw_waveforms(ax, result, limits, log=log)
+    draw_waveforms(ax, result, limits, log=log, origin="target", color="#7a3fb0", label=label)
     ax.legend(frameon=False)
-    ax.set_title("4  target of 1 m² at 1 m, grazing angle 5.4°", fontsize="medium")
+    ax.set_title(title, fontsize="medium")
     return figure
 
 
