@@ -138,14 +138,9 @@ def depth_bias(
         NaN.
     estimators
         Estimators of `echo_table.extract`.
-    shots, records
-        Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
-        each, 1 to 10 000.
     target_error
         Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
         have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
-    corrections
-        A former table, its file, or ``auto`` for the shipped one, to correct the depths by.
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
         out are NaN, and the attribute ``seas_left_out`` has their number.

@@ -93,8 +93,6 @@ def detect(
     clutter
         Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or
         4 to 1000.
-    renders
-        Independent renders of the scene without clutter, 3 to 1000, from whose spread the intervals are estimated.
     max_time
         Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
         attribute ``depths_left_out`` has those that are left out as text, and a warning names them.

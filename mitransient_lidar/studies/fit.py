@@ -119,9 +119,6 @@ def fit(
     free_scale, free_time
         Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
         file, whose unit and time zero are unknown.
-    receiver
-        Receiver of a recorded signal, by default the one that it names; or of a CSV file, whose response and noise the
-        model gets (`analysis.information.measured.measured`).
     passes
         Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
         a tenth of that of the waveforms, 16 to 256.

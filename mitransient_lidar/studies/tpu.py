@@ -93,9 +93,6 @@ def tpu(
         As of `depth_bias.depth_bias`.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
-    corrections
-        A table of `depth_bias.depth_bias` to also correct the depths by, its file, ``auto`` for the shipped one, or
-        None.
     pointing_mrad, position_m, height_m
         Errors of the survey's trajectory; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
