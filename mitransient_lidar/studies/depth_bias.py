@@ -38,13 +38,17 @@ _LOG = logging.getLogger(__name__)
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
 
+
+def rising(meaning: str, unit: str, **more: Any) -> Option:
+    """Return the declaration of a list of increasing numbers from 0 on."""
+    return Option(meaning, 0, None, unit, ascending=True, form="N,N,...", **more)
+
+
 #: Parameters of tables of an instrument.
 InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
-Winds = Annotated[
-    Numbers, Option("Wind speeds; 0 for a level sea with ripples", 0, None, "m/s", ascending=True, form="N,N,...")
-]
+Winds = Annotated[Numbers, rising("Wind speeds; 0 for a level sea with ripples", "m/s")]
 Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
-Depths = Annotated[Numbers, Option("Depths of the bottom", 0, None, "m", above=True, ascending=True, form="N,N,...")]
+Depths = Annotated[Numbers, rising("Depths of the bottom", "m", above=True)]
 SeaScene = Annotated[str, Option("Scene whose sea, water and bottom count")]
 OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrument's")]
 Places = Annotated[int, Option("Random places of a sea with waves, or renders of a level sea", 2, 10_000)]
@@ -88,20 +92,10 @@ def depth_bias(
     params: Mapping[str, Any] | None = None,
     *,
     angles_deg: Annotated[
-        Numbers | None,
-        Option(
-            "Angles from nadir; the instrument's and 5 more by default",
-            *(0, None, "degrees"),
-            ascending=True,
-            form="N,N,...",
-            flag="--angles",
-        ),
+        Numbers | None, rising("Angles from nadir; the instrument's and 5 more by default", "degrees", flag="--angles")
     ] = None,
     winds: Winds = (0.0, 3.0, 6.0),
-    ripples: Annotated[
-        Numbers,
-        Option("Winds whose ripples level seas have", 0, None, "m/s", above=True, ascending=True, form="N,N,..."),
-    ] = (3.0, 6.0),
+    ripples: Annotated[Numbers, rising("Winds whose ripples level seas have", "m/s", above=True)] = (3.0, 6.0),
     waters: Waters = WATERS,
     depths: Depths = (3.0, 6.0, 10.0),
     scene: SeaScene = "table1",

@@ -32,6 +32,7 @@ from mitransient_lidar.studies.depth_bias import (
     Waters,
     Winds,
     depth_bias,
+    rising,
 )
 
 #: Wind whose ripples a level sea has [m/s].
@@ -47,24 +48,10 @@ def tpu(
     params: Mapping[str, Any] | None = None,
     *,
     altitudes: Annotated[
-        Numbers | None,
-        Option(
-            "Heights of the lidar above the sea; the instrument's by default",
-            *(0, None, "m"),
-            above=True,
-            ascending=True,
-            form="N,N,...",
-        ),
+        Numbers | None, rising("Heights of the lidar above the sea; the instrument's by default", "m", above=True)
     ] = None,
     angles_deg: Annotated[
-        Numbers | None,
-        Option(
-            "Angles from nadir; the instrument's by default",
-            *(0, None, "degrees"),
-            ascending=True,
-            form="N,N,...",
-            flag="--angles",
-        ),
+        Numbers | None, rising("Angles from nadir; the instrument's by default", "degrees", flag="--angles")
     ] = None,
     winds: Winds = WINDS,
     waters: Waters = WATERS,

@@ -243,7 +243,6 @@ def test_values_with_commas_are_separated_by_semicolons():
         ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
         ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
         ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
-        ({"background_power_w": -1}, "background_power_w = -1 must not be negative"),
     ],
 )
 def test_invalid_input_is_refused_before_a_render(rendered, options, message):
