@@ -130,6 +130,11 @@ def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
         fov_sweep("table1", {**SCENE, "bin_count": 110, **params}, fov_mrad=fields, **{"passes": 4, **options})
 
 
+def test_fields_of_view_are_given_by_name():
+    with pytest.raises(UserError, match=r"params = \[5, 10\] must be a dict of names and values"):
+        fov_sweep("table1", [5, 10])
+
+
 @pytest.mark.slow
 def test_the_time_leaves_out_the_widest_fields_of_view(caplog, tmp_path):
     options, scene = {"passes": 4, "seed": 1}, few_paths("table1", tmp_path)
