@@ -22,14 +22,11 @@ from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
 from mitransient_lidar.plots.passive import plot_passive
-from mitransient_lidar.plots.studies.depth_bias import plot_depth_bias
-from mitransient_lidar.plots.studies.depth_uncertainty import plot_orders, plot_uncertainty
-from mitransient_lidar.plots.studies.find_shots import plot_found_shots
-from mitransient_lidar.plots.studies.fit import plot_fit
-from mitransient_lidar.plots.studies.fov_sweep import plot_fov_sweep
-from mitransient_lidar.plots.studies.scattering_orders import plot_scattering_orders
-from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
-from mitransient_lidar.plots.studies.target_signal import plot_target_map, plot_target_signal
+from mitransient_lidar.plots.studies.depths import plot_depth_bias, plot_orders, plot_uncertainty
+from mitransient_lidar.plots.studies.light import plot_fov_sweep, plot_scattering_orders
+from mitransient_lidar.plots.studies.parameters import plot_fit
+from mitransient_lidar.plots.studies.shots import plot_found_shots, plot_shot_statistics
+from mitransient_lidar.plots.studies.targets import plot_target_map, plot_target_signal
 from mitransient_lidar.plots.water import plot_phase_function, plot_profile
 from mitransient_lidar.plots.waveforms import plot_waveforms
 from mitransient_lidar.rendering.shots.truth import SeaMap, Shot

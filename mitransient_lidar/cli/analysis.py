@@ -143,7 +143,7 @@ def _fit(
     """Fit, print and write."""
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))
-    from mitransient_lidar.plots.studies.fit import plot_fit
+    from mitransient_lidar.plots.studies.parameters import plot_fit
     from mitransient_lidar.studies import fit as study
 
     with DeferredInterrupt(at_once=False):

@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import analysis, campaigns, depth_errors, gates, render, results, scenes, studies
+from mitransient_lidar.cli import analysis, campaigns, gates, render, results, scenes, studies
 from mitransient_lidar.cli.generator import Command, LazyCommand
 from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.core.errors import UserError
@@ -31,7 +31,6 @@ COMMANDS: dict[str, Command] = {
     **render.COMMANDS,
     **campaigns.COMMANDS,
     **studies.STUDIES,
-    **depth_errors.COMMANDS,
     **campaigns.FIGURES,
     **results.COMMANDS,
     **gates.COMMANDS,

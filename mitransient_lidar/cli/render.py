@@ -152,7 +152,7 @@ def _shots(
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
-    from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
+    from mitransient_lidar.plots.studies.shots import plot_shot_statistics
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.shots import series as study
     from mitransient_lidar.studies import shot_statistics as statistics

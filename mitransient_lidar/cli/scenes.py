@@ -96,14 +96,15 @@ def _bench(
     ] = False,
 ) -> None:
     """Run one of the benchmarks."""
-    from mitransient_lidar.studies import bench_beams, bench_images
+    from mitransient_lidar.studies.bench import beams as narrow
+    from mitransient_lidar.studies.bench import images as imagers
 
     if images and beams:
         raise UserError("--images and --beams: give one of them")
     if images:
-        bench_images.run(json=call.arguments["json"])
+        imagers.run(json=call.arguments["json"])
     elif beams:
-        bench_beams.run(json=call.arguments["json"])
+        narrow.run(json=call.arguments["json"])
     else:
         with call.named():
             call.function(**call.arguments)
@@ -120,7 +121,7 @@ COMMANDS = {
         dash for those that are not given and have no default, or are not used.
         """,
     ),
-    "bench": Command(_HEADING, "studies.bench:run", _bench, "Measure the time to a given accuracy."),
+    "bench": Command(_HEADING, "studies.bench.integrators:run", _bench, "Measure the time to a given accuracy."),
 }
 
 SCENES = {

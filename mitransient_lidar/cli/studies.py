@@ -1,13 +1,14 @@
-"""Commands of studies: a public function, its figure with the data, and its lines."""
+"""Commands of studies: a public function, its figure with the data, and its lines; and tables of an instrument."""
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, write_netcdf
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.generator import Call, Command, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.cli.options import OUTPUT, DrawingOnly, Quiet
@@ -20,8 +21,8 @@ def _study(
 ) -> Command:
     """Return the command of a module of studies, and of its function, by default that of the same name.
 
-    `plot` is the function that draws the result, in the module of the same name in ``plots.studies`` or in another one;
-    `describe` returns the lines of a result; `table` writes a CSV file.
+    `plot` is the function that draws the result, as ``module:name`` of ``plots``; `describe` returns its lines; `table`
+    writes a CSV file.
     """
     suffixes = (".nc",) * has_data + (".csv",) * bool(table)
 
@@ -30,7 +31,7 @@ def _study(
         found = call()
         output.parent.mkdir(parents=True, exist_ok=True)
         with announced():
-            function_at(plot if ":" in plot else f"plots.studies.{name}:{plot}")(found, output)
+            function_at(f"plots.{plot}")(found, output)
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
@@ -52,10 +53,73 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
         typer.echo("\n".join(lines))
 
 
+def _depth_bias(
+    call: Call,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="NetCDF file; output/INSTRUMENT_depths.nc by default.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG, PDF or SVG file of the biases of all estimators against the angle.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write the table of an instrument, and draw its biases."""
+    target = output or OUTPUT / f"{call.arguments['instrument']}_depths.nc"
+    check_suffix("--output", target, ".nc")
+    check_targets(target.parent, [target], call.arguments["scene"])
+    check_figure(figure, option="--figure")
+    from mitransient_lidar.studies.depth_bias import describe_depth_bias
+
+    found = call()
+    with announced():
+        write_netcdf(found, target)
+        if figure is not None:
+            from mitransient_lidar.plots.studies.depths import plot_depth_bias
+
+            figure.parent.mkdir(parents=True, exist_ok=True)
+            plot_depth_bias(found, figure)
+    typer.echo("\n".join(describe_depth_bias(found)))
+
+
+def _tpu(
+    call: Call,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    quiet: Quiet = False,
+) -> None:
+    """Write the uncertainties of an instrument, with figures and fits of each altitude and angle."""
+    from mitransient_lidar.analysis.depth_uncertainty import write_fits
+    from mitransient_lidar.loading.instruments import read_instrument
+    from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
+    from mitransient_lidar.studies.tpu import describe_tpu
+
+    instrument = call.arguments["instrument"]
+    read_instrument(instrument)
+    target = output / f"{instrument}_tpu.nc"
+    former = sorted(output.glob(f"{glob.escape(instrument)}_*m_*deg_*"))
+    check_targets(output, [target, *former], call.arguments["scene"])
+    found = call()
+    output.mkdir(parents=True, exist_ok=True)
+    with announced():
+        write_netcdf(found, target)
+        for height in found["altitude"].values:
+            for angle in found["off_nadir_deg"].values:
+                one = found.sel(altitude=height, off_nadir_deg=angle)
+                if one["found"].isnull().all():  # for lack of time
+                    continue
+                stem = f"{instrument}_{height:g}m_{angle:g}deg"
+                plot_uncertainty(one, output / f"{stem}_tvu.png")
+                plot_orders(one, output / f"{stem}_orders.png")
+                for kind in one["correction"].values:
+                    suffix = "" if kind == "none" else "_corrected"
+                    write_fits(one.sel(correction=kind), "vertical", output / f"{stem}_tvu{suffix}.csv")
+                write_fits(one, "horizontal", output / f"{stem}_thu.csv")
+    typer.echo("\n".join(describe_tpu(found)))
+
+
 STUDIES = {
     "find-shots": _study(
         "find_shots",
-        "plot_found_shots",
+        "studies.shots:plot_found_shots",
         "describe_found_shots",
         """Find places of the sea where the beam meets given slopes.
 
@@ -65,7 +129,7 @@ STUDIES = {
     ),
     "target-signal": _study(
         "target_signal",
-        "plot_target_signal",
+        "studies.targets:plot_target_signal",
         "describe_target",
         """Measure the signal of a target in each pixel.
 
@@ -74,7 +138,7 @@ STUDIES = {
     ),
     "detect": _study(
         "detection",
-        "plot_detection",
+        "studies.targets:plot_detection",
         "describe_detection",
         """Compute how well a target is detected.
 
@@ -84,7 +148,7 @@ STUDIES = {
     ),
     "estimate": _study(
         "estimate",
-        "plots.waveforms:plot_components",
+        "waveforms:plot_components",
         "describe_estimate",
         """Estimate the waveforms in a second, over a level sea and without targets.
 
@@ -93,7 +157,7 @@ STUDIES = {
     ),
     "bounds": _study(
         "bounds",
-        "plot_bounds",
+        "studies.parameters:plot_bounds",
         "describe_bounds",
         """Compute the least errors of parameters from a shot, and rank designs.
 
@@ -104,7 +168,7 @@ STUDIES = {
     ),
     "beam-spread": _study(
         "beam_spread",
-        "plot_beam_spread",
+        "studies.light:plot_beam_spread",
         "describe_spread",
         """Measure the spread of the laser's light at depths.
 
@@ -113,13 +177,13 @@ STUDIES = {
     ),
     "fov-sweep": _study(
         "fov_sweep",
-        "plot_fov_sweep",
+        "studies.light:plot_fov_sweep",
         "describe_fov_sweep",
         "Measure the water's attenuation for several fields of view.",
     ),
     "scattering-orders": _study(
         "scattering_orders",
-        "plot_scattering_orders",
+        "studies.light:plot_scattering_orders",
         "describe_orders",
         """Separate the received light by the number of scatterings.
 
@@ -131,5 +195,28 @@ STUDIES = {
         "studies.water_report:describe_water",
         _water,
         "Print the optical properties of a water and its parameters.",
+    ),
+    "depth-bias": Command(
+        "Study",
+        "studies.depth_bias:depth_bias",
+        _depth_bias,
+        """Measure the errors of the depths in an instrument's records.
+
+        Renders the instrument over known bottoms, by angle, wind, water and depth, records it with the noise of its
+        receiver, measures the depths, and prints share found, bias, spread and stated error of the estimator gaussian
+        [cm]. The file holds all estimators; echoes --correct takes it.
+        """,
+    ),
+    "tpu": Command(
+        "Study",
+        "studies.tpu:tpu",
+        _tpu,
+        """Determine the vertical and horizontal uncertainty of an instrument's soundings.
+
+        Renders the instrument over known bottoms, by altitude, angle, wind, water and depth, and writes uncertainties
+        of single soundings, measured and corrected, and the orders of IHO S-44 that they meet as NetCDF file, figures,
+        and the fits of the part below the sea surface as CSV files for uncertainty tools. Prints TVU at 95 % [cm] and
+        the fits.
+        """,
     ),
 }

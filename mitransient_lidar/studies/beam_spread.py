@@ -56,9 +56,9 @@ _COLUMN = 17
 @alone
 def beam_spread(
     scene: Scene,
-    depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
     params: Mapping[str, Any] | None = None,
     *,
+    depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
     instrument: Instrument = None,
     passes: Annotated[int, Option("Number of independent passes of each render", 2, 10_000)] = 8,
     max_time: FewerPasses = None,

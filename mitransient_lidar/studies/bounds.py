@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import itertools
-import logging
 import math
 import os
-import time
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -34,11 +32,10 @@ from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
+from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.variables import label
-
-_LOG = logging.getLogger(__name__)
+from mitransient_lidar.studies.cases import Cases
 
 #: Most designs of a comparison.
 MOST_DESIGNS = 1000
@@ -148,29 +145,21 @@ def bounds(
     """
     if isinstance(free, str) or len(free) == 0 or len(set(free)) != len(free):
         raise UserError(f"free = {free!r} must be a list of different names of parameters")
-    sky, limit = background_power_w, max_time or math.inf
+    sky = background_power_w
     receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render
         session = open_scene(scene, {**(params or {}), **design}, instrument)
-    began, found = time.perf_counter(), []
-    for number, design in enumerate(designs):
-        if number and time.perf_counter() - began > limit:
-            _LOG.warning("max_time = %g s ended after %d of %d designs", limit, number, len(designs))
-            break
+    found: list[xr.Dataset] = []
+    cases = Cases(designs, "designs", steps=renders, max_time=max_time, progress=progress)
+    for design in cases:
         results = []
         for i in range(renders):
             # Seeds of a render are signed.
             options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
             options["instrument"] = instrument
-            results.append(render(scene, params={**(params or {}), **design}, **options))
-            if results[-1].attrs.get("interrupted"):
-                raise KeyboardInterrupt("interrupted; bounds need all renders, and none is kept.")
-            if progress is not None:
-                done, planned = number * renders + i + 1, len(designs) * renders
-                elapsed = time.perf_counter() - began
-                left = elapsed / done * (planned - done)
-                progress(Progress(done, planned, "render", elapsed_s=elapsed, remaining_s=left))
+            results.append(cases.keep(render(scene, params={**(params or {}), **design}, **options)))
+            cases.step()
         for chain in receivers.values():
             settings: dict[str, Any] = {"gain": gain, "optical_density": optical_density, "nuisances": known}
             found.append(fisher_information(results, chain, sky, **settings))
@@ -182,11 +171,11 @@ def bounds(
         "renders": renders,
         "passes": passes,
         "seed": seed,
-        "designs_left_out": len(designs) - len(found) // len(receivers),
+        "designs_left_out": cases.left_out,
         "background_power_w": sky,
         **{f"scene.{name}": str(value) for name, value in (params or {}).items()},
     }
-    designs = designs[: len(found) // len(receivers)]
+    designs = designs[: cases.begun]
     if len(receivers) > 1:
         designs = [{**design, "receiver": name} for design in designs for name in receivers]
     return _compared(found, designs, attributes)

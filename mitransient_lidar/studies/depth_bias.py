@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import time
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -28,23 +27,28 @@ from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import label
+from mitransient_lidar.studies.cases import Cases
 
 _LOG = logging.getLogger(__name__)
 
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
 
+
+def rising(meaning: str, unit: str, **more: Any) -> Option:
+    """Return the declaration of a list of increasing numbers from 0 on."""
+    return Option(meaning, 0, None, unit, ascending=True, form="N,N,...", **more)
+
+
 #: Parameters of tables of an instrument.
 InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
-Winds = Annotated[
-    Numbers, Option("Wind speeds; 0 for a level sea with ripples", 0, None, "m/s", ascending=True, form="N,N,...")
-]
+Winds = Annotated[Numbers, rising("Wind speeds; 0 for a level sea with ripples", "m/s")]
 Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
-Depths = Annotated[Numbers, Option("Depths of the bottom", 0, None, "m", above=True, ascending=True, form="N,N,...")]
+Depths = Annotated[Numbers, rising("Depths of the bottom", "m", above=True)]
 SeaScene = Annotated[str, Option("Scene whose sea, water and bottom count")]
 OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrument's")]
 Places = Annotated[int, Option("Random places of a sea with waves, or renders of a level sea", 2, 10_000)]
@@ -88,20 +92,10 @@ def depth_bias(
     params: Mapping[str, Any] | None = None,
     *,
     angles_deg: Annotated[
-        Numbers | None,
-        Option(
-            "Angles from nadir; the instrument's and 5 more by default",
-            *(0, None, "degrees"),
-            ascending=True,
-            form="N,N,...",
-            flag="--angles",
-        ),
+        Numbers | None, rising("Angles from nadir; the instrument's and 5 more by default", "degrees", flag="--angles")
     ] = None,
     winds: Winds = (0.0, 3.0, 6.0),
-    ripples: Annotated[
-        Numbers,
-        Option("Winds whose ripples level seas have", 0, None, "m/s", above=True, ascending=True, form="N,N,..."),
-    ] = (3.0, 6.0),
+    ripples: Annotated[Numbers, rising("Winds whose ripples level seas have", "m/s", above=True)] = (3.0, 6.0),
     waters: Waters = WATERS,
     depths: Depths = (3.0, 6.0, 10.0),
     scene: SeaScene = "table1",
@@ -138,14 +132,9 @@ def depth_bias(
         NaN.
     estimators
         Estimators of `echo_table.extract`.
-    shots, records
-        Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
-        each, 1 to 10 000.
     target_error
         Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
         have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
-    corrections
-        A former table, its file, or ``auto`` for the shipped one, to correct the depths by.
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
         out are NaN, and the attribute ``seas_left_out`` has their number.
@@ -188,17 +177,12 @@ def depth_bias(
     if waves.size < axes["wind_speed"].size:
         axes["wind_speed"] = np.concatenate([np.zeros_like(of_level), waves])
         waves = np.concatenate([of_level, waves])
-    limit = max_time or math.inf
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
-    began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
     pixels: list[str] = []
-    left_out = 0
     geometry: dict[str, float] = {}
-    for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
-        if cells and time.perf_counter() - began > limit:
-            left_out = total - number
-            _LOG.warning("max_time = %g s ended after %d of %d seas, the others are NaN", limit, number, total)
-            break
+    places = list(np.ndindex(*(values.size for values in axes.values())))
+    seas = Cases(places, "seas", max_time=max_time, progress=progress)
+    for place in seas:
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
         shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
         if not _is_lost(shallower):
@@ -209,7 +193,7 @@ def depth_bias(
                 "wind_speed": float(waves[place[1]]),
                 "jerlov": str(water),
                 "bottom_depth": float(depth),
-                "surface_seed": seed + number,
+                "surface_seed": seed + seas.begun - 1,
                 **({} if wind else {"spectrum": "flat"}),
             }
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
@@ -221,17 +205,12 @@ def depth_bias(
             except DryBottomError:
                 _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
             else:
-                if rendered.attrs.get("interrupted"):
-                    raise KeyboardInterrupt(f"interrupted after {number} of {total} renders, and none is kept.")
-                recorded = detect_waveforms(rendered, receiver or instrument, records, seed)
+                recorded = detect_waveforms(seas.keep(rendered), receiver or instrument, records, seed)
                 _check_counts(recorded)
                 cells[place] = _cell(recorded, estimators, former)
                 pixels = [str(name) for name in recorded["pixel"].values]
                 geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
-        if progress is not None:
-            elapsed = time.perf_counter() - began
-            left = elapsed / (number + 1) * (total - number - 1)
-            progress(Progress(number + 1, total, "render", elapsed, left))
+        seas.step()
     if not cells:
         raise UserError(f"depth = {axes['depth'].tolist()} must hold one below the waves of {winds} m/s")
     attributes = {
@@ -246,10 +225,10 @@ def depth_bias(
         "target_error": target_error,
         "level_renders": shots,
         "seed": seed,
-        "seas_left_out": left_out,
+        "seas_left_out": seas.left_out,
         **geometry,
     }
-    found = _labelled(axes, cells, pixels, list(estimators), attributes, total - left_out)
+    found = _labelled(axes, cells, pixels, list(estimators), attributes, seas.begun)
     return label(found.assign_coords(ripples=("wind_speed", waves)))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,8 +32,9 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
+from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.variables import label
+from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -93,8 +93,6 @@ def detect(
     clutter
         Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or
         4 to 1000.
-    renders
-        Independent renders of the scene without clutter, 3 to 1000, from whose spread the intervals are estimated.
     max_time
         Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
         attribute ``depths_left_out`` has those that are left out as text, and a warning names them.
@@ -143,7 +141,6 @@ def detect(
     renders, depths, sky = clutter or renders, list(depths), background_power_w
     if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
-    limit = max_time or math.inf
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(scene, params, instrument)
@@ -158,15 +155,10 @@ def detect(
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render
         find_target(open_scene(scene, {**(params or {}), "target_depth": depth}, instrument).scene, target_id)
-    began, left_out = time.perf_counter(), ""
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []
-    for place in (None, *depths):
-        if experiments and time.perf_counter() - began > limit:
-            done = len(experiments) - 1
-            depths, left_out = depths[:done], ", ".join(f"{depth:g}" for depth in depths[done:])
-            _LOG.warning("max_time = %g s ended before the depths of %s m, which are left out", limit, left_out)
-            break
+    cases = Cases((None, *depths), "depths", steps=renders, max_time=max_time, progress=progress)
+    for place in cases:
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
         fixed = session.scene if place is None else open_scene(scene, moved, instrument).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
@@ -177,23 +169,14 @@ def detect(
                 sea = open_scene(scene, {**moved, "surface_seed": number}, instrument)
                 # The records of all seas have the bins of the first one.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
-            found.append(
-                target_signal(
-                    sea if clutter else fixed,
-                    seed=pass_seed(seed, i) >> 1,  # seeds of a render are signed
-                    target_id=target_id,
-                    passes=passes,
-                    integrator=integrator,
-                    axis=axis,
-                )
-            )
-            if found[-1].attrs.get("interrupted"):
-                raise KeyboardInterrupt("interrupted; detection needs all renders, and none is kept.")
-            if progress is not None:
-                done = len(experiments) * renders + len(found)
-                progress(Progress(done, (1 + len(depths)) * renders, "render"))
+            own = pass_seed(seed, i) >> 1  # seeds of a render are signed
+            options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator}
+            found.append(cases.keep(target_signal(sea if clutter else fixed, seed=own, axis=axis, **options)))
+            cases.step()
         first = first or found
         experiments.append(_experiment(found, bool(clutter), chain, lidar, sky))
+    left_out = ", ".join(f"{depth:g}" for depth in depths[cases.begun - 1 :])
+    depths = depths[: cases.begun - 1]
     called = receiver if isinstance(receiver, str) else "custom"
     try:
         data = trials.needs(experiments[0], pfa, pd)

@@ -76,8 +76,8 @@ def find_shots(
 
     Parameters
     ----------
-    scene, params, waveforms, max_time, progress
-        As for `render_found_shots`.
+    scene, params, progress
+        As for `rendering.shots.series.render_shots`: an XML scene with the parameters ``aim_x`` and ``aim_y``.
 
     Returns
     -------
@@ -118,23 +118,9 @@ def render_found_shots(
     max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> RenderedShots:
-    """Render shots, and map the sea and the footprints of beam and pixels.
+    """Render shots of a scene with the parameters ``aim_x`` and ``aim_y``, and map sea and footprints.
 
-    Parameters
-    ----------
-    scene, params
-        An XML scene with the parameters ``aim_x`` and ``aim_y``.
-    shots
-        Places.
-    waveforms
-        Whether to render the shots.
-    max_time, progress
-        As for `rendering.shots.series.render_shots`: `results` may hold the first shots alone.
-
-    Raises
-    ------
-    UserError
-        If the scene is invalid, has no waves or no parameters ``aim_x`` and ``aim_y``, or `max_time` is out of range.
+    `results` may hold the first shots alone. Raises `UserError` if the scene is invalid or has no waves.
     """
     if waveforms:
         variants.leave_the_gpu("shots are rendered")

@@ -8,6 +8,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,9 +119,6 @@ def fit(
     free_scale, free_time
         Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
         file, whose unit and time zero are unknown.
-    receiver
-        Receiver of a recorded signal, by default the one that it names; or of a CSV file, whose response and noise the
-        model gets (`analysis.information.measured.measured`).
     passes
         Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
         a tenth of that of the waveforms, 16 to 256.
@@ -155,39 +153,40 @@ def fit(
             raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
         start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
         bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
-    options: dict[str, Any] = {"free_scale": free_scale, "free_time": free_time}
+    model = None
     if callable(scene):
-        own = BehindBandwidth(scene) if BANDWIDTH in names else scene
         if missing := [name for name in names if name not in (start or {})]:
             raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
-        known = start or {}
-        starts = {name: known[name] for name in names} | dict(known)
-        problem = WaveformFit(found, own, starts, bounds, **options)
-        problem.approach(most_renders=most_renders, until=began + limit)
-        return _run(problem, began, limit, most_renders, scale_errors)
-    given = passes
-    attributes = source.attrs if isinstance(source, xr.Dataset) else {}
-    coarse = min(given or _FEWEST_PASSES, _COARSE_PASSES)
-    model = _RenderedModel(
-        _scene(scene, attributes),
-        params,
-        instrument,
-        [name for name in names if name != BANDWIDTH],
-        coarse,
-        _seed(seed, attributes),
-        progress,
-        between_bins=not found.calibrated if free_time is None else free_time,
-    )
-    starts = {**model.starts(start or {}), **(start or {})}
-    bounds = {**model.bounds(), **(bounds or {})}
-    light: Model = BehindBandwidth(model) if BANDWIDTH in names else model
-    problem = WaveformFit(found, light, starts, bounds, **options)
+        render_at: Model = scene
+        starts = {name: (start or {})[name] for name in names} | dict(start or {})
+    else:
+        attributes = source.attrs if isinstance(source, xr.Dataset) else {}
+        render_at = model = _RenderedModel(
+            _scene(scene, attributes),
+            dict(params or {}),
+            instrument,
+            [name for name in names if name != BANDWIDTH],
+            min(passes or _FEWEST_PASSES, _COARSE_PASSES),
+            _seed(seed, attributes),
+            progress,
+            not found.calibrated if free_time is None else free_time,
+        )
+        starts = {**model.starts(start or {}), **(start or {})}
+        bounds = {**model.bounds(), **(bounds or {})}
+
+    def light() -> Model:
+        return BehindBandwidth(render_at) if BANDWIDTH in names else render_at
+
+    problem = WaveformFit(found, light(), starts, bounds, free_scale=free_scale, free_time=free_time)
     problem.approach(most_renders=most_renders, until=began + limit)
-    if time.perf_counter() - began < limit and not problem.interrupted:
-        model.passes = given or _passes(problem.noise_ratio())
-        light = BehindBandwidth(model) if BANDWIDTH in names else model
-        problem.forget(light)
-    fitted = _run(problem, began, limit, most_renders, scale_errors)
+    if model is not None and time.perf_counter() - began < limit and not problem.interrupted:
+        model.passes = passes or _passes(problem.noise_ratio())
+        problem.forget(light())
+    fitted = problem.run(most_renders=most_renders, until=began + limit, scale_errors=scale_errors)
+    if not fitted.attrs["converged"] and time.perf_counter() - began >= limit:
+        logger.warning("max_time = %g s ended the fit after %d renders, before convergence", limit, problem.renders)
+    if model is None:
+        return fitted
     return fitted.assign_attrs({"scene": model.name, "passes": model.passes, "seed": model.seed})
 
 
@@ -205,37 +204,27 @@ def _passes(ratio: float) -> int:
     return min(max(needed, _FEWEST_PASSES), _MOST_PASSES)
 
 
-def _run(problem: WaveformFit, began: float, limit: float, most_renders: int, scale_errors: bool) -> xr.Dataset:
-    """Return the fit, which ends `limit` [s] after it `began`, with a warning if it has not converged then."""
-    fitted = problem.run(most_renders=most_renders, until=began + limit, scale_errors=scale_errors)
-    if not fitted.attrs["converged"] and time.perf_counter() - began >= limit:
-        logger.warning("max_time = %g s ended the fit after %d renders, before convergence", limit, problem.renders)
-    return fitted
-
-
+@dataclass
 class _RenderedModel:
     """Renders of a scene by values of its free parameters, all with the same random numbers.
 
     Where light is interpolated `between_bins` that are too wide for it, the scene is rendered with narrower ones.
     """
 
-    def __init__(
-        self,
-        scene: str | os.PathLike[str] | SceneSource,
-        params: Mapping[str, Any] | None,
-        instrument: str | None,
-        names: Sequence[str],
-        passes: int,
-        seed: int,
-        progress: ProgressCallback | None,
-        *,
-        between_bins: bool,
-    ) -> None:
-        self.between_bins = between_bins
-        self.scene, self.params, self.instrument = scene, dict(params or {}), instrument
-        self.names, self.passes, self.seed, self.progress = list(names), passes, seed, progress
-        own = scene.values if isinstance(scene, SceneSource) else scene_parameters(scene, by_id=True)
-        self.name = scene.name if isinstance(scene, SceneSource) else Path(scene).stem
+    scene: str | os.PathLike[str] | SceneSource
+    params: dict[str, Any]
+    instrument: str | None
+    names: list[str]
+    passes: int
+    seed: int
+    progress: ProgressCallback | None
+    between_bins: bool
+
+    def __post_init__(self) -> None:
+        if isinstance(self.scene, SceneSource):
+            self.name, own = self.scene.name, self.scene.values
+        else:
+            self.name, own = Path(self.scene).stem, scene_parameters(self.scene, by_id=True)
         self.texts = {**own, **{name: str(value) for name, value in self.params.items()}}
         self.done, self.began = 0, time.perf_counter()
 

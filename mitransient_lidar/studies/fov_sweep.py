@@ -39,11 +39,11 @@ logger = logging.getLogger(__name__)
 @alone
 def fov_sweep(
     scene: Scene,
+    params: Mapping[str, Any] | None = None,
+    *,
     fov_mrad: Annotated[
         Numbers, Option("Full angles of the fields of view", 0, unit="mrad", above=True, form="N,N,...")
     ] = (2, 5, 10, 20, 50, 100),
-    params: Mapping[str, Any] | None = None,
-    *,
     instrument: Instrument = None,
     min_depth: Annotated[
         float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
@@ -176,7 +176,7 @@ def describe_fov_sweep(found: xr.Dataset) -> list[str]:
 
 def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) -> Mapping[str, Any] | None:
     """Return the parameters with the widest field of view, if it is a parameter of the scene."""
-    if not isinstance(scene, (str, os.PathLike)):
+    if not isinstance(scene, (str, os.PathLike)) or not isinstance(params or {}, Mapping):
         return params
     document, name = read_document(scene_path(scene)), "field_of_view_mrad"
     # Pixels within a receiver have views of their own, in place of the receiver's.

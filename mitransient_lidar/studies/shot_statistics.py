@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
@@ -39,17 +37,12 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
     UserError
         If the scene has no bottom, or the record lacks an echo.
     """
-    times = _echo_times(series)
-    rows: list[dict[str, Any]] = []
-    for number in range(series.sizes["shot"]):
-        shot = series.isel(shot=number)
-        row: dict[str, Any] = {name: float(shot[name]) for name in ("aim_x", "aim_y")}
-        row |= {f"slope_{name}": float(shot[f"true_slope_{name}"]) for name in ("along", "across")}
-        for name, time in times.items():
-            gate = time - _HALF_GATE_NS, time + _HALF_GATE_NS
-            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(shot, *gate)
-        rows.append(row)
-    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    columns: dict[str, FloatArray] = {name: series[name].values for name in ("aim_x", "aim_y")}
+    columns |= {f"slope_{name}": series[f"true_slope_{name}"].values for name in ("along", "across")}
+    shape = series.sizes["shot"], -1
+    for name, time in _echo_times(series).items():
+        heights, times = highest_points(series, time - _HALF_GATE_NS, time + _HALF_GATE_NS)
+        columns |= {f"{name}_peak": heights.reshape(shape), f"{name}_time": times.reshape(shape)}
     data = {name: (("shot", "pixel")[: values.ndim], values) for name, values in columns.items()}
     pixels = [str(name) for name in series["pixel"].values]
     return label(xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs), "highest")
@@ -70,7 +63,8 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
     Returns
     -------
     height, time
-        Power [W] and time [ns], shape (pixels,); NaN where the highest bin lies at a limit of the gate.
+        Power [W] and time [ns], shape (waveforms,), of the pixels of one shot, or of several shots in a row; NaN where
+        the highest bin lies at a limit of the gate.
 
     Raises
     ------

@@ -12,15 +12,16 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Instrument, Option, Scene, TargetId, checked, positive_option
+from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
-from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import described, label
+from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -63,7 +64,7 @@ def target_signal(
     scene, params, instrument, integrator
         As for `rendering.render.render`.
     grid, max_offset
-        Places of the target along each axis, and their largest offset from that in the scene, for the result of
+        Places of the target along each axis, and their largest offset from that in the scene: the result is that of
         `target_map` on a square.
     axis
         Time bins instead of automatic ones.
@@ -97,7 +98,7 @@ def target_signal(
         offsets = np.linspace(-max_offset, max_offset, grid).tolist()
         options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed, "integrator": integrator}
         options |= {"instrument": instrument, "max_time": max_time, "axis": axis, "progress": progress}
-        return target_map(scene, params, x=offsets, y=offsets, **options)
+        return target_map(scene, params, offsets, offsets, **options)
     session = open_scene(scene, params, instrument)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
@@ -123,45 +124,23 @@ def target_signal(
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 
-@checked
 @alone
 def target_map(
     scene: Any,
-    params: Mapping[str, Any] | None = None,
+    params: Mapping[str, Any] | None,
+    x: Sequence[float],
+    y: Sequence[float],
     *,
-    x: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
-    y: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
-    max_time: FewerPasses = None,
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """Measure the signal of a target at many places.
+    """Measure the signal of a target at offsets [m] from its place in an XML scene, with `options` of `target_signal`.
 
-    Parameters
-    ----------
-    scene, params
-        An XML scene with the parameters ``target_x`` and ``target_y``.
-    x, y
-        Offsets from the target's place in the scene [m], at least one of each.
-    max_time
-        Time for all places [s], above 0, shared equally among those that are left; each has at least 16 passes.
-    progress
-        Called with a `passes.Progress` after every place.
-    **options
-        Options of `target_signal`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Quantities of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m]; and the number
-        of ``place_passes`` over these alone.
-
-    Raises
-    ------
-    UserError
-        If the scene lacks these parameters, or as for `target_signal`.
-    KeyboardInterrupt
-        If a render was interrupted.
+    The time [s] is shared equally among the places that are left; each has at least 16 passes. Returns the quantities
+    of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m], and the number of
+    ``place_passes`` over these alone. Raises `UserError` if the scene lacks the parameters ``target_x`` and
+    ``target_y``, and KeyboardInterrupt if a render was interrupted.
     """
     known = open_scene(scene, params, options.get("instrument")).parameters
     for name in ("target_x", "target_y"):
@@ -169,18 +148,15 @@ def target_map(
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
     places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
     cells: list[xr.Dataset] = []
-    began = time.perf_counter()
-    for place_x, place_y in itertools.product(*places):
+    cases = Cases(list(itertools.product(*places)), "places", unit="place", progress=progress)
+    end = time.perf_counter() + (max_time or 0)
+    for place_x, place_y in cases:
         moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
         if max_time is not None:
-            left = max(max_time - (time.perf_counter() - began), 1e-3)
-            options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
-        cell = target_signal(scene, moved, **options).drop_dims("time")
-        if cell.attrs.get("interrupted"):
-            raise KeyboardInterrupt("interrupted; a map needs all places, and none is kept.")
+            options["max_time"] = max(end - time.perf_counter(), 1e-3) / (1 + cases.left_out)
+        cell = cases.keep(target_signal(scene, moved, **options)).drop_dims("time")
         cells.append(cell.assign(place_passes=((), cell.attrs["passes"], described("place_passes"))))
-        if progress is not None:
-            progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
+        cases.step()
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
     lines = [xr.concat(row, "target_y", combine_attrs="drop_conflicts") for row in rows]
     maps = xr.concat(lines, "target_x", combine_attrs="drop_conflicts")

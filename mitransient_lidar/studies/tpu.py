@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import time
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,9 +16,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Numbers, Option, checked
 from mitransient_lidar.core.validation import finite
 from mitransient_lidar.loading.instruments import read_instrument
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
+from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.depth_bias import (
     Depths,
     InstrumentName,
@@ -34,12 +32,11 @@ from mitransient_lidar.studies.depth_bias import (
     Waters,
     Winds,
     depth_bias,
+    rising,
 )
 
 #: Wind whose ripples a level sea has [m/s].
 RIPPLES = 5.0
-
-_LOG = logging.getLogger(__name__)
 
 #: Winds [m/s] and waters of the tables of uncertainty tools, and depths at which airborne lidars find the bottom.
 WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
@@ -51,24 +48,10 @@ def tpu(
     params: Mapping[str, Any] | None = None,
     *,
     altitudes: Annotated[
-        Numbers | None,
-        Option(
-            "Heights of the lidar above the sea; the instrument's by default",
-            *(0, None, "m"),
-            above=True,
-            ascending=True,
-            form="N,N,...",
-        ),
+        Numbers | None, rising("Heights of the lidar above the sea; the instrument's by default", "m", above=True)
     ] = None,
     angles_deg: Annotated[
-        Numbers | None,
-        Option(
-            "Angles from nadir; the instrument's by default",
-            *(0, None, "degrees"),
-            ascending=True,
-            form="N,N,...",
-            flag="--angles",
-        ),
+        Numbers | None, rising("Angles from nadir; the instrument's by default", "degrees", flag="--angles")
     ] = None,
     winds: Winds = WINDS,
     waters: Waters = WATERS,
@@ -97,9 +80,6 @@ def tpu(
         As of `depth_bias.depth_bias`.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
-    corrections
-        A table of `depth_bias.depth_bias` to also correct the depths by, its file, ``auto`` for the shipped one, or
-        None.
     pointing_mrad, position_m, height_m
         Errors of the survey's trajectory; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
@@ -127,26 +107,14 @@ def tpu(
     if corrections is not None:
         unwanted = isinstance(corrections, str) and corrections == "none"
         corrections = None if unwanted else corrections_for(instrument, corrections)
-    trajectory, limit = TrajectoryErrors(pointing_mrad, position_m, height_m), max_time
+    trajectory = TrajectoryErrors(pointing_mrad, position_m, height_m)
     angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
-    began = time.perf_counter()
     found: list[xr.Dataset] = []
-    for number, height in enumerate(heights):
-        left = None if limit is None else limit - (time.perf_counter() - began)
-        if found and left is not None and left <= 0:
-            _LOG.warning("max_time = %g s ended after %d of %d altitudes", limit, number, heights.size)
-            break
-
-        def report(state: Progress, number: int = number) -> None:
-            if progress is not None and state.planned is not None:
-                done, planned = number * state.planned + state.done, heights.size * state.planned
-                elapsed = time.perf_counter() - began
-                left = elapsed / done * (planned - done)
-                progress(replace(state, done=done, planned=planned, unit="cell", elapsed_s=elapsed, remaining_s=left))
-
+    cases = Cases(heights.tolist(), "altitudes", unit="cell", max_time=max_time, progress=progress)
+    for height in cases:
         table = depth_bias(
             instrument,
-            {**given, "altitude": float(height)},
+            {**given, "altitude": height},
             scene=scene,
             receiver=receiver,
             angles_deg=angles,
@@ -159,13 +127,13 @@ def tpu(
             records=records,
             seed=seed,
             corrections=corrections,
-            max_time=left,
-            progress=report,
+            max_time=cases.left,
+            progress=cases.step,
         )
-        found.append(sounding_uncertainty(table, trajectory))
+        found.append(sounding_uncertainty(cases.keep(table), trajectory))
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
     seas = math.prod(found[0].sizes[axis] for axis in AXES)
-    left_out = sum(one.attrs["seas_left_out"] for one in found) + (heights.size - len(found)) * seas
+    left_out = sum(one.attrs["seas_left_out"] for one in found) + cases.left_out * seas
     rendered = ("altitude", heights[: len(found)], described("altitude"))
     return joined.assign_coords(altitude=rendered).assign_attrs(estimator=estimator, seas_left_out=left_out)
 

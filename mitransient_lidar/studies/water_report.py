@@ -75,8 +75,6 @@ def describe_water(
     ----------
     kind, value, wavelength_nm, temperature, salinity
         As for `water_of`; or the kind ``profile`` and the path of a file for `profiles.read_profile`.
-    tolerance
-        Largest relative deviation of the layers from a profile, 1e-5 to 0.5.
 
     Raises
     ------

@@ -187,7 +187,7 @@ def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
     depths = [4.0, 8.0, 12.0]
     water = {"attenuation": absorption + scattering, "scattering": scattering, "backscattering": 0.0}
     scene = lidar_scene(tx=PENCIL, rx=VIEW, sea=LARGE_SEA, water={**MATCHED, **water, **narrow}, bottom=12.5, rho=0.0)
-    spread = beam_spread(scene, depths, passes=8, photons=2**15)
+    spread = beam_spread(scene, depths=depths, passes=8, photons=2**15)
     assert spread.attrs["mean_cosine"] == pytest.approx(np.exp(-(NARROW**2)), abs=2e-6)
     for number, depth in enumerate(depths):
         row = spread.isel(depth=number)

@@ -36,7 +36,7 @@ def test_single_scattering_falls_with_c(field_of_view):
 @pytest.fixture(scope="module")
 def ocean():
     """The default water, whose forward peak holds most of the scattering, seen by a narrow beam."""
-    return fov_sweep("table1", [1, 5, 20, 60, 150], {**VERTICAL, "divergence_mrad": 1}, passes=12, seed=3)
+    return fov_sweep("table1", {**VERTICAL, "divergence_mrad": 1}, fov_mrad=[1, 5, 20, 60, 150], passes=12, seed=3)
 
 
 def test_slope_falls_from_c_to_absorption(ocean):

@@ -127,4 +127,4 @@ def test_target_above_the_sea_is_refused(lidar_scene):
 @pytest.mark.slow
 def test_map_needs_a_target_that_can_be_moved():
     with pytest.raises(UserError, match="has no parameter target_x"):
-        target_map("fig09_2x2", passes=16)
+        target_map("fig09_2x2", None, [0.0], [0.0], passes=16)

@@ -161,10 +161,10 @@ app.main()
 
 COARSE = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
 STUDIES = {
-    "detect": (["small.xml", *COARSE, "--passes", 16, "-o", "d.png"], "detection needs all renders, and none"),
+    "detect": (["small.xml", *COARSE, "--passes", 16, "-o", "d.png"], "of 4 renders, and none is kept."),
     "target-signal": (
         ["small.xml", *COARSE, "--grid", 2, "--passes", 16, "-o", "t.png"],
-        "a map needs all places, and",
+        "of 4 places, and none is kept.",
     ),
     "depth-bias": (
         ["published_airborne", "--winds", 0, "--waters", "IB", "--angles", "5,10,15", "--depths", 4, "-o", "d.nc"],

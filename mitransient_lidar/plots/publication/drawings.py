@@ -12,12 +12,10 @@ from matplotlib.patches import Ellipse
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import refract
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.studies.publication.geometry import LAYOUT_SCENES, System, outlines
 from mitransient_lidar.studies.publication.renders import Renders
+from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, System, outlines
 
 _BEAM, _VIEW, _WATER, _BOTTOM = "#17963f", "#555555", "#3f8fc9", "#a8743a"
-
-_SCENE = "fig09_2x2"
 
 #: Half side of the part of the sea that is drawn, and distance of the refracted axes [m].
 _HALF_SIDE, _AXES_APART = 1.3, 0.25
@@ -25,7 +23,7 @@ _HALF_SIDE, _AXES_APART = 1.3, 0.25
 
 def system(_renders: Renders) -> Figure:
     """Draw the lidar, and beam and field of view in air and in water, in the plane of incidence (figure 5)."""
-    numbers = System.of(_SCENE)
+    numbers = System.of(FOUR)
     figure = drawing.new_figure(None, 8.0, 4.2)
     left, right = figure.subplots(1, 2)
     origin = np.array([-numbers.height * math.tan(numbers.off_nadir), 0.0, numbers.height])
@@ -69,7 +67,7 @@ def mesh(renders: Renders) -> Figure:
     """Draw axes refracted at facets of the sea, and its triangles with the footprints (figure 6)."""
     from mitransient_lidar.transport.scene_parts import seas_of
 
-    numbers, session = System.of(_SCENE), renders.session(_SCENE)
+    numbers, session = System.of(FOUR), renders.session(FOUR)
     sea = seas_of(session.scene)[0].sea
     figure = drawing.new_figure(None, 9.6, 4.6)
     left, right = figure.subplots(1, 2)
@@ -112,7 +110,7 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
 def pixels(renders: Renders) -> Figure:
     """Draw the pixels of the three layouts as seen from the lidar (figure 8)."""
     figure = drawing.new_figure(None, 8.4, 3.0)
-    for ax, scene, panel in zip(figure.subplots(1, 3), LAYOUT_SCENES, "abc", strict=True):
+    for ax, scene, panel in zip(figure.subplots(1, 3), LAYOUTS, "abc", strict=True):
         shapes = outlines(renders, scene)
         for number, (shape, colour) in enumerate(zip(shapes, drawing.pixel_colours(len(shapes)), strict=True)):
             for line in shape:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -21,9 +19,10 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
 from mitransient_lidar.plots.publication import waves as wave_drawings
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.studies.publication import echoes, geometry, layers, targets, waves
+from mitransient_lidar.studies.cases import Cases
+from mitransient_lidar.studies.publication import quantities
 from mitransient_lidar.studies.publication.renders import Renders
-from mitransient_lidar.studies.publication.statements import Statement, write_statements
+from mitransient_lidar.studies.publication.statements import Measured, Statement, statements_of, write_statements
 
 _LOG = logging.getLogger(__name__)
 
@@ -32,27 +31,27 @@ TABLE = "statements.csv"
 
 
 class _Figure(NamedTuple):
-    """How a figure is drawn, and the statements that it shows."""
+    """How a figure is drawn, and the quantities of the statements that it shows."""
 
     draw: Callable[[Renders], Figure]
-    statements: Callable[[Renders], list[Statement]] | None = None
+    measure: Callable[[Renders], Mapping[str, Measured]] = lambda _renders: {}
 
 
 _FIGURES = {
-    "fig01b": _Figure(waveforms.example, echoes.decay_statements),
-    "fig02": _Figure(waveforms.mine, echoes.target_statements),
-    "fig04": _Figure(waveforms.mast, echoes.mast_statements),
-    "fig05": _Figure(drawings.system, geometry.system_statements),
+    "fig01b": _Figure(waveforms.example, quantities.backscatter),
+    "fig02": _Figure(waveforms.mine, quantities.sphere),
+    "fig04": _Figure(waveforms.mast, quantities.mast),
+    "fig05": _Figure(drawings.system, quantities.system),
     "fig06": _Figure(drawings.mesh),
-    "fig08": _Figure(drawings.pixels, geometry.pixel_statements),
-    "fig09": _Figure(waveforms.pixels_over_bottom, echoes.pixel_statements),
-    "fig10": _Figure(wave_drawings.surface_echoes, waves.surface_statements),
-    "fig11": _Figure(wave_drawings.bottom_echoes, waves.bottom_statements),
-    "fig12": _Figure(wave_drawings.paths, geometry.path_statements),
-    "fig13": _Figure(waveforms.square_target, targets.square_statements),
-    "fig14": _Figure(waveforms.strip_target, targets.strip_statements),
-    "fig15": _Figure(waveforms.layered, layers.delay_statements),
-    "fig16": _Figure(waveforms.layer_zoom, layers.duration_statements),
+    "fig08": _Figure(drawings.pixels, quantities.pixel_shapes),
+    "fig09": _Figure(waveforms.pixels_over_bottom, quantities.pixels_over_bottom),
+    "fig10": _Figure(wave_drawings.surface_echoes, quantities.surface_echoes),
+    "fig11": _Figure(wave_drawings.bottom_echoes, quantities.bottom_echoes),
+    "fig12": _Figure(wave_drawings.paths, quantities.paths),
+    "fig13": _Figure(waveforms.square_target, quantities.square_target),
+    "fig14": _Figure(waveforms.strip_target, quantities.strip_target),
+    "fig15": _Figure(waveforms.layered, quantities.layer_delays),
+    "fig16": _Figure(waveforms.layer_zoom, quantities.layer_durations),
 }
 
 #: Names of the figures.
@@ -110,8 +109,6 @@ def figures(
         If a file cannot be written.
     """
     chosen = check_names(names)
-    limit = max_time or math.inf
-    began = time.perf_counter()
     renders = Renders(target_error, seed, progress)
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,19 +116,18 @@ def figures(
     found: list[Statement] = []
     interrupted = False
     try:
-        for number, name in enumerate(chosen, start=1):
-            if files and time.perf_counter() - began > limit:
-                _LOG.warning("max_time = %g s ended after %d of %d figures", limit, len(files), len(chosen))
-                break
-            _LOG.info("%s, %d of %d", name, number, len(chosen))
+        cases = Cases(chosen, "figures", max_time=max_time)
+        for name in cases:
+            _LOG.info("%s, %d of %d", name, cases.begun, len(chosen))
             figure = _FIGURES[name]
-            stated = figure.statements(renders) if figure.statements else []
+            stated = statements_of(name, figure.measure(renders))
             path = folder / f"{name}.png"
             # The table holds the statements of the figures that are there, even if the process is killed.
             with together():
                 drawing.save(figure.draw(renders), path)
                 write_statements([*found, *stated], folder / TABLE)
             files.append(path)
+            cases.kept += 1
             found += stated
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):

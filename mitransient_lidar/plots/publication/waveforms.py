@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.layout import draw_sea_level
-from mitransient_lidar.studies.publication import echoes, layers, targets
+from mitransient_lidar.studies.publication import scenes
 from mitransient_lidar.studies.publication.measures import change
 from mitransient_lidar.studies.publication.renders import Renders, as_series, geometry_of
 
@@ -62,7 +62,7 @@ def draw_waveforms(
 
 def example(renders: Renders) -> Figure:
     """Draw a received waveform, on linear and logarithmic axes (figure 1b)."""
-    result = renders.shot(echoes.SINGLE)
+    result = renders.shot(scenes.SINGLE)
     figure = drawing.new_figure(None, 8.0, 3.2)
     for ax, log in zip(figure.subplots(1, 2), (False, True), strict=True):
         draw_waveforms(ax, result, (-1.5, 10.0), log=log)
@@ -73,51 +73,49 @@ def example(renders: Renders) -> Figure:
 
 def mine(renders: Renders) -> Figure:
     """Draw the echo of a sphere (figure 2)."""
-    figure = drawing.new_figure(None, 6.0, 3.4)
-    ax = figure.subplots()
-    result = renders.shot(echoes.MINE)
-    draw_waveforms(ax, result, (-1.5, 14.0), log=True)
-    draw_waveforms(ax, result, (-1.5, 14.0), log=True, origin="target", color="#7a3fb0", label="sphere alone")
-    _show_decades([ax])
-    ax.legend(frameon=False)
-    ax.set_title("2  sphere of 1 m at 9 m", fontsize="medium")
+    figure = _with_part(renders.shot(scenes.MINE), (-1.5, 14.0), "2  sphere of 1 m at 9 m", "sphere alone", log=True)
+    _show_decades(figure.axes)
     return figure
 
 
 def mast(renders: Renders) -> Figure:
     """Draw the echo of a target below a mast (figure 4)."""
+    summed = renders.shot(scenes.MAST).sum("pixel", keepdims=True, keep_attrs=True)
+    return _with_part(summed, (-0.5, 2.5), "4  target of 1 m² at 1 m, grazing angle 5.4°", "target alone")
+
+
+def _with_part(result: xr.Dataset, limits: tuple[float, float], title: str, label: str, *, log: bool = False) -> Figure:
+    """Draw waveforms and the light of the target alone."""
     figure = drawing.new_figure(None, 6.0, 3.4)
     ax = figure.subplots()
-    result = renders.shot(echoes.MAST)
-    summed = result.sum("pixel", keepdims=True, keep_attrs=True)
-    draw_waveforms(ax, summed, (-0.5, 2.5))
-    draw_waveforms(ax, summed, (-0.5, 2.5), origin="target", color="#7a3fb0", label="target alone")
+    draw_waveforms(ax, result, limits, log=log)
+    draw_waveforms(ax, result, limits, log=log, origin="target", color="#7a3fb0", label=label)
     ax.legend(frameon=False)
-    ax.set_title("4  target of 1 m² at 1 m, grazing angle 5.4°", fontsize="medium")
+    ax.set_title(title, fontsize="medium")
     return figure
 
 
 def pixels_over_bottom(renders: Renders) -> Figure:
     """Draw four pixels and one over a flat bottom (figure 9)."""
-    return _four_and_one(renders, (echoes.FOUR, echoes.SINGLE), (-1.5, 10.0), "9")
+    return _four_and_one(renders, (scenes.FOUR, scenes.SINGLE), (-1.5, 10.0), "9")
 
 
 def layered(renders: Renders) -> Figure:
     """Draw four pixels and one over water in two layers (figure 15)."""
-    figure = _four_and_one(renders, (layers.FOUR, layers.SINGLE), (-1.5, 9.5), "15", log=True)
+    figure = _four_and_one(renders, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), (-1.5, 9.5), "15", log=True)
     _show_decades(figure.axes)
     return figure
 
 
 def layer_zoom(renders: Renders) -> Figure:
     """Draw the change at 3 m, with arrows at its start and stop (figure 16)."""
-    figure = _four_and_one(renders, (layers.FOUR, layers.SINGLE), (1.8, 5.0), "16", log=True)
-    for ax, scene in zip(figure.axes, (layers.FOUR, layers.SINGLE), strict=True):
+    figure = _four_and_one(renders, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), (1.8, 5.0), "16", log=True)
+    for ax, scene in zip(figure.axes, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), strict=True):
         result = renders.shot(scene)
         mean, geometry = as_series(result).mean(), geometry_of(result)
         factor, _ = drawing.si_prefix(float(mean.power[:, geometry.depth_of_time(mean.time) >= 1.8].max()))
         colours = drawing.pixel_colours(len(mean.power))
-        for pixel, middle in enumerate(layers.layer_times(result)):
+        for pixel, middle in enumerate(scenes.layer_times(result)):
             for time in change(mean, pixel, float(middle)):
                 point = float(geometry.depth_of_time(time)), float(np.interp(time, mean.time, mean.power[pixel]))
                 arrow = {"arrowstyle": "-|>", "color": colours[pixel], "linewidth": 0.9}
@@ -129,19 +127,19 @@ def layer_zoom(renders: Renders) -> Figure:
 
 def square_target(renders: Renders) -> Figure:
     """Draw pixels and target on the sea, and the waveforms, of 2x2 pixels (figure 13)."""
-    return _target(renders, targets.SQUARE, "13")
+    return _target(renders, scenes.SQUARE, "13")
 
 
 def strip_target(renders: Renders) -> Figure:
     """Draw pixels and target on the sea, and the waveforms, of 1x4 pixels (figure 14)."""
-    return _target(renders, targets.STRIPS, "14")
+    return _target(renders, scenes.STRIPS, "14")
 
 
 def _four_and_one(
-    renders: Renders, scenes: tuple[str, str], limits: tuple[float, float], number: str, log: bool = False
+    renders: Renders, pair: tuple[str, str], limits: tuple[float, float], number: str, log: bool = False
 ) -> Figure:
     figure = drawing.new_figure(None, 9.0, 3.5)
-    for ax, scene, panel in zip(figure.subplots(1, 2), scenes, ("a", "b"), strict=True):
+    for ax, scene, panel in zip(figure.subplots(1, 2), pair, ("a", "b"), strict=True):
         result = renders.shot(scene)
         draw_waveforms(ax, result, limits, log=log)
         ax.set_title(f"{number} ({panel})  {'2x2 pixels' if panel == 'a' else 'single pixel'}", fontsize="medium")

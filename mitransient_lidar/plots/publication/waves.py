@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from mitransient_lidar.physics.lidar.refraction import refract
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
-from mitransient_lidar.plots.studies.find_shots import draw_sea
+from mitransient_lidar.plots.studies.shots import draw_sea
 from mitransient_lidar.studies.find_shots import render_found_shots
-from mitransient_lidar.studies.publication.geometry import SHOT_SCENES, System, shot_places
 from mitransient_lidar.studies.publication.renders import Renders
-from mitransient_lidar.studies.publication.waves import shots
+from mitransient_lidar.studies.publication.scenes import SHOTS, System, shot_places, three_shots
 
 _STYLES = ("-", "--", ":")
 
@@ -27,7 +26,7 @@ def surface_echoes(renders: Renders) -> Figure:
     figure = drawing.new_figure(None, 10.4, 6.2)
     axes = figure.subplots(2, 3)
     _draw_places(renders, axes[0], "10")
-    for ax, result, panel in zip(axes[1], shots(renders), "bcd", strict=True):
+    for ax, result, panel in zip(axes[1], three_shots(renders), "bcd", strict=True):
         draw_waveforms(ax, result, (-1.2, 1.2))
         ax.set_title(f"10 ({panel})  surface echo, shot {'bcd'.index(panel) + 1}", fontsize="medium")
     add_pixel_legend(axes[1, 0], "upper left")
@@ -40,7 +39,7 @@ def bottom_echoes(renders: Renders) -> Figure:
     grid = figure.add_gridspec(2, 3)
     _draw_places(renders, [figure.add_subplot(grid[0, number]) for number in range(3)], "11")
     ax = figure.add_subplot(grid[1, :])
-    results = shots(renders)
+    results = three_shots(renders)
     for number, (result, style) in enumerate(zip(results, _STYLES, strict=True), start=1):
         draw_waveforms(ax, result, (4.0, 6.5), pixels=[0], label=f"shot {number}", linestyle=style)
     ax.legend(frameon=False)
@@ -50,7 +49,7 @@ def bottom_echoes(renders: Renders) -> Figure:
 
 def paths(renders: Renders) -> Figure:
     """Draw the paths below the slopes of shots 1 and 3, refracted by Snell's law (figure 12)."""
-    system, places = System.of(SHOT_SCENES[0]), shot_places(renders)
+    system, places = System.of(SHOTS[0]), shot_places(renders)
     figure = drawing.new_figure(None, 7.0, 3.6)
     for ax, slope, name in zip(figure.subplots(1, 2), (places[0].along, places[2].along), "AB", strict=True):
         down = np.array([math.sin(system.off_nadir), -math.cos(system.off_nadir)])
@@ -74,7 +73,7 @@ def paths(renders: Renders) -> Figure:
 def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:
     """Draw the sea about each shot, with the footprints of beam and pixels."""
     places = shot_places(renders)
-    drawn = render_found_shots(renders.session(SHOT_SCENES[0]), places, waveforms=False)
+    drawn = render_found_shots(renders.session(SHOTS[0]), places, waveforms=False)
     for index, (ax, shot) in enumerate(zip(axes, places, strict=True)):
         draw_sea(ax, dataclasses.replace(drawn, shots=(shot,)), first=index + 1)
         # Adding 0 turns -0 into 0.

@@ -65,10 +65,6 @@ class Series:
         """Return the mean of the shots."""
         return self._mean(np.full(len(self), True))
 
-    def error(self) -> FloatArray:
-        """Return the standard error [W] of the mean, shape (pixel, time)."""
-        return np.asarray(self.power.std(axis=0, ddof=1) / np.sqrt(len(self)))
-
     def without(self, shot: int) -> Waveform:
         """Return the mean of the other shots."""
         return self._mean(np.arange(len(self)) != shot)
@@ -162,3 +158,21 @@ def change(waveform: Waveform, pixel: int, middle: float) -> tuple[float, float]
     before = bins[time[near][bins] < stop] if np.isfinite(stop) else bins
     start = highest_of(time[near], -curvature[None], before)[1][0] if len(before) > 2 else float("nan")
     return float(start), float(stop)
+
+
+def duration(waveform: Waveform, pixel: int, middle: float) -> float:
+    """Return the time from the start to the stop of a `change` [ns]."""
+    start, stop = change(waveform, pixel, middle)
+    return stop - start
+
+
+def far_after_near(waveform: Waveform, gate: tuple[float, float], origin: str = "") -> float:
+    """Return the delay of the mean highest point of the far pixels after that of the near ones [ns]."""
+    times = waveform.highest(gate, origin)[1]
+    return float(times[:2].mean() - times[2:].mean())
+
+
+def near_share(waveform: Waveform) -> float:
+    """Return the share of blue and black in the energy that the target reflects."""
+    energy = waveform.parts["target"].sum(axis=1)
+    return float(energy[2:].sum() / energy.sum())

@@ -35,6 +35,9 @@ SEAS = (1, 2, 3)
 #: Places on each sea: random ones, and those of the slopes of each shot.
 RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5
 
+#: Random places in words.
+RANDOM = f"{RANDOM_PLACES * len(SEAS)} random places on {len(SEAS)} seas"
+
 #: Share of the paths of a full pass, passes of a place, and most passes for the requested error.
 _SHARE, _PASSES, _MOST_PASSES = 0.25, 4, 256
 
@@ -83,14 +86,14 @@ class Renders:
         goal = {"target_error": wanted, "passes": most, "components": "target_depth" in values}
         return self._rendered(scene, params, [(aim[0], aim[1])] * REPEATS, goal)
 
-    def random(self, scene: str, *, move_target: bool = False) -> list[xr.Dataset]:
+    def random(self, scene: str, *, move_target: bool = False) -> Series:
         """Return renders at random places of each sea, to which a target may move with the beam."""
         goal = {"passes": _PASSES, "components": move_target, "move_target": move_target}
         found = []
         for sea in SEAS:
             places = random_places(self.sea(scene, sea), RANDOM_PLACES, self.seed + sea)
-            found.append(self._rendered(scene, {"surface_seed": sea}, places.tolist(), goal))
-        return found
+            found.append(as_series(self._rendered(scene, {"surface_seed": sea}, places.tolist(), goal)))
+        return joined(found)
 
     def of_slopes(self, scene: str, slopes: Sequence[tuple[float, float]]) -> list[Series]:
         """Return, for each pair of slopes (along, across) [1], renders at places of all seas with about them."""

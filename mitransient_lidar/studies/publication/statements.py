@@ -1,16 +1,25 @@
-"""Statements of the publication, each with a measured quantity, its error, and whether it holds."""
+"""Statements of the publication, each with a measured quantity, its error, and whether it holds.
+
+Their table, `statements.csv`, has the published value, the limits between which a statement holds, and texts in which
+names in braces stand for words of the measured quantity.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import FloatArray
 
-#: Names of the columns of the table.
+#: Names of the columns of the table that is written.
 COLUMNS = (
     *("figure", "statement", "quantity", "published", "value", "standard_error", "holds", "share", "where"),
     "difference",
@@ -18,6 +27,15 @@ COLUMNS = (
 
 #: Standard errors within which a quantity at a limit may lie on either side.
 _MARGIN = 2.0
+
+
+class Measured(NamedTuple):
+    """Quantity of a statement: value, standard error, values at other places if any, and words of its texts."""
+
+    value: float
+    error: float = 0.0
+    others: FloatArray | None = None
+    words: Mapping[str, Any] = {}
 
 
 @dataclass(frozen=True)
@@ -82,6 +100,28 @@ class Statement:
             *(self.figure, self.statement, self.quantity, self.published, *numbers, self.holds, share, where),
             self.difference,
         ]
+
+
+def statements_of(figure: str, found: Mapping[str, Measured]) -> list[Statement]:
+    """Return the statements of a figure in the order of the table, with the quantities that were found, by name."""
+    text = (resources.files(__package__) / "statements.csv").read_text("utf-8")
+    return [
+        _statement(row, found[row["measure"]]) for row in csv.DictReader(text.splitlines()) if row["figure"] == figure
+    ]
+
+
+def _statement(row: Mapping[str, str], found: Measured) -> Statement:
+    """Return the statement of a row of the table."""
+    texts = {name: text.format(**found.words) for name, text in row.items()}
+    low, high = float(texts["low"]), float(texts["high"])
+    return Statement(
+        **{name: texts[name] for name in ("figure", "statement", "quantity", "published", "where", "places")},
+        difference=texts["difference"],
+        value=found.value,
+        error=found.error,
+        limits=(low, high),
+        share=None if found.others is None else float(np.mean((found.others >= low) & (found.others <= high))),
+    )
 
 
 def write_statements(statements: Sequence[Statement], path: Path) -> None:

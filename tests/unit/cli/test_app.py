@@ -23,7 +23,7 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue, variants
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress
-from mitransient_lidar.studies import bench
+from mitransient_lidar.studies.bench import integrators as bench
 
 
 @pytest.fixture
@@ -171,9 +171,10 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     name = command.replace("-", "_")
     study = f"mitransient_lidar.studies.{name}"
     interrupted = xr.Dataset(attrs={"interrupted": 1, "passes": 3})
+    module = "targets" if command == "target-signal" else "light"
     stub(monkeypatch, command, lambda **_: interrupted)
     monkeypatch.setattr(f"{study}.{describe}", lambda _: ["lines"])
-    monkeypatch.setattr(f"mitransient_lidar.plots.studies.{name}.plot_{name}", lambda *_: None)
+    monkeypatch.setattr(f"mitransient_lidar.plots.studies.{module}.plot_{name}", lambda *_: None)
     depths = ["--depths", "3"] if command == "beam-spread" else []
     done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
     assert done.stdout.splitlines() == [str(tmp_path / "out.nc"), "lines"]

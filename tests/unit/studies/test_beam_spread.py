@@ -10,7 +10,7 @@ from command_line import run
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
+from mitransient_lidar.plots.studies.light import plot_beam_spread
 from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
 from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -21,53 +21,37 @@ QUICK = {"passes": 2, "photons": 4096}
 @pytest.fixture(scope="module")
 def spread():
     """Spread in a shipped scene."""
-    return beam_spread("fig09_1x1", [8, 2.0, 2.0], {"bottom_depth": 8}, **QUICK)
-
-
-@pytest.mark.parametrize(
-    ("depths", "message"),
-    [
-        (0.0, "depths = [0.0] must be numbers (greater than 0)"),
-        ([3, -2], "depths = [3.0, -2.0] must be numbers (greater than 0)"),
-        ([3, np.nan], "depths holds nan but every value must be finite"),
-        ("deep", "depths = 'deep' must hold numbers only, separated by commas"),
-        ([], "depths = [] must hold at least one number"),
-        ([3, 8.5], "depths = 8.5 m must not lie below the bottom, at 8 m"),
-    ],
-)
-def test_depths_that_are_refused(lidar_scene, depths, message):
-    with pytest.raises(UserError, match=f"^{re.escape(message)}$"):
-        beam_spread(lidar_scene(), depths, **QUICK)
+    return beam_spread("fig09_1x1", {"bottom_depth": 8}, depths=[8, 2.0, 2.0], **QUICK)
 
 
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"photons": 10}, "photons = 10 must lie between 1024 and 16777216"),
+        ({"depths": [3, 8.5]}, "depths = 8.5 m must not lie below the bottom, at 8 m"),
         ({"params": {"bottom_depth": 3}}, "params = ['bottom_depth'] need an XML scene"),
     ],
 )
 def test_options_that_are_refused(lidar_scene, option, message):
     with pytest.raises(UserError, match=re.escape(message)):
-        beam_spread(lidar_scene(), 2.0, **{**QUICK, **option})
+        beam_spread(lidar_scene(), **{"depths": 2.0, **QUICK, **option})
 
 
 def test_scenes_that_are_refused():
     receiver = {"type": "multipixel_receiver", "film": {"type": "time_gated_film"}}
     dry = {"tx": {"type": "lidar_transmitter"}, "rx": receiver, "plate": {"type": "rectangle"}}
     with pytest.raises(UserError, match=r"^the scene has no water: give its surface a layered_water"):
-        beam_spread(dry, 2.0, **QUICK)
+        beam_spread(dry, depths=2.0, **QUICK)
     del dry["rx"]
     with pytest.raises(UserError, match=r"^sensor: the scene has none"):
-        beam_spread(dry, 2.0, **QUICK)
+        beam_spread(dry, depths=2.0, **QUICK)
 
 
 @pytest.mark.slow
 def test_only_what_is_wider_than_the_beam_is_a_bottom(lidar_scene):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([2, 0, -4]).scale(0.75)}
     scene = lidar_scene(bottom=None, extra={"target": plate})
-    found = beam_spread(scene, 6.0, **QUICK)
-    without = beam_spread(lidar_scene(bottom=None), 6.0, **QUICK)
+    found = beam_spread(scene, depths=6.0, **QUICK)
+    without = beam_spread(lidar_scene(bottom=None), depths=6.0, **QUICK)
     assert 0.1 < float(found["transmitted"].item()) < 0.9 * float(without["transmitted"].item())
 
 
@@ -104,7 +88,7 @@ def test_result(spread):
 
 @pytest.mark.slow
 def test_light_at_the_bottom_is_light_just_above_it(lidar_scene):
-    found = beam_spread(lidar_scene(), [7.9, 8.0], **QUICK)
+    found = beam_spread(lidar_scene(), depths=[7.9, 8.0], **QUICK)
     above, at = found["transmitted"].values
     assert 0.97 < at / above < 1
 
@@ -112,7 +96,7 @@ def test_light_at_the_bottom_is_light_just_above_it(lidar_scene):
 @pytest.mark.slow
 def test_seed_decides(lidar_scene):
     scene = lidar_scene()
-    first, again, other = (beam_spread(scene, 5.0, seed=seed, **QUICK)["shift_rms"].item() for seed in (1, 1, 2))
+    first, again, other = (beam_spread(scene, depths=5.0, seed=seed, **QUICK)["shift_rms"].item() for seed in (1, 1, 2))
     assert first == pytest.approx(again, rel=1e-12)
     assert first != pytest.approx(other, rel=1e-6)
 
@@ -129,7 +113,7 @@ def test_share_in_view(lidar_scene, off_nadir):
         sea={"slope_variance": "2e-5"},
         water={"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0},
     )
-    found = beam_spread(scene, [1.0, 7.0], passes=4, photons=2**14)
+    found = beam_spread(scene, depths=[1.0, 7.0], passes=4, photons=2**14)
     # Photons count as if they were drawn one by one; 0.2 % for the ripples.
     share = 1 - np.exp(-0.5 * 1.2**2)
     error = np.sqrt(share * (1 - share) / (4 * 2**14))
@@ -144,7 +128,7 @@ def test_share_in_view(lidar_scene, off_nadir):
 def test_depths_without_light_are_unknown(lidar_scene):
     # A plate that is wide enough to take all light, but not the bottom.
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(400)}
-    found = beam_spread(lidar_scene(extra={"plate": plate}), [1.0, 4.0], **QUICK)
+    found = beam_spread(lidar_scene(extra={"plate": plate}), depths=[1.0, 4.0], **QUICK)
     assert found["transmitted"].values[1] == 0
     assert found["transmitted"].values[0] > 0.5
     assert np.isnan(found["radius_90"].values[1])
@@ -156,7 +140,7 @@ def test_depths_without_light_are_unknown(lidar_scene):
 
 def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     scene = lidar_scene(sea={"spectrum": "flat", "size": 2.0}, bottom=4.0)
-    found = beam_spread(scene, 2.0, **QUICK)
+    found = beam_spread(scene, depths=2.0, **QUICK)
     # Standard deviations of the footprint are 1.064 m across and 1.132 m along, erf(1/(sqrt(2) sigma)) in the patch.
     assert found.attrs["beam_outside_surface"] == pytest.approx(1 - 0.6526 * 0.6230, abs=0.01)
     assert "passes outside it and is left out" in caplog.text

@@ -1,6 +1,7 @@
 """Bounds of designs from closed-form light in place of renders: ratios, table, figures and the command."""
 
 import csv
+import time
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
-from mitransient_lidar.plots.studies.bounds import plot_bounds
+from mitransient_lidar.plots.studies.parameters import plot_bounds
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.studies import bounds as study
 
@@ -97,7 +98,7 @@ def test_designs_after_the_time_are_left_out_and_counted(monkeypatch, caplog):
         return light(scene, **options)
 
     monkeypatch.setattr(study, "render", render)
-    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     energies = {"pulse_energy_mj": [5, 20, 1.25]}
     options = {"free": ["attenuation"], "receiver": "ideal", "passes": 2, "renders": 2}
     found = study.bounds("table1", SMALL, over=energies, max_time=3, **options)
@@ -178,7 +179,7 @@ def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
     small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
     done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
     assert done.exit_code == 130
-    assert done.stderr == "interrupted; bounds need all renders, and none is kept.\n"
+    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept.\n"
     assert not list(tmp_path.iterdir())
 
 
@@ -242,7 +243,6 @@ def test_values_with_commas_are_separated_by_semicolons():
         ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
         ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
         ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
-        ({"background_power_w": -1}, "background_power_w = -1 must not be negative"),
     ],
 )
 def test_invalid_input_is_refused_before_a_render(rendered, options, message):

@@ -14,7 +14,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.publication import figures as publication
 from mitransient_lidar.rendering.shots.truth import SeaMap
-from mitransient_lidar.studies.publication import echoes, layers, measures, renders, targets
+from mitransient_lidar.studies.publication import measures, renders
 from mitransient_lidar.studies.publication.measures import Series, Waveform
 from mitransient_lidar.studies.publication.renders import Renders, joined
 from mitransient_lidar.studies.publication.statements import COLUMNS, Statement, write_statements
@@ -36,7 +36,7 @@ def test_duration_of_a_smeared_step(sigma, rate):
     # Differences over 1 ns smear the curvature by a variance of 1/6 ns^2.
     assert stop - start == pytest.approx(2 * math.sqrt(sigma**2 + 1 / 6), rel=0.01)
     assert (start + stop) / 2 == pytest.approx(60, abs=0.05)
-    assert layers.duration(fall, 0, 61.0) == stop - start
+    assert measures.duration(fall, 0, 61.0) == stop - start
 
 
 def test_what_a_waveform_does_not_show_is_nan():
@@ -67,9 +67,9 @@ def test_decay_of_an_exponential():
 def test_delay_and_ratio_of_two_echoes():
     """Far echoes 4 ns later; a target whose near pixels hold three quarters of its light."""
     power = np.stack([gaussian(54, 2), gaussian(56, 2), gaussian(50, 2), gaussian(52, 2)])
-    assert echoes.far_after_near(Waveform(TIME, power), (40, 70)) == pytest.approx(4, abs=0.01)
+    assert measures.far_after_near(Waveform(TIME, power), (40, 70)) == pytest.approx(4, abs=0.01)
     parts = {"target": np.array([0.5, 0.5, 1, 2])[:, None] * gaussian(60, 2)}
-    assert targets.near_share(Waveform(TIME, power, parts)) == pytest.approx(0.75)
+    assert measures.near_share(Waveform(TIME, power, parts)) == pytest.approx(0.75)
 
 
 def test_error_of_a_ratio_is_that_of_repeated_experiments():
@@ -181,7 +181,7 @@ def test_an_interruption_keeps_the_figures_that_are_done(tmp_path, monkeypatch):
     def interrupt(_renders):
         raise KeyboardInterrupt
 
-    broken = publication._FIGURES["fig12"]._replace(statements=interrupt)
+    broken = publication._FIGURES["fig12"]._replace(measure=interrupt)
     monkeypatch.setitem(publication._FIGURES, "fig12", broken)
     done = run("figures", "fig05", "fig12", "fig13", "-o", tmp_path, "-q")
     assert done.exit_code == 130

@@ -5,7 +5,7 @@ import pytest
 from figure_inputs import shot_statistics
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
+from mitransient_lidar.plots.studies.shots import plot_shot_statistics
 from mitransient_lidar.studies.shot_statistics import slope_correlations
 
 

@@ -1,4 +1,4 @@
-"""Figures of the least errors of parameters: of one design, and of several in comparison."""
+"""Figures of the parameters of a scene: their least errors, and a fit of them to waveforms."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots.studies.panels import finish, new_panels
 
-_COLUMNS = 3  # panels side by side
 _SHOWN = 20  # designs in a panel, the best ones
 _WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmic
 
@@ -25,15 +25,10 @@ def plot_bounds(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     if found.sizes["design"] == 1:
         return _plot_one(found.isel(design=0), path)
     names, shown = found["parameter"].values, min(found.sizes["design"], _SHOWN)
-    columns = min(_COLUMNS, names.size)
-    rows = math.ceil(names.size / columns)
     labels = 0.075 * max(len(str(label)) for label in found["design"].values)
-    figure = drawing.new_figure(path, (2.9 + labels) * columns, (0.27 * shown + 1.1) * rows + 0.4)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, name in zip(axes, names, strict=False):
+    figure, axes, *_ = new_panels(path, names.size, (2.9 + labels, 0.27 * shown + 1.1), (0.0, 0.4))
+    for ax, name in zip(axes, names, strict=True):
         _rank(ax, found.sel(parameter=name))
-    for ax in axes[names.size :]:
-        ax.axis("off")
     text = f"bounds of single shots relative to {found['design'].values[0]}, receiver {found.attrs['receiver']}"
     figure.suptitle(drawing.titled(found.attrs, text))
     return drawing.save(figure, path)
@@ -53,23 +48,15 @@ def _rank(ax: Axes, one: xr.Dataset) -> None:
     for place in places:
         value = float(ranked["bound"][place])
         text = f"{value:.3g}" if math.isfinite(value) else "no bound"
-        ax.annotate(
-            text,
-            (1, place),
-            (4, 0),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            va="center",
-            size=7,
-        )
+        style = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "size": 7}
+        ax.annotate(text, (1, place), (4, 0), **style)
     ax.axvline(1, color="0.6", linewidth=0.9)
     ax.set_yticks(places, ranked["design"].values.tolist(), fontsize="small")
-    ax.set(ylim=(order.size - 0.5, -0.5), xlabel="bound over that of the first design")
     if drawn.any() and ratio[drawn].max() > _WIDE * ratio[drawn].min():
         ax.set_xscale("log")
     unit = one["parameter_units"].item()
-    ax.set_title(f"{one['parameter'].item()}, bounds in {'units of 1' if unit == '1' else unit}", fontsize="medium")
-    drawing.add_grid(ax, "x")
+    title = f"{one['parameter'].item()}, bounds in {'units of 1' if unit == '1' else unit}"
+    finish(ax, title, grid="x", ylim=(order.size - 0.5, -0.5), xlabel="bound over that of the first design")
 
 
 def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
@@ -95,8 +82,8 @@ def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
     for place in places[~np.isfinite(one["bound"].values)]:
         left.text(0.02, place, "no bound", transform=left.get_yaxis_transform(), va="center", size=8, color="0.4")
     left.set_yticks(places, labels)
-    left.set(xscale="log", ylim=(len(names) - 0.5, -0.5), xlabel="bound over the value, absolute where a unit is given")
-    drawing.add_grid(left, "x")
+    text = "bound over the value, absolute where a unit is given"
+    finish(left, grid="x", xscale="log", ylim=(len(names) - 0.5, -0.5), xlabel=text)
     left.legend(frameon=False, fontsize="small")
     image = right.imshow(one["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
     for (row, column), number in np.ndenumerate(one["correlation"].values):
@@ -107,4 +94,44 @@ def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
     right.set_yticks(places, names, fontsize="small")
     figure.colorbar(image, ax=right, label="correlation of the estimates", shrink=0.8)
     figure.suptitle(drawing.titled(one.attrs, f"bounds of a single shot, receiver {one.attrs['receiver']}"))
+    return drawing.save(figure, path)
+
+
+_SHOWN_PIXELS = 12  # more would hide each other
+
+
+def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw measured and fitted waveforms above their differences in standard deviations, one colour a pixel.
+
+    `fitted` is a result of `studies.fit.fit`. Of more than 12 pixels, those with the largest peaks are drawn. The title
+    gives the values with their standard errors.
+    """
+    time = fitted["time"].values
+    rows = {name: fitted[name].values.reshape(-1, time.size) for name in ("measured", "measured_stderr", "fitted")}
+    residual, used = (fitted[name].values.reshape(-1, time.size) for name in ("residual", "used"))
+    strongest = np.sort(np.argsort(-rows["fitted"].max(axis=-1), kind="stable")[:_SHOWN_PIXELS])
+    names = fitted["pixel"].values if "pixel" in fitted.coords else np.arange(len(residual)).astype(str)
+    figure = drawing.new_figure(path, 9.6, 6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
+    shown = used[strongest].any(axis=0)
+    for pixel, colour in zip(strongest, drawing.pixel_colours(strongest.size), strict=True):
+        values = np.where(used[pixel] > 0, rows["measured"][pixel], np.nan)
+        error = np.nan_to_num(rows["measured_stderr"][pixel])
+        style = {"color": colour, "markersize": 2.5, "elinewidth": 0.7, "alpha": 0.75}
+        upper.errorbar(time, values, error, fmt=".", label=str(names[pixel]), **style)
+        upper.plot(time, np.where(used[pixel] > 0, rows["fitted"][pixel], np.nan), color=colour, linewidth=1.1)
+        lower.plot(time, residual[pixel], ".", color=colour, markersize=3)
+    peak = float(np.nanmax(rows["fitted"][strongest]))
+    # Noise would fill the lower decades of a logarithmic axis.
+    noise = float(np.median(np.nan_to_num(rows["measured_stderr"][strongest])))
+    linear = min(max(1e-3 * peak, 3 * noise), 0.3 * peak)
+    upper.set_yscale("symlog", linthresh=linear, linscale=0.5)
+    upper.legend(frameon=False, ncols=2 if strongest.size > 4 else 1)
+    unit = fitted["measured"].attrs.get("units") or "any unit"
+    finish(upper, ylim=(-linear, 2 * peak), ylabel=f"waveform ({unit})")
+    limits, label = (time[shown][0], time[shown][-1]), "difference\n(standard deviations)"
+    finish(lower, zero=0, xlim=limits, xlabel=drawing.TIME_LABEL, ylabel=label)
+    columns = (fitted[name].values for name in ("parameter", "value", "stderr"))
+    text = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, value, error in zip(*columns, strict=True))
+    figure.suptitle(drawing.titled(fitted.attrs, text), fontsize="medium", wrap=True)
     return drawing.save(figure, path)

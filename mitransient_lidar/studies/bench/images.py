@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
-import resource
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -12,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mitransient_lidar.studies.bench import run_processes
+from mitransient_lidar.studies.bench.processes import Tasks, answer, peak_mb, run_processes
 
 #: Layouts whose cost is measured.
 LAYOUTS = ("2x2", "8x8", "32x32", "128x128", "256x256")
@@ -48,8 +45,8 @@ def run(*, json: bool = False) -> None:
     Scene: the table system over a bottom at 8 m below a sea at 3 m/s, c = 0.3 /m, 64 gates of 10 ns, 1.5 ns apart. A
     render ends when the gate on the bottom is known to 10 %.
     """
-    tasks: dict[tuple[str, ...], dict[str, str]] = {(layout,): {"layout": layout} for layout in LAYOUTS}
-    run_processes("mitransient_lidar.studies.bench_images", ("layout",), tasks, _COLUMNS, json)
+    tasks: Tasks = {(layout,): {"layout": layout} for layout in LAYOUTS}
+    run_processes("images", ("layout",), tasks, _COLUMNS, json)
 
 
 def measure(layout: str) -> dict[str, float]:
@@ -89,7 +86,7 @@ def measure(layout: str) -> dict[str, float]:
         "passes": done,
         "bottom_error": error,
         "per_pixel_ms": 1e3 * wall / pixels,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": peak_mb(),
     }
 
 
@@ -103,4 +100,4 @@ def _bottom_error(result: Any) -> float:
 
 
 if __name__ == "__main__":
-    print(json_module.dumps(measure(**json_module.loads(sys.argv[1]))))
+    answer(measure)

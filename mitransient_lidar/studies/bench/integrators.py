@@ -1,61 +1,43 @@
-"""Benchmark of the speed and the accuracy of the integrators.
-
-Every measurement runs in its own process, so that its peak memory and compile time are independent of the others.
-"""
+"""Benchmark of the speed and the accuracy of the integrators."""
 
 from __future__ import annotations
 
-import json as json_module
-import os
-import resource
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.studies.bench.processes import Tasks, answer, peak_mb, run_processes
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.passes import PassRenderer
 
+#: Coefficients of turbid water [1/m].
+TURBID = {"attenuation": "1.5", "scattering": "1.2", "backscattering": "0.024"}
+
+_LAYERED = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35"}
+_IMAGER = {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}
+_SPACE = {"altitude": "500000", "off_nadir_deg": "1", "divergence_mrad": "0.01", "field_of_view_mrad": "0.08"}
+
 #: Shipped scene and parameters of each case.
 CASES: dict[str, tuple[str, dict[str, str]]] = {
     "flat": ("fig09_2x2", {"spectrum": "flat"}),
     "clear": ("fig09_2x2", {}),
-    "turbid": ("fig09_2x2", {"attenuation": "1.5", "scattering": "1.2", "backscattering": "0.024"}),
-    "layered": (
-        "fig09_2x2",
-        {
-            "layer_tops": "0, 3",
-            "attenuation": "0.9, 0.5",
-            "scattering": "0.7, 0.35",
-            "backscattering": "0.014, 0.007",
-            "field_of_view_mrad": "35",
-        },
-    ),
+    "turbid": ("fig09_2x2", TURBID),
+    "layered": ("fig09_2x2", {**_LAYERED, "backscattering": "0.014, 0.007", "field_of_view_mrad": "35"}),
     "target": ("fig09_2x2", {"field_of_view_mrad": "35", "bottom_depth": "12"}),
-    "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
+    "imager": ("fig09_2x2", _IMAGER),
     "narrow": ("fig09_2x2", {"divergence_mrad": "0.5"}),
     "mast": ("fig04_mast", {}),
-    "space": (
-        "fig09_2x2",
-        {
-            "altitude": "500000",
-            "off_nadir_deg": "1",
-            "divergence_mrad": "0.01",
-            "field_of_view_mrad": "0.08",
-        },
-    ),
+    "space": ("fig09_2x2", _SPACE),
 }
 
 #: Scene and parameters in which instruments are measured: wind of 5 m/s and coastal water.
@@ -121,58 +103,12 @@ def run(
     if case is not None and case not in CASES and case not in instruments:
         raise UserError(f"case = {case!r} must be one of {', '.join([*CASES, *instruments])}")
     ends = {"target_error": target_error, "max_time": max_time}
-    tasks: dict[tuple[str, ...], dict[str, Any]] = {
+    tasks: Tasks = {
         (name, integrator): {"case": name, "integrator": integrator, "quick": quick, **ends}
         for name in ([case] if case else list(QUICK_CASES if quick else (*CASES, *instruments)))
         for integrator in INTEGRATORS[: None if name in CASES else 1]
     }
-    run_processes("mitransient_lidar.studies.bench", ("case", "integrator"), tasks, _COLUMNS, json)
-
-
-def run_processes(
-    module: str,
-    heading: tuple[str, ...],
-    tasks: Mapping[tuple[str, ...], Mapping[str, Any]],
-    columns: Mapping[str, str],
-    as_json: bool,
-    group_heading: str | None = None,
-) -> None:
-    """Run a module for each task in its own process, and print the figures; tasks and figures are passed as JSON.
-
-    Tasks are given by their labels, whose headings are `heading`; `columns` are the headings of the figures. With
-    `group_heading` a task returns the figures of several rows by their labels.
-    """
-    figures: dict[str, Any] = {}
-    if not as_json:
-        print(_row([*heading, *([group_heading] if group_heading else [])], columns.values()))
-    for labels, task in tasks.items():
-        command = [sys.executable, "-m", module, json_module.dumps(task)]
-        with tempfile.TemporaryDirectory() as folder:
-            # In a session of its own: after Ctrl-C, it would print what it has as if it were all.
-            done = subprocess.run(
-                command,
-                check=False,
-                stdout=subprocess.PIPE,
-                text=True,
-                start_new_session=True,
-                env={**os.environ, "TMPDIR": folder},
-            )
-        if done.returncode:
-            raise UserError(f"the benchmark of {' with '.join(labels)} ended with exit code {done.returncode}")
-        values = json_module.loads(done.stdout)
-        group = figures
-        for label in labels[:-1]:
-            group = group.setdefault(label, {})
-        group[labels[-1]] = values
-        rows = {(*labels, label): row for label, row in values.items()} if group_heading else {labels: values}
-        for row_labels, row in rows.items() if not as_json else ():
-            print(_row(row_labels, (f"{row[key]:.4g}" for key in columns)), flush=True)
-    if as_json:
-        print(json_module.dumps(figures, indent=2))
-
-
-def _row(labels: Iterable[str], cells: Iterable[str]) -> str:
-    return " ".join([*(f"{label:<14}" for label in labels), *(f"{cell:>10}" for cell in cells)])
+    run_processes("integrators", ("case", "integrator"), tasks, _COLUMNS, json)
 
 
 @alone
@@ -199,7 +135,7 @@ def measure(
         max_time=_LONGEST_S if target_error and max_time is None else max_time,
         progress=lambda _: marks.append((time.perf_counter(), time.process_time())),
     )
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    peak = peak_mb()
     renderer = choose_integrator(loaded, integrator).prepare(loaded, lidar_sensor(loaded))
     steps = np.diff(np.array(marks)[:, 0])
     wall, cpu = (float(last - first) for first, last in zip(marks[0], marks[-1], strict=True))
@@ -256,4 +192,4 @@ def _plain_ray_rate(renderer: PassRenderer) -> float:
 
 
 if __name__ == "__main__":
-    print(json_module.dumps(measure(**json_module.loads(sys.argv[1]))))
+    answer(measure)

@@ -1,9 +1,10 @@
-"""Figure of shots on a sea: footprints over the elevation, and the waveforms received from each."""
+"""Figures of shots on a sea: footprints and waveforms, and echoes against the slopes of the sea."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,8 +14,10 @@ from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots.studies.panels import finish
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
+from mitransient_lidar.studies.shot_statistics import depth_bias, slope_correlations, slope_effects
 
 #: Share of a pixel's peak that counts as an echo.
 _FAINT = 5e-3
@@ -70,17 +73,10 @@ def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
         angle = math.degrees(rendered.azimuth)
         ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color="gold"))
         # Beside the footprint, whose lines would cross the number.
-        ax.annotate(
-            f"{number}",
-            (shot.x, shot.y + rendered.pixel_lines.max()),
-            xytext=(0, 2),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize="large",
-            fontweight="bold",
-            path_effects=[withStroke(linewidth=3, foreground="white")],
-        )
+        edge = shot.y + rendered.pixel_lines.max()
+        style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontweight": "bold", "fontsize": "large"}
+        style |= {"path_effects": [withStroke(linewidth=3, foreground="white")], "textcoords": "offset points"}
+        ax.annotate(f"{number}", (shot.x, edge), (0, 2), **style)
     ax.set_aspect("equal")
     turn = math.degrees(rendered.azimuth)
     beam = "+x" if abs(turn) < 1e-4 else f"{abs(turn):.3g}° from +x towards {'+' if turn > 0 else '-'}y"
@@ -110,3 +106,34 @@ def _draw_waveforms(ax: Axes, name: str, shot: Shot, result: xr.Dataset) -> None
     slopes = f"{math.degrees(math.atan(shot.along)):+.1f}°, {math.degrees(math.atan(shot.across)):+.1f}°"
     ax.set_title(f"{name} ({slopes})", fontsize="small")
     ax.set(xlabel="time (ns)", ylabel="power (mW)")
+
+
+_LABELS = {
+    "strength": "surface echo (log10 W)",
+    "separation": "far pair after near pair (ns)",
+    "sideways": "green after red (ns)",
+    "depth": "bottom too deep (m)",
+}
+
+
+def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the strength, the times and the depths of echoes against the slopes that the beam meets.
+
+    `shots` is a result of `studies.shot_statistics.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
+    """
+    figure = drawing.new_figure(path, 9.6, 7.0)
+    effects, correlations = slope_effects(shots), slope_correlations(shots)
+    for ax, (name, (slope, value)) in zip(figure.subplots(2, 2).flat, effects.items(), strict=True):
+        ax.plot(np.degrees(np.arctan(slope)), value, ".", color="#1f5fd6", markersize=4)
+        along = "mean rise to the left (deg)" if name == "sideways" else "mean slope towards the lidar (deg)"
+        finish(ax, xlabel=along, ylabel=_LABELS[name])
+        ax.set_title(f"correlation {correlations[name]:+.2f}, {np.isfinite(value).sum()} shots", fontsize="small")
+        if name == "depth":
+            slopes = np.linspace(slope.min(), slope.max(), 100)
+            names = ("scene.bottom_depth", "off_nadir_deg", "refractive_index")
+            depth, off_nadir_deg, index = (float(shots.attrs[attribute]) for attribute in names)
+            bias = depth_bias(slopes, depth, math.radians(off_nadir_deg), index)
+            ax.plot(np.degrees(np.arctan(slopes)), bias, color="#d81e1e", label="refraction alone")
+            ax.legend(frameon=False)
+    figure.suptitle(drawing.titled(shots.attrs, f"{shots.sizes['shot']} shots"))
+    return drawing.save(figure, path)

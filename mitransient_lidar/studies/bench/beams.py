@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_module
-import sys
 import time
 from typing import Any
 
 import numpy as np
 
-from mitransient_lidar.studies.bench import run_processes
+from mitransient_lidar.studies.bench.integrators import TURBID
+from mitransient_lidar.studies.bench.processes import Tasks, answer, run_processes
 
 #: Divergences [mrad], views over the divergence, and the largest view [mrad].
 DIVERGENCES = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
@@ -19,10 +18,7 @@ _LARGEST_VIEW = 100.0
 #: Beam and view of the reference [mrad].
 REFERENCE = (10.0, 30.0)
 
-WATERS = {
-    "clear": {},
-    "turbid": {"attenuation": "1.5", "scattering": "1.2", "backscattering": "0.024"},
-}
+WATERS = {"clear": {}, "turbid": TURBID}
 SEAS = {"flat": {"spectrum": "flat"}, "waves": {}}
 
 _SCENE, _WIND = "table1", {"wind_speed": "6"}
@@ -40,10 +36,8 @@ def run(*, json: bool = False) -> None:
     waves of 6 m/s. The figure of merit is 1 / (median relative variance x CPU time) of the waveform's bins from the
     surface echo to the end of the bottom echo.
     """
-    tasks: dict[tuple[str, ...], dict[str, str]] = {
-        (water, sea): {"water": water, "sea": sea} for water in WATERS for sea in SEAS
-    }
-    run_processes("mitransient_lidar.studies.bench_beams", ("water", "sea"), tasks, _COLUMNS, json, "beams")
+    tasks: Tasks = {(water, sea): {"water": water, "sea": sea} for water in WATERS for sea in SEAS}
+    run_processes("beams", ("water", "sea"), tasks, _COLUMNS, json, "beams")
 
 
 def measure(water: str, sea: str) -> dict[str, dict[str, float]]:
@@ -81,4 +75,4 @@ def _measure(divergence: float, view: float, water: str, sea: str) -> dict[str, 
 
 
 if __name__ == "__main__":
-    print(json_module.dumps(measure(**json_module.loads(sys.argv[1]))))
+    answer(measure)

@@ -1,4 +1,4 @@
-"""Figures of the uncertainty of soundings: against depth by water, and orders of surveys by wind and water."""
+"""Figures of the depths of an instrument: their errors against the angle, their uncertainty, and orders of surveys."""
 
 from __future__ import annotations
 
@@ -13,10 +13,32 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots.studies.panels import finish, name_sides, new_panels
 
-_COLUMNS = 3
 #: Of the orders from the strictest on, of none, and of an unknown depth.
 _ORDER_COLOURS = ("#1a7f37", "#8fd19e", "#f2c14e", "#e07a2f", "#b3261e", "0.9")
+
+
+def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the biases of a result of `studies.depth_bias` against the angle, one panel for each sea, water and depth.
+
+    Lines are those of the estimators, means over the channels, with the spread of single depths as bars.
+    """
+    cells = found[["bias", "spread"]].mean("pixel").stack(cell=("wind_speed", "water", "depth"))
+    figure, axes, lowest, first = new_panels(path, cells.sizes["cell"], (4.2, 3.4), (1.6, 0.5), sharex=True)
+    names = [str(name) for name in found["estimator"].values]
+    for number, ax in enumerate(axes):
+        one = cells.isel(cell=number)
+        for name, colour in zip(names, drawing.pixel_colours(10), strict=False):
+            bias, spread = (100 * one[part].sel(estimator=name).values for part in ("bias", "spread"))
+            style = {"color": colour, "marker": "o", "markersize": 3.5, "linewidth": 1.3, "capsize": 2}
+            ax.errorbar(found["off_nadir_deg"], bias, spread, label=name.replace("_", " "), **style)
+        wind, water, depth = one["cell"].item()
+        sea = f"{wind:g} m/s" if wind else f"level sea, ripples of {float(one['ripples']):g} m/s"
+        finish(ax, f"{sea}, Jerlov {water}, {depth:g} m", zero=0)
+    name_sides(figure, lowest, "angle from nadir (°)", first, "bias of the depth (cm), deep is positive")
+    figure.suptitle(f"{found.attrs['instrument']}, receiver {found.attrs['receiver']}")
+    return drawing.save(figure, path)
 
 
 def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -26,12 +48,9 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
     corrected depths, or of measured ones without corrections; open markers of depths as measured.
     """
     waters = found["water"].values
-    columns = min(_COLUMNS, waters.size)
-    rows = -(-waters.size // columns)
-    figure = drawing.new_figure(path, 3.9 * columns + 1.2, 3.1 * rows + 0.6)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    figure, axes, lowest, first = new_panels(path, waters.size, (3.9, 3.1), (1.2, 0.6), sharex=True, sharey=True)
     colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, found.sizes["wind_speed"]))
-    for ax, water in zip(axes.flat, waters, strict=False):
+    for ax, water in zip(axes, waters, strict=True):
         _draw_orders(ax, float(found["depth"].max()))
         for wind, colour in zip(found["wind_speed"].values, colours, strict=True):
             one = found["tvu"].sel(water=water, wind_speed=wind)
@@ -39,17 +58,9 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
             ax.plot(found["depth"], one.isel(correction=-1), label=f"{wind:g} m/s", **style)
             if one.sizes["correction"] > 1:
                 ax.plot(found["depth"], one.isel(correction=0), **{**style, "linestyle": "none"}, mfc="none")
-        ax.set_title(f"Jerlov {water}", fontsize="medium")
-        drawing.add_grid(ax)
-    for ax in axes.flat[waters.size :]:
-        ax.axis("off")
-    axes[0, 0].set_ylim(0, 1.15 * max(float(found["tvu"].fillna(0).max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
-    for ax in axes[-1]:
-        ax.set_xlabel("depth (m)")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("TVU at 95 % (m)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", frameon=False, title="wind")
+        finish(ax, f"Jerlov {water}")
+    axes[0].set_ylim(0, 1.15 * max(float(found["tvu"].fillna(0).max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
+    name_sides(figure, lowest, "depth (m)", first, "TVU at 95 % (m)", title="wind")
     figure.suptitle(_title(found, "total vertical uncertainty"))
     return drawing.save(figure, path)
 

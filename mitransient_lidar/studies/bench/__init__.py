@@ -1,0 +1,1 @@
+"""Benchmarks: speed and accuracy of the integrators, of narrow beams, and of images."""
