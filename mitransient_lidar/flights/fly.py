@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import xarray as xr
 
@@ -20,9 +20,6 @@ from mitransient_lidar.flights.preparation import telling_errors_alone
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
-
-if TYPE_CHECKING:
-    pass
 
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
@@ -83,7 +80,7 @@ def fly(
         After Ctrl-C; pulses that are written stay, and the same call goes on.
     """
     if isinstance(flight, Mapping):
-        plan = FlightPlan.of(flight)
+        plan = FlightPlan.of_file(flight)
     else:
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(checked_path("flight", flight))
     folder = checked_path("folder", folder)

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.toml_files import check_keys, required
+from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
-from mitransient_lidar.flights.poses.attitude import check_rotation_spec, rotation_matrices
+from mitransient_lidar.flights.poses.attitude import RotationSpec, rotation_matrices
 from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
-from mitransient_lidar.flights.poses.straight_lines import fixed_platform, straight_lines
-from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
-
-#: Kinds of platforms of a plan.
-PLATFORM_KINDS = ("lines", "mast", "csv", "sbet")
 
 #: Interpolation between records.
-INTERPOLATIONS = ("linear", "cubic")
+Interpolation = Literal["linear", "cubic"]
 
 #: Longest time between records that splines go through, with its rounding, and fewest of such records [s].
 _DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
@@ -84,17 +76,16 @@ class Trajectory:
     roll_deg: FloatArray
     pitch_deg: FloatArray
     yaw_deg: FloatArray
-    rotation_spec: str = "aerospace"
-    interpolation: str = "linear"
+    rotation_spec: RotationSpec = "aerospace"
+    interpolation: Interpolation = "linear"
     lines: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
     def __post_init__(self) -> None:
         for one in fields(self):
             if one.name not in ("rotation_spec", "interpolation"):
                 object.__setattr__(self, one.name, _array(one.name, getattr(self, one.name)))
-        check_rotation_spec(self.rotation_spec)
-        if self.interpolation not in INTERPOLATIONS:
-            raise UserError(f"interpolation = {shown(self.interpolation)} must be one of {', '.join(INTERPOLATIONS)}")
+        one_of("rotation_spec", self.rotation_spec, get_args(RotationSpec))
+        one_of("interpolation", self.interpolation, get_args(Interpolation))
         count = self.time_s.size
         for name in TrajectoryRecords._fields:
             shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
@@ -109,50 +100,6 @@ class Trajectory:
     def records(self) -> TrajectoryRecords:
         """Times, positions and attitudes of the records."""
         return TrajectoryRecords(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any], folder: str | os.PathLike[str] = ".") -> Trajectory:
-        """Return the trajectory of the table ``[platform]`` of a plan.
-
-        Parameters
-        ----------
-        given
-            Table with ``kind``: ``lines`` and ``mast`` have the keys of `straight_lines.straight_lines` and
-            `straight_lines.fixed_platform`; ``csv`` has ``file`` and ``rotation_spec`` (``ARINC 705``, as HELIOS++),
-            ``sbet`` has ``file`` and ``epsg``. Files may also have ``origin``, the position of the origin of the scene
-            in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); ``interpolation``
-            (``cubic``); ``lines_s``, a list of the first and last time of each flight line [s] (one line, of all
-            records); and ``time``, as of `times.time_system`.
-        folder
-            Folder from which relative paths of files count.
-
-        Raises
-        ------
-        UserError
-            For a key or a value that is not allowed or is missing, and for a file that cannot be read.
-        """
-        kind = required("[platform]", given, "kind")
-        if kind not in PLATFORM_KINDS:
-            raise UserError(f"kind = {shown(kind)} of a platform must be one of {', '.join(PLATFORM_KINDS)}")
-        if kind == "lines":
-            records, lines = straight_lines(given)
-            return cls(*records, lines=lines)
-        if kind == "mast":
-            return cls(*fixed_platform(given))
-        where, own = f"a platform of kind {kind!r}", "rotation_spec" if kind == "csv" else "epsg"
-        check_keys(where, given, ("kind", "file", own, "origin", "interpolation", "lines_s", "time"))
-        file = required(where, given, "file")
-        if not isinstance(file, str):
-            raise UserError(f"file = {shown(file)} must be the path of a trajectory")
-        origin = finite_array("origin", given.get("origin", (0.0, 0.0, 0.0)))
-        if origin.shape != (3,):
-            raise UserError(f"origin = {shown(given['origin'])} must be x, y and z in metres")
-        spec = check_rotation_spec(given.get("rotation_spec", "ARINC 705")) if kind == "csv" else "aerospace"
-        path = Path(folder) / file
-        records = read_text_records(path) if kind == "csv" else read_sbet_records(path, required(where, given, "epsg"))
-        records = records._replace(position=records.position - origin)
-        lines = finite_array("lines_s", given.get("lines_s", ()))
-        return cls(*records, spec, given.get("interpolation", "cubic"), lines)
 
     def at(self, times: npt.ArrayLike) -> PlatformPoses:
         """Return the poses at times [s], shape (n,); raise `UserError` for a time that is on no flight line."""

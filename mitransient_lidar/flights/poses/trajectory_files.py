@@ -40,9 +40,6 @@ _COLUMNS = (
 #: Numbers of a record of an SBET file, and the largest file [bytes]: eleven hours of 200 records a second.
 _SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
 
-#: Largest code of a coordinate system.
-_LARGEST_EPSG = 10**6
-
 
 def read_text_records(path: str | os.PathLike[str]) -> TrajectoryRecords:
     """Read a trajectory from a text file as HELIOS++ does.
@@ -154,7 +151,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
 
 def _system(epsg: int) -> Any:
     """Return projected coordinates in metres by their EPSG code."""
-    system = parsed_system("epsg", integer("epsg", epsg, 1, _LARGEST_EPSG))
+    system = parsed_system("epsg", epsg)
     metric = all(axis.unit_conversion_factor == 1 for axis in system.axis_info[:2])
     if not (system.is_projected and metric and is_east_north(system)):
         raise UserError(f"epsg = {epsg} ({system.name}) must be projected coordinates in metres, east and north")

@@ -5,6 +5,7 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pixel_turns, pulse_poses
+from mitransient_lidar.flights.poses.platforms import platform_of
 from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -103,7 +104,7 @@ def test_scan_angle_is_from_the_vertical_to_the_right(heading_deg):
 
 def test_lines_of_pulses():
     given = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 100, "length": 50, "count": 2, "spacing": 5}
-    trajectory = Trajectory.of(given)
+    trajectory = platform_of(given).trajectory()
     poses = pulse_poses(trajectory, Mounting(), Fixed(), trajectory.pulse_times(4))
     np.testing.assert_array_equal(poses.line, [0] * 5 + [1] * 5)
     np.testing.assert_allclose(poses.origin[:, 1], [0, 12.5, 25, 37.5, 50, 50, 37.5, 25, 12.5, 0], atol=1e-12)
@@ -120,7 +121,7 @@ def test_lines_of_pulses():
 )
 def test_invalid_mountings(given, message):
     with pytest.raises(UserError, match=message):
-        Mounting.of(given)
+        Mounting.of(given, "[mounting]")
 
 
 def test_mounting_of_a_plan():

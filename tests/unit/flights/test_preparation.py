@@ -36,7 +36,7 @@ def from_file(folder, place, **others):
     """Return a flight along the records, whose platform has this origin."""
     (folder / "line.csv").write_text(RECORDS)
     platform = {"kind": "csv", "file": "line.csv", "origin": place}
-    return FlightPlan.of({**FLIGHT, "platform": platform, **others}, folder)
+    return FlightPlan.of_file({**FLIGHT, "platform": platform, **others}, folder)
 
 
 def loaded_scene(folder, **parameters):
@@ -96,14 +96,16 @@ def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
     (tmp_path / "step.asc").write_text(GRID)
     (tmp_path / "own.xml").write_text(OWN_SCENE.format(shared=scenes.__path__[0], own=own))
     given = {**FLIGHT, "scene": "own.xml", "parameters": {"map_file": str(tmp_path / "step.asc")}}
-    record = scene_of(FlightPlan.of({**given, "crs": "EPSG:32633", "origin": [500000.0, 6500000.0, 0.0]}, tmp_path))
+    record = scene_of(
+        FlightPlan.of_file({**given, "crs": "EPSG:32633", "origin": [500000.0, 6500000.0, 0.0]}, tmp_path)
+    )
     text = record.document().filled(lambda setting: setting.value)
     found = tuple(float(re.search(f'name="origin_{axis}" value="(.*?)"', text)[1]) for axis in "xy")
     assert found == place
     assert record.parameters["map_file"] == "nowhere.tif"
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "step.asc")]
     # Without map coordinates the map lies as it does in a render.
-    assert ("origin_x" in scene_of(FlightPlan.of(given, tmp_path)).text) == bool(own)
+    assert ("origin_x" in scene_of(FlightPlan.of_file(given, tmp_path)).text) == bool(own)
 
 
 def test_places_beyond_a_map(tmp_path, caplog):
@@ -119,9 +121,10 @@ def test_places_beyond_a_map(tmp_path, caplog):
 
 
 def test_a_map_without_coordinates_and_a_flight_without_them_go_together(tmp_path):
-    check_maps(FlightPlan.of(FLIGHT), loaded_scene(tmp_path))
+    check_maps(FlightPlan.of_file(FLIGHT), loaded_scene(tmp_path))
     check_maps(
-        FlightPlan.of({**FLIGHT, "origin": [5e5, 6e6, 0]}), mi.load_dict({"type": "scene", "b": {"type": "seabed"}})
+        FlightPlan.of_file({**FLIGHT, "origin": [5e5, 6e6, 0]}),
+        mi.load_dict({"type": "scene", "b": {"type": "seabed"}}),
     )
 
 
@@ -143,9 +146,9 @@ def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
     for size in (None, 16, 8):
         if size == 8:
             with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*flight\.zarr, 16"):
-                _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size)
+                _prepare(FlightPlan.of_file(FLIGHT), tmp_path / STORE, size)
         else:
-            assert _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size) is store
+            assert _prepare(FlightPlan.of_file(FLIGHT), tmp_path / STORE, size) is store
 
 
 def test_what_is_told_before_a_flight(caplog):
