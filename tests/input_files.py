@@ -238,7 +238,7 @@ def plan_table(path: Path) -> None:
     from mitransient_lidar.campaigns.runs import RunRenderer
 
     given = {"scene": "table1", "design": {"file": path.name}, "fixed": {"time_start_ns": 1400, "bin_count": 200}}
-    campaign = Campaign.of(given, path.parent)
+    campaign = Campaign.of_file(given, path.parent)
     RunRenderer.of(campaign, campaign.table())
 
 

@@ -167,7 +167,7 @@ def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> C
     if isinstance(given, Campaign):
         return given
     if isinstance(given, Mapping):
-        return Campaign.of(given)
+        return Campaign.of_file(given)
     return Campaign.read(checked_path("campaign", given))
 
 

@@ -31,7 +31,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
-CAMPAIGN = Campaign.of(
+CAMPAIGN = Campaign.of_file(
     {
         "scene": "table1",
         "parameters": {"time": {"low": 1, "high": 2}, "layout": ["1x1", "2x2"]},
@@ -116,7 +116,9 @@ def test_renderer_of_a_store_is_that_of_its_campaign(store):
     assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
     assert renderer.scene.parameters == {"time": "0"}
     assert is_of(store, CAMPAIGN, CAMPAIGN.table())
-    other = Campaign.of({"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}})
+    other = Campaign.of_file(
+        {"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}}
+    )
     assert not is_of(store, other, other.table())
     edited = CAMPAIGN.table()
     edited["time"] = edited["time"] + 1e-9

@@ -28,22 +28,10 @@ def test_shipped_flights_have_poses(name):
     ("change", "message"),
     [
         ({"sence": "flight"}, "'sence' is no key of a flight"),
-        ({"scene": 3}, "scene = 3 must be a name"),
-        ({"pulses": {}}, r"\[pulses\] has no rate_hz"),
-        ({"pulses": {"rate_hz": -1}}, "rate_hz"),
-        ({"pulses": {"rate_hz": 100, "most": 0}}, "most = 0 must"),
-        ({"receiver": {"gian": 1}}, "'gian' is no key of"),
         ({"receiver": {"gain": "best"}}, "receiver.gain = 'best' must be a number or auto"),
         ({"receiver": {"gain": "auto", "optical_density": "auto"}}, "are alternatives: give one of them"),
-        ({"receiver": {"optical_density": 20}}, "optical_density = 20"),
         ({"estimator": "best"}, "estimator = 'best' must be one of"),
-        ({"errors": {"rol_deg": 1}}, "rol_deg"),
-        ({"origin": [0, 0]}, r"origin = \[0, 0\] must be x, y and z"),
-        ({"still_sea": 1}, "still_sea = 1 must be true or false"),
         ({"parameters": {"altitude": 200}}, "'altitude' follows from the poses"),
-        ({"seed": -1}, "seed = -1 must"),
-        ({"max_time": 0}, "max_time = 0 must"),
-        ({"surface_radius": -1}, "surface_radius = -1"),
     ],
 )
 def test_bad_flights_are_one_sentence(change, message):

@@ -85,15 +85,7 @@ def test_invalid_text(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"kind": "csv"}, "has no file"),
         ({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"),
-        ({"kind": "csv", "file": "flight.trj", "epsg": 3}, "'epsg' is no key of a platform of kind 'csv'"),
-        (
-            {"kind": "csv", "file": "flight.trj", "rotation_spec": "ZYX"},
-            "rotation_spec = 'ZYX' must be one of aerospace",
-        ),
-        ({"kind": "csv", "file": "flight.trj", "origin": [1, 2]}, "must be x, y and z in metres"),
-        ({"kind": "sbet", "file": "flight.trj"}, "has no epsg"),
     ],
 )
 def test_invalid_tables(tmp_path, given, message):
