@@ -124,7 +124,7 @@ def _composed(name: str, value: Any, kind: Any, option: Option) -> Any:
     """Return a table, a list, a text, or an object of another class."""
     if isinstance(kind, type) and issubclass(kind, Plan):
         return value if isinstance(value, kind) else kind.of(table(name, value), f"[{name}]", f"{name}.")
-    if get_origin(kind) is tuple:
+    if get_origin(kind) is tuple and {str, float} & {*get_args(kind)}:
         return _list(name, value, get_args(kind), option)
     if get_origin(kind) is not None and issubclass(get_origin(kind), Mapping):
         return table(name, value)

@@ -49,6 +49,8 @@ def table(kind):
 def wrong(kind, option):
     """Return values that a declaration does not allow."""
     kinds, numbers = parts(kind), {int, float} & {*parts(kind)}
+    if get_origin(kinds[0]) is tuple and get_origin(get_args(kinds[0])[0]) is tuple:
+        return []
     if get_origin(kinds[0]) is tuple:
         fixed = Ellipsis not in get_args(kinds[0])
         return ["north", [nan], *([[1.0]] if fixed else [])] if str not in get_args(kinds[0]) else [3, [3]]
@@ -71,14 +73,15 @@ def test_each_key_is_read_refused_and_documented_by_its_declaration(plan):
     for name, (kind, option) in plan._kinds.items():
         if name in plan.__annotations__:
             assert f" {name} {option.help()}" in " ".join(plan.__doc__.split())
-        for value in wrong(kind, option):
+        default = plan.__dataclass_fields__[name].default
+        for value in (one for one in wrong(kind, option) if one != default):
             with pytest.raises(UserError, match=rf"^a\.{name}(\.[a-z]+)? (=|holds) .+ (must|is) ") as error:
                 plan.of({**usual_table, name: value}, "the table", "a.")
             assert "\n" not in str(error.value)
         if name in usual_table and name not in ("length", "count"):
             with pytest.raises(UserError, match=f"^the table has no {name}: it must have it$"):
                 plan.of({key: value for key, value in usual_table.items() if key != name}, "the table")
-    with pytest.raises(UserError, match="^'colour' is no key of the table: allowed are .+"):
+    with pytest.raises(UserError, match=r"^'colour' is no key of the table: allowed are .+"):
         plan.of({**usual_table, "colour": 3}, "the table")
-    with pytest.raises(UserError, match="^the table = 3 must be a table$"):
+    with pytest.raises(UserError, match=r"^the table = 3 must be a table$"):
         plan.of(3, "the table")
