@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from mitransient_lidar.core.options import Option, positive_option
 from mitransient_lidar.core.plans import Plan, of_kind
 from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.flights.poses.attitude import RotationSpec
-from mitransient_lidar.flights.poses.records import TrajectoryRecords
+from mitransient_lidar.flights.poses.records import PlatformPoses
 from mitransient_lidar.flights.poses.times import TimeSystem, time_system
 from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory
 from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
@@ -83,7 +83,7 @@ class _Moving(Platform):
 
     def _records(
         self, begin: FloatArray, duration: float, first: FloatArray, velocity: FloatArray, yaw: FloatArray
-    ) -> TrajectoryRecords:
+    ) -> PlatformPoses:
         """Return the records of lines that begin at times [s] and positions [m], with velocities [m/s], yaws [deg]."""
         noise = self.noise
         still = not (noise.roll_deg or noise.pitch_deg or noise.yaw_deg)
@@ -97,7 +97,7 @@ class _Moving(Platform):
         rng = np.random.default_rng(noise.seed)
         noises = np.stack([noise.sample(since.size, duration / steps, rng) for _ in begin], axis=1)
         position = first[:, None] + velocity[:, None] * since[:, None]
-        return TrajectoryRecords(
+        return PlatformPoses(
             (begin[:, None] + since).ravel(),
             position.reshape(-1, 3),
             (self.roll_deg + noises[0]).ravel(),
@@ -152,7 +152,7 @@ class Lines(_Moving):
         level = np.column_stack([velocity, np.zeros(self.count)])
         place = np.column_stack([first, np.full(self.count, self.height)])
         records = self._records(begin, duration, place, level, yaw)
-        return Trajectory(*records, lines=np.column_stack([begin, begin + duration]))
+        return Trajectory(**vars(records), lines=np.column_stack([begin, begin + duration]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +166,7 @@ class Mast(_Moving):
     def trajectory(self, folder: Path = Path()) -> Trajectory:
         """Return position and attitude over time."""
         place, heading = np.array([self.position]), np.array([self.heading_deg])
-        return Trajectory(*self._records(np.zeros(1), self.duration_s, place, np.zeros((1, 3)), heading))
+        return Trajectory(**vars(self._records(np.zeros(1), self.duration_s, place, np.zeros((1, 3)), heading)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,15 +191,17 @@ class TrajectoryFile(Platform):
         """Return position and attitude over time; raise `UserError` for a file that cannot be read."""
         lines = finite_array("lines_s", self.lines_s)
         records, order = self._records(folder / self.file)
-        records = records._replace(position=records.position - np.array(self.origin or (0.0, 0.0, 0.0)))
-        return Trajectory(*records, order, self.interpolation, lines)
+        place = records.position - np.array(self.origin or (0.0, 0.0, 0.0))
+        return Trajectory(
+            **vars(replace(records, position=place)), rotation_spec=order, interpolation=self.interpolation, lines=lines
+        )
 
     def time_system(self, time_s: FloatArray) -> TimeSystem:
         """Return the system of the times of pulses [s]; raise `UserError` if they may be Unix times."""
         return self.time or time_system(time_s, self.file, is_sbet=isinstance(self, SbetFile))
 
     @abstractmethod
-    def _records(self, path: Path) -> tuple[TrajectoryRecords, RotationSpec]:
+    def _records(self, path: Path) -> tuple[PlatformPoses, RotationSpec]:
         """Return the records of a file, and the order of their rotations."""
 
 
@@ -209,7 +211,7 @@ class CsvFile(TrajectoryFile):
 
     rotation_spec: Annotated[RotationSpec, Option("Order of the rotations, by default that of HELIOS++")] = "ARINC 705"
 
-    def _records(self, path: Path) -> tuple[TrajectoryRecords, RotationSpec]:
+    def _records(self, path: Path) -> tuple[PlatformPoses, RotationSpec]:
         return read_text_records(path), self.rotation_spec
 
 
@@ -219,7 +221,7 @@ class SbetFile(TrajectoryFile):
 
     epsg: Annotated[int, Option("EPSG code of the coordinates", 1, _LARGEST_EPSG)]
 
-    def _records(self, path: Path) -> tuple[TrajectoryRecords, RotationSpec]:
+    def _records(self, path: Path) -> tuple[PlatformPoses, RotationSpec]:
         return read_sbet_records(path, self.epsg), "aerospace"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
 from mitransient_lidar.flights.poses.attitude import RotationSpec, rotation_matrices
-from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
+from mitransient_lidar.flights.poses.records import PlatformPoses, check_records
 
 #: Interpolation between records.
 Interpolation = Literal["linear", "cubic"]
@@ -28,20 +28,24 @@ _MOST_PULSES = 10**8
 _LAST_PULSE = 1e-6
 
 
-class PlatformPoses(NamedTuple):
-    """Interpolated poses of a platform, and what they belong to."""
+@dataclass(frozen=True, eq=False)
+class InterpolatedPoses(PlatformPoses):
+    """Poses of a platform at any times, roll and pitch -180 to 180 and yaw 0 to 360 degrees.
 
-    time_s: FloatArray  #: Times [s], shape (n,).
-    position: FloatArray  #: Positions x, y, z [m], shape (n, 3).
-    roll_deg: FloatArray  #: Roll [deg], -180 to 180, shape (n,).
-    pitch_deg: FloatArray  #: Pitch [deg], -180 to 180, shape (n,).
-    yaw_deg: FloatArray  #: Yaw [deg], 0 to 360, shape (n,).
-    rotation: FloatArray  #: Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
-    line: IntArray  #: Number of the flight line, from 0, shape (n,).
+    Parameters
+    ----------
+    rotation
+        Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
+    line
+        Number of the flight line, from 0, shape (n,).
+    """
+
+    rotation: FloatArray
+    line: IntArray
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, eq=False)
+class Trajectory(PlatformPoses):
     """Position and attitude of a platform over time, and its flight lines.
 
     Axes of the platform are x to the right, y forward and z up. Between records, positions and angles are linear in
@@ -50,12 +54,8 @@ class Trajectory:
 
     Parameters
     ----------
-    time_s
-        Times [s], strictly increasing, shape (n,), n at least 2.
-    position
-        Positions x (east), y (north), z (up) [m], shape (n, 3).
-    roll_deg, pitch_deg, yaw_deg
-        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
+    time_s, position, roll_deg, pitch_deg, yaw_deg
+        The records, 2 or more at strictly increasing times.
     rotation_spec
         Order of the rotations, as in `attitude.rotation_matrices`.
     interpolation
@@ -71,11 +71,6 @@ class Trajectory:
         the one before.
     """
 
-    time_s: FloatArray
-    position: FloatArray
-    roll_deg: FloatArray
-    pitch_deg: FloatArray
-    yaw_deg: FloatArray
     rotation_spec: RotationSpec = "aerospace"
     interpolation: Interpolation = "linear"
     lines: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
@@ -87,21 +82,16 @@ class Trajectory:
         one_of("rotation_spec", self.rotation_spec, get_args(RotationSpec))
         one_of("interpolation", self.interpolation, get_args(Interpolation))
         count = self.time_s.size
-        for name in TrajectoryRecords._fields:
+        for name in ("position", "roll_deg", "pitch_deg", "yaw_deg"):
             shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
             if shape != wanted:
                 raise UserError(f"{name} has the shape {shape}: it must be {wanted}")
-        check_records(self.records, "a trajectory", lambda row: f"record {row + 1} of a trajectory")
+        check_records(self, "a trajectory", lambda row: f"record {row + 1} of a trajectory")
         if self.lines.size == 0:
             object.__setattr__(self, "lines", self.time_s[[0, -1]][None])
         self._check_lines()
 
-    @property
-    def records(self) -> TrajectoryRecords:
-        """Times, positions and attitudes of the records."""
-        return TrajectoryRecords(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
-
-    def at(self, times: npt.ArrayLike) -> PlatformPoses:
+    def at(self, times: npt.ArrayLike) -> InterpolatedPoses:
         """Return the poses at times [s], shape (n,); raise `UserError` for a time that is on no flight line."""
         time = np.atleast_1d(finite_array("times", times))
         line = np.searchsorted(self.lines[:, 0], time, side="right") - 1
@@ -114,7 +104,7 @@ class Trajectory:
         position, (roll, pitch, yaw) = values[:, :3], values[:, 3:].T
         roll, pitch, yaw = 180 - (180 - roll) % 360, 180 - (180 - pitch) % 360, yaw % 360
         rotation = rotation_matrices(roll, pitch, yaw, self.rotation_spec)
-        return PlatformPoses(time, position, roll, pitch, yaw, rotation, line)
+        return InterpolatedPoses(time, position, roll, pitch, yaw, rotation, line)
 
     def _interpolated(self, time: FloatArray) -> FloatArray:
         """Return positions [m] and angles [deg], which may exceed a turn, at times on flight lines, shape (n, 6)."""
