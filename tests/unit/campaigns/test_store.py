@@ -108,12 +108,16 @@ def test_new_store_is_empty_and_complete(store, path):
 
 
 def is_of(store, campaign, columns, scene=RECORD):
-    return store.is_of("campaign", campaign.text, columns, lambda: scene)
+    try:
+        store.require(campaign, columns, lambda: scene)
+    except UserError as error:
+        return "holds another campaign, or its scene has changed" not in str(error)
+    return True
 
 
 def test_renderer_of_a_store_is_that_of_its_campaign(store):
     renderer = store.renderer()
-    assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
+    assert (renderer.plan.text, renderer.axis) == (CAMPAIGN.text, AXIS)
     assert renderer.scene.parameters == {"time": "0"}
     assert is_of(store, CAMPAIGN, CAMPAIGN.table())
     other = Campaign.of_file(
@@ -125,6 +129,8 @@ def test_renderer_of_a_store_is_that_of_its_campaign(store):
     assert not is_of(store, CAMPAIGN, edited)
     # The file of the scene has changed since.
     assert not is_of(store, CAMPAIGN, CAMPAIGN.table(), replace(RECORD, text="<scene></scene>"))
+    with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*, 4"):
+        store.require(CAMPAIGN, None, lambda: RECORD, 8)
 
 
 def test_store_of_other_versions(store, caplog):

@@ -2,7 +2,6 @@
 
 import logging
 import re
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.fly import STORE, _prepare
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
@@ -136,19 +134,6 @@ def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
     for wrong in ({"crs": "EPSG:32633"}, {"origin": [500021.0, 6500015.0, 0.0]}):
         with pytest.raises(UserError, match=r"origin = \[500020.0, .* of the platform must have the x and y of that"):
             from_file(tmp_path, place, **wrong).poses()
-
-
-def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
-    """As that of a campaign: another size is refused instead of being ignored."""
-    store = SimpleNamespace(count=3, shard_size=16, inputs=lambda rows: {}, is_of=lambda *about: True)
-    monkeypatch.setattr("mitransient_lidar.flights.fly.Store", lambda path: store)
-    (tmp_path / STORE).mkdir()
-    for size in (None, 16, 8):
-        if size == 8:
-            with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*flight\.zarr, 16"):
-                _prepare(FlightPlan.of_file(FLIGHT), tmp_path / STORE, size)
-        else:
-            assert _prepare(FlightPlan.of_file(FLIGHT), tmp_path / STORE, size) is store
 
 
 def test_what_is_told_before_a_flight(caplog):
