@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from mitransient_lidar.core.errors import UserError
@@ -18,9 +19,9 @@ from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 Setting = float | Literal["auto"]
@@ -77,7 +78,7 @@ class ReceiverFile(ChannelTable):
 
 @dataclass(frozen=True)
 class Channel:
-    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `presets`."""
+    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `ReceiverChain`."""
 
     chain: ReceiverChain
     gain: Setting = 1.0
@@ -202,10 +203,17 @@ def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
     UserError
         If a key is unknown, a parameter is out of range, or the stages do not fit together.
     """
-    values = ReceiverFile.of(parse_toml(text, name), name, f"{name}: ")
+    return _receiver(parse_toml(text, name), name, folder, RECEIVERS)
+
+
+def _receiver(
+    given: Mapping[str, Any], name: str, folder: Path, presets: Mapping[str, ReceiverChain]
+) -> ReceiverChannels:
+    """Return the receiver of the tables of a file."""
+    values = ReceiverFile.of(given, name, f"{name}: ")
     base = None
     if values.preset is not None:
-        base = Channel(RECEIVERS[one_of(f"{name}: preset", values.preset, RECEIVERS)])
+        base = Channel(presets[one_of(f"{name}: preset", values.preset, presets)])
     others: dict[str, Any] = {
         key: value for key in ("wavelength_nm", "source") if (value := getattr(values, key)) is not None
     }
@@ -282,3 +290,16 @@ def _tried(name: str, build: Callable[[], Any]) -> Any:
         raise UserError(f"{name}: {error}") from None
     except (TypeError, ValueError):
         raise UserError(f"{name} has a parameter of another type than its number or text") from None
+
+
+def _presets() -> Mapping[str, ReceiverChain]:
+    """Return the typical chains for 532 nm."""
+    path = Path(__file__).with_name("presets.toml")
+    found: dict[str, ReceiverChain] = {}
+    for name, given in parse_toml(path.read_text("utf-8"), path).items():
+        found[name] = _receiver(given, f"{path.name}: {name}", path.parent, found).default.chain
+    return MappingProxyType(found)
+
+
+#: Typical chains for 532 nm, with their sources.
+RECEIVERS = _presets()

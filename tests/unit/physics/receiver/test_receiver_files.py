@@ -9,10 +9,10 @@ from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import instrument_receiver, parse_receiver, receiver
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS, instrument_receiver, parse_receiver, receiver
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 WHOLE = """
@@ -144,8 +144,6 @@ def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
         ('preset = "apd"\n[detector]\ntype = "eye"', "detector.type = 'eye' must be one of"),
         ('[detector]\ntype = "photodiode"', "detector has no quantum_efficiency"),
         ('preset = "apd"\n[amplifier]\nbandwidth_mhz = -1', "amplifier: bandwidth_mhz = -1"),
-        ('preset = "apd"\n[amplifier]\nbandwidth_mhz = "wide"', "amplifier"),
-        ('preset = "apd"\ngain = true', "gain = True must be a number or auto"),
         ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
         ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "'preset' is no key of own.toml: channels.deep"),
         ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
@@ -154,12 +152,9 @@ def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
             "amplifier of channel 'deep' must have the resp",
         ),
         ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
-        ('preset = "apd"\npulse_repetition_khz = 0', "pulse_repetition_khz = 0"),
-        ('preset = "apd"\namplifier = 3', "amplifier = 3 must be a table"),
         ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
         ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),
         ('preset = "apd"\n[detector]\ntail_fractions = 0.1', "detector: tail_fractions = 0.1 must be a list of num"),
-        ('preset = "apd"\n[detector]\ntail_fractions = ["a"]', "detector: tail_fractions"),
         (
             'preset = "pmt"\n[detector]\nafterpulse_probability = 0.1',
             "'afterpulse_probability' is no key of own.toml: detector",

@@ -9,13 +9,14 @@ from significance import largest_z
 from mitransient_lidar.analysis.detection import statistics
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import sample_moments
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
     SinglePhotonDetector,
     photons_per_joule,
 )
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 FRACTIONS, DECAYS, DELAYS = (0.02, 0.05), (30.0, 90.0), (0.0, 24.5)
 TUBE = LinearDetector.photomultiplier(
