@@ -128,10 +128,7 @@ def test_a_tube_at_another_voltage_keeps_its_tail():
     ("values", "message"),
     [
         ({"tail_fractions": (0.1,)}, r"tail_decays_ns = \[\] must have as many numbers as tail_fractions, 1"),
-        ({"tail_fractions": (-0.1,), "tail_decays_ns": (9.0,)}, "tail_fractions = -0.1 must not be negative"),
         ({"tail_fractions": (0.7, 0.6), "tail_decays_ns": (9.0, 8.0)}, "tail_fractions .* a sum of at most 1"),
-        ({"tail_fractions": (0.1,), "tail_decays_ns": (0.0,)}, "tail_decays_ns = 0 must be greater than 0"),
-        ({"tail_fractions": 0.1}, "tail_fractions = 0.1 must be a list of numbers"),
         (
             {"tail_fractions": (0.1,), "tail_decays_ns": (9.0,), "tail_delays_ns": (1.0, 2.0)},
             "tail_delays_ns = .* must have as many numbers as tail_fractions",
