@@ -238,7 +238,7 @@ def plan_table(path: Path) -> None:
     from mitransient_lidar.campaigns.runs import RunRenderer
 
     given = {"scene": "table1", "design": {"file": path.name}, "fixed": {"time_start_ns": 1400, "bin_count": 200}}
-    campaign = Campaign.of(given, path.parent)
+    campaign = Campaign.of_file(given, path.parent)
     RunRenderer.of(campaign, campaign.table())
 
 
@@ -297,16 +297,16 @@ def fly(path: Path) -> None:
     from mitransient_lidar.core.files import read_text
     from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
     from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+    from mitransient_lidar.flights.poses.platforms import platform_of
     from mitransient_lidar.flights.poses.scanner import Scanner
-    from mitransient_lidar.flights.poses.trajectory import Trajectory
 
     tables = ("platform", "scanner", "mounting")
     given = parse_toml(read_text(path), path)
     check_keys("a flight", given, tables)
     platform, scanner, mounting = (table(name, required("a flight", given, name)) for name in tables)
-    trajectory = Trajectory.of(platform, path.parent)
+    trajectory = platform_of(platform).trajectory(path.parent)
     times = trajectory.pulse_times(10.0)[:1000]
-    pulse_poses(trajectory, Mounting.of(mounting), Scanner.of(scanner), times)
+    pulse_poses(trajectory, Mounting.of(mounting), Scanner.of_table(scanner), times)
 
 
 def sbet(folder: Path) -> Path:
@@ -323,9 +323,9 @@ def follow(**platform: Any) -> Callable[[Path], None]:
     """Return what reads a trajectory from a file, and interpolates it."""
 
     def read(path: Path) -> None:
-        from mitransient_lidar.flights.poses.trajectory import Trajectory
+        from mitransient_lidar.flights.poses.platforms import platform_of
 
-        trajectory = Trajectory.of({"file": path.name, **platform}, path.parent)
+        trajectory = platform_of({"file": path.name, **platform}).trajectory(path.parent)
         trajectory.at(np.linspace(*trajectory.lines[0], 50))
 
     return read

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.physics.receiver.presets import RECEIVERS
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 logging.disable(logging.WARNING)  # of saturated surface echoes, which are intended here

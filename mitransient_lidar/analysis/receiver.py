@@ -17,7 +17,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import made_from
@@ -69,8 +69,8 @@ def detect_waveforms(
     dataset : xarray.Dataset
         A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``.
     chain : ReceiverChannels, ReceiverChain, str or path-like, optional
-        The receiver of every channel, or one chain for all; a name in `physics.receiver.presets.RECEIVERS` or of an
-        instrument, or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
+        The receiver of every channel, or one chain for all; a name in `receiver_files.RECEIVERS` or of an instrument,
+        or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
         of the result, and the preset ``apd`` without one.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see

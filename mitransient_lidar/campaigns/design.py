@@ -8,9 +8,9 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -18,20 +18,14 @@ import numpy.typing as npt
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
-from mitransient_lidar.core.toml_files import check_keys, parse_toml
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    finite,
-    in_range,
-    integer,
-    is_number,
-    non_negative,
-    positive,
-    shown,
-)
+from mitransient_lidar.core.options import BackgroundPower, Option, positive_option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.toml_files import parse_toml, table
+from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
+from mitransient_lidar.physics.receiver.receiver_files import Setting
 
 #: Kinds of designs: every combination; points of a sequence, of a Latin hypercube, or random ones; rows of a file.
-DESIGN_KINDS = ("grid", "sobol", "latin_hypercube", "random", "table")
+DesignKind = Literal["grid", "sobol", "latin_hypercube", "random", "table"]
 
 #: Contents of a store that a campaign may keep.
 KEPT = ("waveform", "stderr", "components", "echoes", "truth")
@@ -50,36 +44,28 @@ Column = npt.NDArray[Any]
 #: What a parameter of a design may take: a range, or values.
 _Free = Union["Range", tuple[Any, ...]]
 
+#: What a parameter that varies is.
+_Varied = Union["Range", tuple[Any, ...], Expression]
+
 
 @dataclass(frozen=True)
-class Range:
-    """Range of a parameter: `low` to `high`, uniform in the value, or in its logarithm for the scale ``log``.
+class Range(Plan):
+    """Range of a parameter, uniform in the value or in its logarithm."""
 
-    `steps` is the number of its values in a grid, both ends among them.
-    """
-
-    low: float
-    high: float
-    scale: str = "linear"
-    steps: int | None = None
+    low: Annotated[float, Option("Low end")]
+    high: Annotated[float, Option("High end, more than the low one")]
+    scale: Annotated[Literal["linear", "log"], Option("Scale in which the range is uniform")] = "linear"
+    steps: Annotated[int | None, Option("Number of values in a grid, both ends among them", 2, 10**6)] = None
 
     @classmethod
-    def of(cls, name: str, given: Mapping[str, Any]) -> Range:
+    def of_parameter(cls, name: str, given: Mapping[str, Any]) -> Range:
         """Check a range of a file; raise `UserError` if it is empty, or not a range."""
-        check_keys(f"parameters.{name}", given, ("low", "high", "scale", "steps"))
-        for end in ("low", "high"):
-            if end not in given:
-                raise UserError(f"{name} = {shown(dict(given))} must have {end}, as in {{ low = 2.0, high = 20.0 }}")
-        low, high = (finite(f"{name}.{end}", given[end]) for end in ("low", "high"))
-        scale = given.get("scale", "linear")
-        if scale not in ("linear", "log"):
-            raise UserError(f"{name}.scale = {shown(scale)} must be 'linear' or 'log'")
-        if not low < high:
-            raise UserError(f"{name} has the empty range {low:g} to {high:g}: low must be less than high")
-        if scale == "log" and low <= 0:
-            raise UserError(f"{name}.low = {low:g} must be positive for the scale 'log'")
-        steps = integer(f"{name}.steps", given["steps"], 2, 10**6) if "steps" in given else None
-        return cls(low, high, scale, steps)
+        found = cls.of(given, f"parameters.{name}", f"{name}.")
+        if not found.low < found.high:
+            raise UserError(f"{name} has the empty range {found.low:g} to {found.high:g}: low must be less than high")
+        if found.scale == "log" and found.low <= 0:
+            raise UserError(f"{name}.low = {found.low:g} must be positive for the scale 'log'")
+        return found
 
     def at(self, shares: FloatArray) -> FloatArray:
         """Return the values at shares of the range, 0 to 1."""
@@ -89,108 +75,88 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Design:
-    """Choice of the runs: `kind` (`DESIGN_KINDS`), `count` of runs, places on each sea (`shots`), `seed`, and table."""
+class Design(Plan):
+    """Choice of the runs of a campaign."""
 
-    kind: str = "sobol"
-    count: int | None = None
-    shots: int = 1
-    seed: int = 0
-    file: str | None = None
+    kind: Annotated[DesignKind, Option("Kind, by default table with a file")] = "sobol"
+    count: Annotated[int | None, Option("Number of runs", 1, MOST_RUNS)] = None
+    shots: Annotated[int, Option("Places on each sea", 1, MOST_SHOTS)] = 1
+    seed: Annotated[int, Option("Seed of the random numbers", 0, 2**32 - 1)] = 0
+    file: Annotated[str | None, Option("CSV file with a row for each run", form="the name of a CSV file")] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.file is not None) != (self.kind == "table"):
+            raise UserError(
+                f"design.file = {shown(self.file)} must name a CSV file for kind = 'table', and only for it"
+            )
+        if (self.count is None) == (self.kind not in ("grid", "table")):
+            needs = "needs a number of runs" if self.count is None else "has the number of runs that its values give"
+            raise UserError(f"design.count = {shown(self.count)}: a design of kind {self.kind!r} {needs}")
 
 
-@dataclass(frozen=True)
-class Campaign:
-    """A campaign, as its file describes it.
+@dataclass(frozen=True, kw_only=True)
+class Campaign(Plan):
+    """A campaign, as its file describes it; `folder` is that from which its relative paths count.
 
-    Attributes
-    ----------
-    scene, instrument
-        Scene by name or path, and instrument, as for `render_shots`.
-    target_error
-        Relative standard error of the median bin of each run.
-    max_time
-        Longest time for the passes of each run [s], None for any. A run that it ends has other bits elsewhere.
-    keep
-        What the store holds, of `KEPT`.
-    derivatives
-        Names of parameters by which the waveforms are differentiated, as for `render_shots`; kept as
-        ``waveform_derivative``.
-    receiver
-        Receiver chain of every pixel, whose noisy ``signal`` is kept as well; `gain`, `optical_density` (numbers or
-        'auto') and `background_power_w` are those of `analysis.receiver.detect_waveforms`.
-    fixed
-        Parameters of the scene that are the same in all runs.
-    parameters
-        Parameters that vary: a `Range`, a tuple of values, or an `Expression` of the others.
-    design
-        Choice of the runs.
-    folder
-        Folder of the file, from which relative paths count.
-    text
-        The campaign as JSON, from which `from_json` returns it.
+    A parameter that varies is a `Range`, a tuple of values, or an `Expression` of the others. `text` is the campaign as
+    JSON, from which `from_json` returns it.
     """
 
-    scene: str
-    target_error: float = 0.05
-    max_time: float | None = None
-    keep: tuple[str, ...] = ("waveform", "truth")
-    instrument: str | None = None
-    derivatives: tuple[str, ...] = ()
-    receiver: str | None = None
-    gain: float | Literal["auto"] = 1.0
-    optical_density: float | Literal["auto"] = 0.0
-    background_power_w: float = 0.0
-    fixed: Mapping[str, Any] = field(default_factory=dict)
-    parameters: Mapping[str, Range | tuple[Any, ...] | Expression] = field(default_factory=dict)
-    design: Design = Design()
+    scene: Annotated[str, Option("Scene", form="the name of a shipped scene or the path of an XML file")]
+    target_error: Annotated[float, positive_option("Relative standard error of the median bin of each run")] = 0.05
+    max_time: Annotated[
+        float | None,
+        positive_option("Longest time for the passes of each run; one that it ends has other bits elsewhere", "s"),
+    ] = None
+    keep: Annotated[tuple[str, ...], Option(f"What the store holds, of {', '.join(KEPT)}")] = ("waveform", "truth")
+    instrument: Annotated[str | None, Option("Instrument instead of the scene's lidar")] = None
+    derivatives: Annotated[
+        tuple[str, ...], Option("Parameters by which waveforms are differentiated, kept as waveform_derivative")
+    ] = ()
+    receiver: Annotated[str | None, Option("Receiver chain of every pixel, whose noisy signal is kept as well")] = None
+    gain: Annotated[Setting, Option("Factor of its gain", 0, above=True)] = 1.0
+    optical_density: Annotated[Setting, Option("Optical density of its filter", 0, 12)] = 0.0
+    background_power_w: BackgroundPower = 0.0
+    fixed: Annotated[Mapping[str, Any], Option("Parameters of the scene that are the same in all runs")] = field(
+        default_factory=dict
+    )
+    parameters: Annotated[Mapping[str, _Varied], Option("Parameters that vary")] = field(default_factory=dict)
+    design: Annotated[Design, Option("Choice of the runs")]
     folder: Path = Path()
     text: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.keep:
+            raise UserError(f"keep = [] must be a list of {', '.join(KEPT)}")
+        if unknown := [name for name in self.keep if name not in KEPT]:
+            raise UserError(f"keep holds {shown(unknown[0])}: allowed are {', '.join(KEPT)}")
+        object.__setattr__(self, "keep", tuple(name for name in KEPT if name in self.keep))
+        if twice := [name for name in self.parameters if name in self.fixed]:
+            raise UserError(f"parameter {twice[0]!r} is in [fixed] and in [parameters]: leave out one of them")
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Campaign:
         """Read a TOML file; raise `UserError` if it cannot be read, is not TOML, or describes no campaign."""
-        return cls.of(parse_toml(read_text(path), path), Path(path).resolve().parent)
+        return cls.of_file(parse_toml(read_text(path), path), Path(path).resolve().parent)
 
     @classmethod
-    def of(cls, given: Mapping[str, Any], folder: Path | None = None) -> Campaign:
+    def of_file(cls, given: Mapping[str, Any], folder: Path | None = None) -> Campaign:
         """Check a campaign given as a dict of the contents of its file; raise `UserError` if it is invalid."""
-        own = [one.name for one in fields(cls) if one.name not in ("folder", "text")]
-        check_keys("a campaign", given, own)
-        scene = given.get("scene")
-        if not isinstance(scene, (str, os.PathLike)):
-            raise UserError(f"scene = {shown(scene)} must be the name of a shipped scene or the path of an XML file")
         folder = Path.cwd() if folder is None else folder
-        for name in ("instrument", "receiver"):
-            if not isinstance(given.get(name), (str, type(None))):
-                raise UserError(f"{name} = {shown(given[name])} must be a name")
-        gain, density = given.get("gain", 1.0), given.get("optical_density", 0.0)
-        parameters = {name: _parameter(name, value) for name, value in _section(given, "parameters").items()}
-        design = _design(_section(given, "design"))
-        fixed = _section(given, "fixed")
-        if twice := [name for name in parameters if name in fixed]:
-            raise UserError(f"parameter {twice[0]!r} is in [fixed] and in [parameters]: leave out one of them")
+        values = dict(given)
+        if isinstance(values.get("scene"), (str, os.PathLike)):
+            values["scene"] = _resolved(os.fspath(values["scene"]), folder)
+        if isinstance(design := values.get("design"), Mapping) and "file" in design:
+            values["design"] = {"kind": "table", **design}
+        varied = table("parameters", values.get("parameters", {}))
+        values["parameters"] = {name: _parameter(name, value) for name, value in varied.items()}
         try:
             text = json.dumps(_plain(given))
         except (TypeError, ValueError, RecursionError):
             raise UserError("the campaign must hold numbers, texts, lists and tables only") from None
-        campaign = cls(
-            scene=_resolved(str(scene), folder),
-            target_error=positive("target_error", given.get("target_error", 0.05)),
-            max_time=None if given.get("max_time") is None else positive("max_time", given["max_time"]),
-            keep=_kept(given.get("keep", ["waveform", "truth"])),
-            instrument=given.get("instrument"),
-            derivatives=_names("derivatives", given.get("derivatives", [])),
-            receiver=given.get("receiver"),
-            gain=gain if gain == "auto" else positive("gain", gain),
-            optical_density=density if density == "auto" else in_range("optical_density", density, 0, 12),
-            background_power_w=non_negative("background_power_w", given.get("background_power_w", 0.0)),
-            fixed=fixed,
-            parameters=parameters,
-            design=design,
-            folder=folder,
-            text=text,
-        )
+        campaign = cls.of(values, "a campaign", folder=folder, text=text)
         if campaign.receiver is None and (
             told := [name for name in ("gain", "optical_density", "background_power_w") if name in given]
         ):
@@ -200,7 +166,7 @@ class Campaign:
     @classmethod
     def from_json(cls, text: str) -> Campaign:
         """Return the campaign of a `text`."""
-        return cls.of(json.loads(text))
+        return cls.of_file(json.loads(text))
 
     @property
     def needed_names(self) -> set[str]:
@@ -339,10 +305,10 @@ def _grid_axis(one: _Free) -> Column:
     return one.at(np.linspace(0, 1, one.steps))
 
 
-def _parameter(name: str, value: Any) -> Range | tuple[Any, ...] | Expression:
+def _parameter(name: str, value: Any) -> _Varied:
     """Return what a parameter takes: a range, values, or an expression."""
     if isinstance(value, Mapping):
-        return Range.of(name, value)
+        return Range.of_parameter(name, value)
     if isinstance(value, str):
         return Expression(name, value)
     if isinstance(value, Sequence) and value:
@@ -355,54 +321,6 @@ def _parameter(name: str, value: Any) -> Range | tuple[Any, ...] | Expression:
         f"{name} = {shown(value)} must be a range {{ low = .., high = .. }}, a list of numbers or of texts, or an "
         "expression in quotes; a single value belongs to [fixed]"
     )
-
-
-def _design(given: Mapping[str, Any]) -> Design:
-    """Check the design of a file."""
-    check_keys("design", given, [one.name for one in fields(Design)])
-    kind = given.get("kind", "table" if "file" in given else "sobol")
-    if kind not in DESIGN_KINDS:
-        raise UserError(f"design.kind = {shown(kind)} must be one of {', '.join(DESIGN_KINDS)}")
-    file, count = given.get("file"), given.get("count")
-    if (file is not None) != (kind == "table") or not isinstance(file, (str, type(None))):
-        raise UserError(f"design.file = {shown(file)} must name a CSV file for kind = 'table', and only for it")
-    if (count is None) == (kind not in ("grid", "table")):
-        needs = "needs a number of runs" if count is None else "has the number of runs that its values give"
-        raise UserError(f"design.count = {shown(count)}: a design of kind {kind!r} {needs}")
-    return Design(
-        kind,
-        None if count is None else integer("design.count", count, 1, MOST_RUNS),
-        integer("design.shots", given.get("shots", 1), 1, MOST_SHOTS),
-        integer("design.seed", given.get("seed", 0), 0, 2**32 - 1),
-        file,
-    )
-
-
-def _kept(given: Any) -> tuple[str, ...]:
-    """Check what the store holds."""
-    names = [given] if isinstance(given, str) else given
-    if not isinstance(names, (list, tuple)) or not names:
-        raise UserError(f"keep = {shown(given)} must be a list of {', '.join(KEPT)}")
-    for name in names:
-        if name not in KEPT:
-            raise UserError(f"keep holds {shown(name)}: allowed are {', '.join(KEPT)}")
-    return tuple(name for name in KEPT if name in names)
-
-
-def _names(option: str, given: Any) -> tuple[str, ...]:
-    """Check a list of names."""
-    names = [given] if isinstance(given, str) else given
-    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{option} = {shown(given)} must be a list of names")
-    return tuple(names)
-
-
-def _section(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return a table of a file, empty if it is not there."""
-    section = given.get(name, {})
-    if not isinstance(section, Mapping):
-        raise UserError(f"{name} = {shown(section)} must be a table, as [{name}] begins")
-    return section
 
 
 def _resolved(name: str, folder: Path) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -51,86 +52,62 @@ class Array(NamedTuple):
         return cls(tuple(map(str, values.dims)), np.asarray(values.values, dtype=dtype), plain(values.attrs))
 
 
-class Renderer(Protocol):
-    """What renders the runs of a store."""
+@dataclass(frozen=True, eq=False)
+class Renderer(ABC):
+    """What renders the runs of a store, each with the same bits wherever and whenever.
 
-    @property
-    def unit(self) -> str:
-        """Name of a run."""
+    Attributes
+    ----------
+    plan
+        The campaign or the flight.
+    scene
+        Its scene, with its instrument.
+    axis
+        Time bins of all runs; None where each has its own.
+    """
 
-    @property
-    def kind(self) -> str:
-        """What the store is of, ``campaign`` or ``flight``."""
+    plan: Any
+    scene: SceneSource
+    axis: TimeAxis | None = None
 
-    @property
-    def text(self) -> str:
-        """What is rendered, as JSON."""
-
-    @property
-    def scene(self) -> SceneSource:
-        """The scene."""
-
-    @property
-    def axis(self) -> TimeAxis | None:
-        """Time bins of all runs; None where each has its own."""
+    #: Class of the plan, name of one that is rendered, and of what a store of them is.
+    plan_type: ClassVar[Any]
+    unit: ClassVar[str]
+    kind: ClassVar[str]
 
     @property
     def shots(self) -> int:
         """Number of shots of a run, where they have a dimension."""
+        return 1
 
+    @abstractmethod
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
         """Return the rows of the runs of a shard, those that are rendered together in one list."""
 
     def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
-        """Return arrays that are known of runs before they are rendered."""
+        """Return arrays that are known of runs before they are rendered, and not from their inputs."""
+        return {}
 
+    @abstractmethod
     def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
         """Return the arrays of runs that are rendered together, which are the first dimension; raise `UserError`."""
 
+    @abstractmethod
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
         """Return the attributes of a parameter of the runs."""
 
 
-@dataclass(frozen=True)
-class RunRenderer:
-    """Renders the runs of a campaign, each with the same bits wherever and whenever.
+@dataclass(frozen=True, eq=False)
+class RunRenderer(Renderer):
+    """Renders the runs of a campaign; without time bins they are automatic for each run."""
 
-    Attributes
-    ----------
-    campaign
-        The campaign.
-    scene
-        Its scene, with its instrument.
-    axis
-        Time bins of all runs; automatic for each run without them.
-    """
-
-    campaign: Campaign
-    scene: SceneSource
-    axis: TimeAxis | None = None
-
-    #: Name of one that is rendered, and of what a store of them is.
-    unit, kind = "run", "campaign"
-
-    @staticmethod
-    def check(text: str) -> None:
-        """Raise `UserError` for a text that is no campaign."""
-        Campaign.from_json(text)
-
-    @classmethod
-    def restored(cls, text: str, scene: SceneSource, axis: TimeAxis | None) -> RunRenderer:
-        """Return the renderer of a stored campaign."""
-        return cls(Campaign.from_json(text), scene, axis)
-
-    @property
-    def text(self) -> str:
-        """The campaign as JSON."""
-        return self.campaign.text
+    plan: Campaign
+    plan_type, unit, kind = Campaign, "run", "campaign"
 
     @property
     def shots(self) -> int:
         """Number of shots of a run."""
-        return self.campaign.design.shots
+        return self.plan.design.shots
 
     @classmethod
     def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
@@ -147,7 +124,7 @@ class RunRenderer:
 
     def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters of a run that are its own: those of the table, and the random sea."""
-        if _SEA in values or _SEA in self.campaign.fixed or _SEA not in self.scene.values:
+        if _SEA in values or _SEA in self.plan.fixed or _SEA not in self.scene.values:
             return dict(values)
         return {**values, _SEA: int(self._random(number).integers(1, _SEAS))}
 
@@ -159,7 +136,7 @@ class RunRenderer:
         UserError
             If the scene refuses the parameters, or the light does not fit the record.
         """
-        campaign, known = self.campaign, self.scene.values
+        campaign, known = self.plan, self.scene.values
         params = {**campaign.fixed, **self.inputs(number, values)}
         random = self._random(number)
         random.integers(1, _SEAS)
@@ -184,7 +161,7 @@ class RunRenderer:
         """Return the record of the receiver of the shots of a run, None without a receiver."""
         from mitransient_lidar.analysis.receiver import detect_waveforms
 
-        campaign = self.campaign
+        campaign = self.plan
         if campaign.receiver is None:
             return None
         noise = int(np.random.SeedSequence([campaign.design.seed, number, 1]).generate_state(1)[0])
@@ -199,10 +176,10 @@ class RunRenderer:
 
     def arrays(self, number: int, values: Mapping[str, Any]) -> dict[str, Array]:
         """Return what the store holds of a run, without its dimension; raises as `series`, or if shots are missing."""
-        series, planned = self.series(number, values), self.campaign.design.shots
+        series, planned = self.series(number, values), self.plan.design.shots
         if series.sizes["shot"] < planned:
             done = f"ended after {series.sizes['shot']} of {planned} shots of the run"
-            raise UserError(f"max_time = {self.campaign.max_time:g} s {done}: it must be longer")
+            raise UserError(f"max_time = {self.plan.max_time:g} s {done}: it must be longer")
         return self._stored(number, values, series)
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
@@ -235,18 +212,18 @@ class RunRenderer:
         found["passes"] = _number("passes", series.attrs, np.int32)
         if _SEA in (own := self.inputs(number, values)) and _SEA not in values:
             found[_SEA] = _number(_SEA, own, np.int64)
-        if self.campaign.design.shots > 1:
+        if self.plan.design.shots > 1:
             return found
         return {name: _of_one_shot(array) for name, array in found.items()}
 
     def _arrays(self, number: int, series: xr.Dataset) -> Iterator[tuple[str, Array]]:
         from mitransient_lidar.analysis.waveforms.echo_table import extract
 
-        keep, recorded = self.campaign.keep, self.record(number, series)
+        keep, recorded = self.plan.keep, self.record(number, series)
         names = [name for name, kind in (("waveform", "waveform"), ("waveform_stderr", "stderr")) if kind in keep]
         if "components" in keep:
             names += ["waveform_by_origin"] + (["waveform_by_origin_stderr"] if "stderr" in keep else [])
-        if self.campaign.derivatives:
+        if self.plan.derivatives:
             names += ["waveform_derivative"] + (["waveform_derivative_stderr"] if "stderr" in keep else [])
         for name in names:
             about = {key: value for key, value in series[name].attrs.items() if key != "ancillary_variables"}
@@ -274,13 +251,13 @@ class RunRenderer:
         found = {name: Array.of(series[name]) for name in names}
         if recorded is not None and (time := _renamed_time(recorded["signal"], series)).dims[-1] != "time":
             found["signal_time"] = Array(("signal_time",), time["signal_time"].values, plain(series["time"].attrs))
-        if "echoes" in self.campaign.keep:
+        if "echoes" in self.plan.keep:
             found["echo"] = Array(("echo",), np.array(ECHOES), described("echo"))
         return found
 
     def _random(self, number: int) -> np.random.Generator:
         """Return the random numbers of a run: its sea, then its places, then the seed of its shots."""
-        return np.random.default_rng([self.campaign.design.seed, number])
+        return np.random.default_rng([self.plan.design.seed, number])
 
     def _longest_record(self, columns: Mapping[str, Column]) -> TimeAxis | None:
         """Return time bins that hold the light of all runs, None where the campaign gives them.
@@ -288,7 +265,7 @@ class RunRenderer:
         Each end is sought by one parameter after the other: from the first run, its extreme value that makes the record
         longer is kept.
         """
-        if all(name in self.campaign.fixed for name in ("time_start_ns", "bin_count")):
+        if all(name in self.plan.fixed for name in ("time_start_ns", "bin_count")):
             return None
         extremes = {name: _extremes(column) for name, column in columns.items()}
         ends: list[tuple[float, TimeAxis]] = []
@@ -318,7 +295,7 @@ class RunRenderer:
         """Return the automatic time bins of a run."""
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-        session = open_scene(self.scene, {**self.campaign.fixed, **values})
+        session = open_scene(self.scene, {**self.plan.fixed, **values})
         return find_lidar_scene(session.scene, session.sensor).axis
 
 

@@ -29,7 +29,7 @@ from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
-from mitransient_lidar.core.validation import integer, require_memory
+from mitransient_lidar.core.validation import integer, require_memory, shown
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -66,10 +66,10 @@ _WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
 _STATUS = {**described("status"), "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
 
 
-#: Module and class of the renderer, and name of a run, by the kind of a store.
+#: Module and class of the renderer, by the kind of a store.
 _RENDERERS = {
-    "campaign": ("mitransient_lidar.campaigns.runs", "RunRenderer", "run"),
-    "flight": ("mitransient_lidar.flights.renderer", "FlightRenderer", "shot"),
+    "campaign": ("mitransient_lidar.campaigns.runs", "RunRenderer"),
+    "flight": ("mitransient_lidar.flights.renderer", "FlightRenderer"),
 }
 
 
@@ -102,7 +102,9 @@ class Store:
             #: What the store is of, and that as JSON.
             self.kind = "flight" if "flight" in self.attributes else "campaign"
             self.text = str(self.attributes[self.kind])
-            self._renderer_type().check(self.text)
+            module, name = _RENDERERS[self.kind]
+            self._type: type[Renderer] = getattr(importlib.import_module(module), name)
+            self._plan = self._type.plan_type.from_json(self.text)
             #: Number of runs, and of runs of a shard.
             self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
             self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, LARGEST_SHARD)
@@ -163,31 +165,48 @@ class Store:
     def renderer(self) -> Any:
         """Return the `Renderer` of the runs; warn if the store is of other versions."""
         compare_versions(self.attributes)
-        axis = self.attributes["record"]
-        return self._renderer_type().restored(
-            self.text,
-            SceneSource.from_attributes(self.attributes["scene"]),
-            None if axis is None else TimeAxis(*axis),
-        )
+        axis, scene = self.attributes["record"], SceneSource.from_attributes(self.attributes["scene"])
+        return self._type(self._plan, scene, None if axis is None else TimeAxis(*axis))
 
     @property
     def unit(self) -> str:
         """Name of a run."""
-        return _RENDERERS[self.kind][2]
+        return self._type.unit
 
-    def _renderer_type(self) -> Any:
-        """Return the class of the renderer."""
-        module, name, _ = _RENDERERS[self.kind]
-        return getattr(importlib.import_module(module), name)
+    def require(
+        self,
+        plan: Any,
+        columns: Mapping[str, Column] | None,
+        scene: Callable[[], SceneSource],
+        shard_size: int | None = None,
+    ) -> Store:
+        """Return the store; raise `UserError` unless it is that of a plan.
 
-    def is_of(self, kind: str, text: str, columns: Mapping[str, Column], scene: Callable[[], SceneSource]) -> bool:
-        """Return whether it is the store of a campaign or flight with these columns, and of its scene as it is now."""
-        if self.kind != kind or json.loads(self.text) != json.loads(text):
-            return False
-        own = self.inputs(slice(0, self.count))
-        if own.keys() != columns.keys() or not all(np.array_equal(own[name], columns[name]) for name in own):
-            return False
-        return scene().attributes() == SceneSource.from_attributes(self.attributes["scene"]).attributes()
+        Parameters
+        ----------
+        plan
+            Campaign or flight.
+        columns
+            Parameters of its runs, None where they follow from the plan.
+        scene
+            Its scene as it is now.
+        shard_size
+            Number of runs of a shard, None for any.
+        """
+        own, source = self.inputs(slice(0, self.count)), SceneSource.from_attributes(self.attributes["scene"])
+        if (
+            not isinstance(self._plan, type(plan))
+            or json.loads(self.text) != json.loads(plan.text)
+            or (columns is not None and own.keys() != columns.keys())
+            or (columns is not None and not all(np.array_equal(own[name], columns[name]) for name in own))
+            or scene().attributes() != source.attributes()
+        ):
+            raise UserError(
+                f"{self.path} holds another {self.kind}, or its scene has changed: choose another place, or remove it"
+            )
+        if shard_size not in (None, self.shard_size):
+            raise UserError(f"shard_size = {shown(shard_size)} must be that of {self.path}, {self.shard_size}")
+        return self
 
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""
@@ -441,7 +460,7 @@ def _fill(
     about: dict[str, Any] = {
         "Conventions": "CF-1.11",
         "title": f"{renderer.kind.capitalize()} of {count} {renderer.unit}s, scene {renderer.scene.name}",
-        renderer.kind: renderer.text,
+        renderer.kind: renderer.plan.text,
         "scene": {"scene": renderer.scene.name, **renderer.scene.attributes()},
         "record": None if axis is None else [axis.start_ns, axis.bin_width_ns, axis.bin_count],
         "bin_width_ns": (width := float(time[1] - time[0]) if len(time) > 1 else 1.0),

@@ -27,7 +27,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.processors import usable_processors
-from mitransient_lidar.core.validation import integer, require_memory, shown
+from mitransient_lidar.core.validation import integer, require_memory
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> C
     if isinstance(given, Campaign):
         return given
     if isinstance(given, Mapping):
-        return Campaign.of(given)
+        return Campaign.of_file(given)
     return Campaign.read(checked_path("campaign", given))
 
 
@@ -177,14 +177,7 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
         check_names(campaign)
     columns = campaign.table()
     if path.exists():
-        store = Store(path)
-        if not store.is_of("campaign", campaign.text, columns, lambda: source_of(campaign)):
-            raise UserError(
-                f"{path} holds another campaign, or its scene has changed: choose another place, or remove it"
-            )
-        if shard_size not in (None, store.shard_size):
-            raise UserError(f"shard_size = {shown(shard_size)} must be that of {path}, {store.shard_size}")
-        return store
+        return Store(path).require(campaign, columns, lambda: source_of(campaign), shard_size)
     renderer = RunRenderer.of(campaign, columns)
     count = len(next(iter(columns.values())))
     first: UserError | None = None

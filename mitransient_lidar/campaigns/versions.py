@@ -18,7 +18,7 @@ _LOG = logging.getLogger(__name__)
 _PACKAGES = ("mitsuba", "drjit", "numpy")
 
 #: Files of the package that decide the numbers, by suffix.
-_SUFFIXES = (".py", ".csv")
+_SUFFIXES = (".py", ".csv", ".toml")
 
 #: Name of the SHA-256 of the files.
 FILES = "files of mitransient-lidar"

@@ -89,7 +89,7 @@ class Option:
 
     def check(self, name: str, value: Any, kind: Any) -> Any:
         """Return a value of a type as a number or a list of numbers; raise `UserError` if it is out of range."""
-        kinds = _parts(kind)
+        kinds = parts(kind)
         if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
         if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
@@ -199,6 +199,15 @@ def _documented(text: str, options: Mapping[str, Option]) -> str:
     return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
 
 
+def documented_parameters(text: str, options: Mapping[str, Option]) -> str:
+    """Return the documentation of a class with a section of parameters, behind its first paragraphs."""
+    if not options:
+        return text
+    beginning, *sections = re.split(r"\n\n(?=    \w+\n    -{4,}\n)", text.rstrip())
+    listed = "\n".join(f"    {name}\n{_indented(option.help())}" for name, option in options.items())
+    return "\n\n".join([beginning, f"    Parameters\n    ----------\n{listed}", *sections]) + "\n    "
+
+
 def _indented(text: str) -> str:
     return textwrap.fill(text, 120, initial_indent=" " * 8, subsequent_indent=" " * 8)
 
@@ -214,10 +223,10 @@ def _is_list(kinds: tuple[Any, ...]) -> bool:
     return any(isinstance(one, type) and issubclass(one, Sequence | np.ndarray) for one in origins)
 
 
-def _parts(kind: Any) -> tuple[Any, ...]:
+def parts(kind: Any) -> tuple[Any, ...]:
     """Return the types of a union, and the words of a literal."""
     if get_origin(kind) in (Union, types.UnionType, Literal):
-        return tuple(part for one in get_args(kind) for part in _parts(one))
+        return tuple(part for one in get_args(kind) for part in parts(one))
     return (kind,)
 
 

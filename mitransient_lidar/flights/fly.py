@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import xarray as xr
 
 from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import ProcessCount, Scheduler, complete
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
@@ -20,9 +19,6 @@ from mitransient_lidar.flights.preparation import telling_errors_alone
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
-
-if TYPE_CHECKING:
-    pass
 
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
@@ -83,7 +79,7 @@ def fly(
         After Ctrl-C; pulses that are written stay, and the same call goes on.
     """
     if isinstance(flight, Mapping):
-        plan = FlightPlan.of(flight)
+        plan = FlightPlan.of_file(flight)
     else:
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(checked_path("flight", flight))
     folder = checked_path("folder", folder)
@@ -99,13 +95,7 @@ def fly(
 def _prepare(plan: FlightPlan, path: Path, shard_size: int | None, progress: ProgressCallback | None = None) -> Store:
     """Return the store of a flight, a new one if there is none."""
     if path.exists():
-        store = Store(path)
-        columns = store.inputs(slice(0, store.count))
-        if not store.is_of("flight", plan.text, columns, lambda: scene_of(plan)):
-            raise UserError(f"{path} holds another flight, or its scene has changed: choose another folder")
-        if shard_size not in (None, store.shard_size):
-            raise UserError(f"shard_size = {shard_size} must be that of {path}, {store.shard_size}")
-        return store
+        return Store(path).require(plan, None, lambda: scene_of(plan), shard_size)
     renderer, columns = FlightRenderer.of(plan, progress)
     with telling_errors_alone():
         arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})

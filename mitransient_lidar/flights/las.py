@@ -24,12 +24,10 @@ from mitransient_lidar.core.validation import finite_array, integer, positive
 from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
 from mitransient_lidar.flights.poses.times import ADJUSTMENT_S
 from mitransient_lidar.flights.waveform_packets import PacketWriter
+from mitransient_lidar.results.variables import PointClass
 
 if TYPE_CHECKING:
     import laspy
-
-#: Classes of points, of the topo-bathymetric domain profile of LAS.
-BOTTOM, WATER_SURFACE, SUBMERGED_OBJECT, NO_BOTTOM = 40, 41, 43, 45
 
 _MOST_POINTS = 2**32 - 1  # what programs with 32-bit counters open
 #: Most scanner channels, and returns of a pulse in one of them.
@@ -234,7 +232,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         "gps_time": finite_array("gps_time", points["gps_time"].values)
         - ADJUSTMENT_S * (_time_system(points) == "gps"),
         "classification": kind,
-        "synthetic": kind == NO_BOTTOM,
+        "synthetic": kind == PointClass.NO_ECHO,
         "withheld": points["withheld"].values,
         "quality": _whole(points, "quality", 0, 255),
         "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),

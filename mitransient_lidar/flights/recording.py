@@ -29,7 +29,7 @@ def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -
         series,
         _receiver(series, plan).with_channel_settings(_stored(inputs)),
         seed=int(np.random.SeedSequence([plan.seed, int(inputs["pulse"][0]), 1]).generate_state(1)[0]),
-        background_power=plan.background_power_w,
+        background_power=plan.receiver.background_power_w,
     )
 
 
@@ -47,7 +47,7 @@ def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str,
     densities: dict[int, float] = {}
     for series in probes:
         receiver = _receiver(series, plan)
-        recorded = detect_waveforms(series, receiver, background_power=plan.background_power_w)
+        recorded = detect_waveforms(series, receiver, background_power=plan.receiver.background_power_w)
         pixels = recorded["pixel"].values
         used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
         for pixel, gain, density in zip(pixels, *used, strict=True):
@@ -101,7 +101,8 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
 
 def _receiver(series: xr.Dataset, plan: FlightPlan) -> ReceiverChannels:
     """Return the receiver of a flight, with its settings, of which some may be automatic."""
-    return receiver_of_result(series, plan.receiver, plan.gain, plan.optical_density)
+    own = plan.receiver
+    return receiver_of_result(series, own.chain, own.gain, own.optical_density)
 
 
 def _stored(inputs: Mapping[str, Column]) -> dict[int, tuple[float, float]]:

@@ -2,55 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, shown
+from mitransient_lidar.core.options import Option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_array
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.refraction import cos_in_water, refract
 
-BoolArray = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
-class PoseErrors:
-    """Standard deviations of what a flight knows of its poses, by default typical of a survey after post-processing.
+class PoseErrors(Plan):
+    """Standard deviations of what a flight knows of its poses, by default typical of a survey after post-processing."""
 
-    Attributes
-    ----------
-    roll_deg, pitch_deg, heading_deg
-        Attitude [deg].
-    horizontal_m, height_m
-        Position, in each horizontal direction and in height [m].
-    range_m
-        Calibration of the range [m].
-
-    A negative or infinite value, and NaN, raise UserError.
-    """
-
-    roll_deg: float = 0.0025
-    pitch_deg: float = 0.0025
-    heading_deg: float = 0.005
-    horizontal_m: float = 0.03
-    height_m: float = 0.05
-    range_m: float = 0.01
-
-    def __post_init__(self) -> None:
-        for one in fields(self):
-            non_negative(one.name, getattr(self, one.name))
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any]) -> PoseErrors:
-        """Read a table by the names of the attributes; raise UserError for another name."""
-        names = [one.name for one in fields(cls)]
-        if unknown := [name for name in given if name not in names]:
-            raise UserError(f"unknown standard deviation {shown(unknown[0])}: allowed are {', '.join(names)}")
-        return cls(**given)
+    roll_deg: Annotated[float, Option("Roll", 0, unit="deg")] = 0.0025
+    pitch_deg: Annotated[float, Option("Pitch", 0, unit="deg")] = 0.0025
+    heading_deg: Annotated[float, Option("Heading", 0, unit="deg")] = 0.005
+    horizontal_m: Annotated[float, Option("Position in each horizontal direction", 0, unit="m")] = 0.03
+    height_m: Annotated[float, Option("Position in height", 0, unit="m")] = 0.05
+    range_m: Annotated[float, Option("Calibration of the range", 0, unit="m")] = 0.01
 
     def rotations(self, forward: npt.ArrayLike | None, shots: int) -> FloatArray:
         """Return the rotation vectors of roll, pitch and heading by one standard deviation [rad], shape (3, shots, 3).

@@ -16,7 +16,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.design import Column
-from mitransient_lidar.campaigns.runs import Array, plain
+from mitransient_lidar.campaigns.runs import Array, Renderer, plain
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -66,40 +66,11 @@ _PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
 
 
 @dataclass(frozen=True, eq=False)
-class FlightRenderer:
-    """Renders the pulses of a flight, each with the same bits wherever and whenever.
-
-    Attributes
-    ----------
-    plan
-        The flight.
-    scene
-        Its scene, with its instrument.
-    axis
-        Width and number of the time bins of all records; each begins at the time of its group.
-    """
+class FlightRenderer(Renderer):
+    """Renders the pulses of a flight, whose records begin at the times of their groups, all with as many time bins."""
 
     plan: FlightPlan
-    scene: SceneSource
-    axis: TimeAxis | None
-
-    #: Name of one that is rendered, and of what a store of them is.
-    unit, kind, shots = "shot", "flight", 1
-
-    @staticmethod
-    def check(text: str) -> None:
-        """Raise `UserError` for a text that is no flight."""
-        FlightPlan.from_json(text)
-
-    @classmethod
-    def restored(cls, text: str, scene: SceneSource, axis: TimeAxis | None) -> FlightRenderer:
-        """Return the renderer of a stored flight."""
-        return cls(FlightPlan.from_json(text), scene, axis)
-
-    @property
-    def text(self) -> str:
-        """The flight as JSON."""
-        return self.plan.text
+    plan_type, unit, kind = FlightPlan, "shot", "flight"
 
     @classmethod
     @alone
@@ -157,10 +128,6 @@ class FlightRenderer:
                 number = name.removeprefix(setting)
                 return {"units": "1", "long_name": f"{text} of channel {number} of the receiver, chosen for the flight"}
         return described(name, "flight")
-
-    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
-        """Return nothing: all inputs are known before."""
-        return {}
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
         """Return the rows of pulses that are rendered together: successive ones of a group, over one sea."""

@@ -31,7 +31,7 @@ from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
@@ -85,7 +85,7 @@ def detect(
     scene, params, instrument, integrator
         As for `target_signal.target_signal`, with at most 16 pixels.
     receiver
-        Detector and electronics of every pixel, or a name in `physics.receiver.presets.RECEIVERS`.
+        Detector and electronics of every pixel, or a name in `physics.receiver.receiver_files.RECEIVERS`.
     depths
         Further depths of the target to render [m], increasing: values of the parameter ``target_depth`` of the scene.
     shots

@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import binom
 from significance import FALSE_ALARM, largest_z
 
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.studies.detection import describe_detection, detect
 
 pytestmark = pytest.mark.long

@@ -211,7 +211,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
         np.testing.assert_array_equal(again[name], whole[name])
     for name in ("points.laz", "waveforms.wdp"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    other = FlightPlan.of({**FLIGHT, "seed": 2})
+    other = FlightPlan.of_file({**FLIGHT, "seed": 2})
     with pytest.raises(Exception, match="holds another flight"):
         fly(other, tmp_path / "killed", workers=1)
 
@@ -232,7 +232,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
 )
 def test_flights_that_cannot_be_rendered(change, message):
     with pytest.raises(Exception, match=message):
-        FlightRenderer.of(FlightPlan.of({**FLIGHT, **change}))
+        FlightRenderer.of(FlightPlan.of_file({**FLIGHT, **change}))
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
 
 class ShotMoments(NamedTuple):

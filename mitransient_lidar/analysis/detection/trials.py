@@ -19,7 +19,7 @@ from mitransient_lidar.analysis.detection.matched_filter import delay_bound, del
 from mitransient_lidar.analysis.detection.statistics import Cases, sample_moments, within_range
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
 Variables = dict[str, Any]
 

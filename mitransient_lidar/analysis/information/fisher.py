@@ -19,7 +19,7 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import PixelChain, pixel_chains
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, Setting
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 from mitransient_lidar.results.variables import label

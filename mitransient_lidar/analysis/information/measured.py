@@ -19,8 +19,8 @@ from mitransient_lidar.analysis.information.errors import noise_of_mean, smoothe
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, positive, shown
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.files import Given

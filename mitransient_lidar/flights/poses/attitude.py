@@ -5,11 +5,12 @@ Body axes are x to the right, y forward and z up; at zero angles they are the ax
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, shown
+from mitransient_lidar.core.validation import FloatArray
 
 #: Orders and signs of the three rotations, as factors from the left, of which the last acts first on a vector: name,
 #: axis, and sign of the angle (+1: counterclockwise seen against the axis).
@@ -20,18 +21,11 @@ _FACTORS = {
 }
 
 #: Their names: the order of inertial navigation, and the two that HELIOS++ calls ``rotationSpec``.
-ROTATION_SPECS = tuple(_FACTORS)
-
-
-def check_rotation_spec(given: object) -> str:
-    """Return an order of rotations; raise `UserError` unless it is one of `ROTATION_SPECS`."""
-    if given not in ROTATION_SPECS:
-        raise UserError(f"rotation_spec = {shown(given)} must be one of {', '.join(ROTATION_SPECS)}")
-    return str(given)
+RotationSpec = Literal["aerospace", "ARINC 705", "CANONICAL"]
 
 
 def rotation_matrices(
-    roll_deg: npt.ArrayLike, pitch_deg: npt.ArrayLike, yaw_deg: npt.ArrayLike, rotation_spec: str = "aerospace"
+    roll_deg: npt.ArrayLike, pitch_deg: npt.ArrayLike, yaw_deg: npt.ArrayLike, rotation_spec: RotationSpec = "aerospace"
 ) -> FloatArray:
     """Return the matrices that turn vectors of the body into vectors of the scene.
 
@@ -46,13 +40,12 @@ def rotation_matrices(
     roll_deg, pitch_deg, yaw_deg
         Angles [deg], shape (n,).
     rotation_spec
-        One of `ROTATION_SPECS`, else `UserError` is raised.
+        Order of the rotations.
 
     Returns
     -------
     Rotation matrices, shape (n, 3, 3).
     """
-    check_rotation_spec(rotation_spec)
     angles = {"roll": roll_deg, "pitch": pitch_deg, "yaw": yaw_deg}
     first, second, third = (
         _about(axis, sign * np.radians(np.asarray(angles[name], dtype=np.float64)))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.toml_files import check_keys
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, shown
+from mitransient_lidar.core.options import Option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.poses.attitude import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
@@ -22,43 +22,25 @@ _TURN_DEG, _LEVEL = 10.0, 1e-6
 
 
 @dataclass(frozen=True)
-class Mounting:
+class Mounting(Plan):
     """Position and attitude of a scanner on its platform.
 
-    Parameters
-    ----------
-    roll_deg, pitch_deg, yaw_deg
-        Angles of the scanner from the axes of the platform [deg], with the signs and the order ``aerospace`` of
-        `attitude.rotation_matrices`: a roll turns the nadir of the scanner to the left, a pitch turns it forward, and a
-        yaw turns its forward axis to the right.
-    lever_arm
-        Position of the scanner from the point whose positions the trajectory has, x to the right, y forward and z up
-        in the axes of the platform [m], shape (3,).
-
-    Raises
-    ------
-    UserError
-        For values that are not finite, or a lever arm of another shape.
+    Angles are those from the axes of the platform, with the signs and the order ``aerospace`` of
+    `attitude.rotation_matrices`.
     """
 
-    roll_deg: float = 0.0
-    pitch_deg: float = 0.0
-    yaw_deg: float = 0.0
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for name in ("roll_deg", "pitch_deg", "yaw_deg"):
-            object.__setattr__(self, name, finite(name, getattr(self, name)))
-        arm = finite_array("lever_arm", self.lever_arm)
-        if arm.shape != (3,):
-            raise UserError(f"lever_arm = {shown(self.lever_arm)} must be x, y and z in metres")
-        object.__setattr__(self, "lever_arm", tuple(arm.tolist()))
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Mounting:
-        """Return the mounting of the table ``[mounting]`` of a plan; raise `UserError` for what is not allowed."""
-        check_keys("[mounting]", given, [one.name for one in fields(cls)])
-        return cls(**given)
+    roll_deg: Annotated[float, Option("Roll, which turns the nadir of the scanner to the left", unit="deg")] = 0.0
+    pitch_deg: Annotated[float, Option("Pitch, which turns it forward", unit="deg")] = 0.0
+    yaw_deg: Annotated[float, Option("Yaw, which turns its forward axis to the right", unit="deg")] = 0.0
+    lever_arm: Annotated[
+        tuple[float, float, float],
+        Option(
+            "Position of the scanner from the point whose positions the trajectory has, x to the right, y forward and "
+            "z up in the axes of the platform",
+            unit="m",
+            form="x, y and z in metres",
+        ),
+    ] = (0.0, 0.0, 0.0)
 
     @property
     def rotation(self) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,17 +14,28 @@ from mitransient_lidar.core.validation import FloatArray
 _LARGEST = 1e12
 
 
-class TrajectoryRecords(NamedTuple):
-    """Positions and attitudes of a platform, one for each time."""
+@dataclass(frozen=True, eq=False)
+class PlatformPoses:
+    """Positions and attitudes of a platform, one for each time.
 
-    time_s: FloatArray  #: Times [s], shape (n,).
-    position: FloatArray  #: Positions x, y, z [m], shape (n, 3).
-    roll_deg: FloatArray  #: Roll [deg], shape (n,).
-    pitch_deg: FloatArray  #: Pitch [deg], shape (n,).
-    yaw_deg: FloatArray  #: Yaw [deg], shape (n,).
+    Parameters
+    ----------
+    time_s
+        Times [s], shape (n,).
+    position
+        Positions x (east), y (north), z (up) [m], shape (n, 3).
+    roll_deg, pitch_deg, yaw_deg
+        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
+    """
+
+    time_s: FloatArray
+    position: FloatArray
+    roll_deg: FloatArray
+    pitch_deg: FloatArray
+    yaw_deg: FloatArray
 
 
-def check_records(records: TrajectoryRecords, source: str, place: Callable[[int], str]) -> None:
+def check_records(records: PlatformPoses, source: str, place: Callable[[int], str]) -> None:
     """Check that there are 2 records or more, of numbers from -1e12 to 1e12, at times that increase.
 
     Parameters

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.toml_files import check_keys, required
-from mitransient_lidar.core.validation import FloatArray, finite, finite_array, in_range, integer, positive, shown
-
-#: Motions of a mirror within a cycle, between -1 and 1.
-WAVES = ("triangular", "sinusoidal", "sawtooth")
-
-#: What the pixels turn with.
-PIXELS = ("scan", "platform")
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.plans import Plan, of_kind
+from mitransient_lidar.core.validation import FloatArray, finite_array
 
 #: Part of the interval between two points of a raster by which a pulse may be early.
 _EARLY = 1e-6
 
 #: Most points of a raster.
 _MOST_POINTS = 10**9
+
+#: Form of angles from one end to the other.
+_TWO = "two angles in degrees"
+
+#: Motion of a mirror within a cycle, between -1 and 1, and parameters of several scanners.
+Wave = Literal["triangular", "sinusoidal", "sawtooth"]
+NadirAngle = Annotated[float, Option("Angle of the pulses from the nadir of the scanner", 0, 90, "deg")]
+Phase = Annotated[float, Option("Phase of the cycle at time 0", unit="deg")]
 
 
 class ScanDirections(NamedTuple):
@@ -36,29 +38,21 @@ class ScanDirections(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scanner(ABC):
+class Scanner(Plan, ABC):
     """What all scanners have.
 
     The frame of the scanner has x to its right, y forward and z up; its nadir is -z. Azimuths are counted from forward,
     clockwise from above. Cycles begin at time 0 of the trajectory.
 
-    Parameters
-    ----------
-    pixels
-        ``scan``: far (+angle_x) points away from the nadir of the scanner, so that pixels turn with the scan; at the
-        nadir itself it has the limit along the scan, or points to the right. ``platform``: far points forward at the
-        nadir, and goes with the beam by the shortest rotation from there.
+    Pixels that turn with the ``scan`` have far (+angle_x) away from the nadir of the scanner; at the nadir itself it
+    has the limit along the scan, or points to the right. Those of the ``platform`` have far forward at the nadir, and
+    it goes with the beam by the shortest rotation from there.
     """
 
-    pixels: str = "scan"
-
-    def __post_init__(self) -> None:
-        if self.pixels not in PIXELS:
-            raise UserError(f"pixels = {shown(self.pixels)} of a scanner must be one of {', '.join(PIXELS)}")
-        self._check()
+    pixels: Annotated[Literal["scan", "platform"], Option("What the pixels turn with")] = "scan"
 
     @staticmethod
-    def of(given: Mapping[str, Any]) -> Scanner:
+    def of_table(given: object) -> Scanner:
         """Return the scanner of the table ``[scanner]`` of a plan: ``kind`` (`SCANNER_KINDS`) and its parameters.
 
         Raises
@@ -66,16 +60,7 @@ class Scanner(ABC):
         UserError
             For a key or a value that is not allowed or is missing.
         """
-        kind = required("[scanner]", given, "kind")
-        if not isinstance(kind, str) or kind not in SCANNER_KINDS:
-            raise UserError(f"kind = {shown(kind)} of a scanner must be one of {', '.join(SCANNER_KINDS)}")
-        where, parameters = f"a scanner of kind {kind!r}", fields(SCANNER_KINDS[kind])
-        values = {name: value for name, value in given.items() if name != "kind"}
-        check_keys(where, values, [one.name for one in parameters])
-        for one in parameters:
-            if one.default is MISSING:
-                required(where, given, one.name)
-        return SCANNER_KINDS[kind](**values)
+        return of_kind("scanner", given, SCANNER_KINDS)
 
     def directions(self, times: npt.ArrayLike) -> ScanDirections:
         """Return the directions of pulses at times [s], shape (n,); raise `UserError` for times that are not finite.
@@ -93,40 +78,19 @@ class Scanner(ABC):
         return ScanDirections(axis, turn * away + across * beside, turn * beside - across * away)
 
     @abstractmethod
-    def _check(self) -> None:
-        """Convert the parameters; raise `UserError` for one out of range."""
-
-    @abstractmethod
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the angles from the nadir and the azimuths [rad] at times [s], each of shape (n,)."""
-
-    def _set(self, name: str, value: object) -> None:
-        """Set a parameter while the object is made."""
-        object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Palmer(Scanner):
-    """Full circles at a constant angle from the nadir, as of a rotating mirror or prism.
+    """Full circles at a constant angle from the nadir, as of a rotating mirror or prism."""
 
-    Parameters
-    ----------
-    nadir_angle_deg
-        Angle of the pulses from the nadir of the scanner [deg], 0 to 90.
-    rate_hz
-        Circles per second [Hz], clockwise from above; negative for the other sense.
-    phase_deg
-        Azimuth at time 0 [deg].
-    """
-
-    nadir_angle_deg: float
-    rate_hz: float
-    phase_deg: float = 0.0
-
-    def _check(self) -> None:
-        self._set("nadir_angle_deg", in_range("nadir_angle_deg", self.nadir_angle_deg, 0.0, 90.0))
-        for name in ("rate_hz", "phase_deg"):
-            self._set(name, finite(name, getattr(self, name)))
+    nadir_angle_deg: NadirAngle
+    rate_hz: Annotated[
+        float, Option("Circles per second, clockwise from above; negative for the other sense", unit="Hz")
+    ]
+    phase_deg: Annotated[float, Option("Azimuth at time 0", unit="deg")] = 0.0
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         azimuth = 2 * np.pi * _cycles(times, self.rate_hz, self.phase_deg)
@@ -137,37 +101,20 @@ class Palmer(Scanner):
 class SemiArc(Scanner):
     """Arcs at a constant angle from the nadir, in front of the platform or to one side.
 
-    Parameters
-    ----------
-    nadir_angle_deg
-        Angle of the pulses from the nadir of the scanner [deg], 0 to 90.
-    rate_hz
-        Cycles per second [Hz], positive: there and back, or one way for ``sawtooth``.
-    arc_deg
-        Range of azimuths of the arc [deg], above 0 to 360.
-    centre_deg
-        Azimuth of the middle of the arc [deg]: 0 forward, 90 to the right, 180 backward.
-    wave
-        Azimuth over a cycle: ``triangular`` (constant speed), ``sinusoidal``, or ``sawtooth``, which jumps back.
-    phase_deg
-        Phase of the cycle at time 0 [deg]. At phase 0 the beam is in the middle of the arc and moves clockwise; a
-        ``sawtooth`` begins at the counterclockwise end.
+    At phase 0 the beam is in the middle of the arc and moves clockwise; a ``sawtooth`` begins at the counterclockwise
+    end.
     """
 
-    nadir_angle_deg: float
-    rate_hz: float
-    arc_deg: float = 180.0
-    centre_deg: float = 0.0
-    wave: str = "triangular"
-    phase_deg: float = 0.0
-
-    def _check(self) -> None:
-        self._set("nadir_angle_deg", in_range("nadir_angle_deg", self.nadir_angle_deg, 0.0, 90.0))
-        self._set("rate_hz", positive("rate_hz", self.rate_hz))
-        self._set("arc_deg", in_range("arc_deg", positive("arc_deg", self.arc_deg), 0.0, 360.0))
-        for name in ("centre_deg", "phase_deg"):
-            self._set(name, finite(name, getattr(self, name)))
-        _check_wave(self.wave)
+    nadir_angle_deg: NadirAngle
+    rate_hz: Annotated[float, positive_option("Cycles per second: there and back, or one way for sawtooth", "Hz")]
+    arc_deg: Annotated[float, Option("Range of azimuths of the arc", 0, 360, "deg", above=True)] = 180.0
+    centre_deg: Annotated[
+        float, Option("Azimuth of the middle of the arc: 0 forward, 90 to the right, 180 backward", unit="deg")
+    ] = 0.0
+    wave: Annotated[Wave, Option("Azimuth over a cycle: triangular has constant speed, sawtooth jumps back")] = (
+        "triangular"
+    )
+    phase_deg: Phase = 0.0
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         share = _wave(self.wave, _cycles(times, self.rate_hz, self.phase_deg))
@@ -179,30 +126,17 @@ class SemiArc(Scanner):
 class Oscillating(Scanner):
     """Lines across the flight, as of an oscillating mirror; a ``sawtooth`` is that of a rotating polygon.
 
-    Parameters
-    ----------
-    half_angle_deg
-        Largest angle of the pulses from the nadir, to each side [deg], above 0 to 90.
-    rate_hz
-        Cycles per second [Hz], positive: two lines each, or one for ``sawtooth``.
-    wave
-        Angle over a cycle: ``sinusoidal``, ``triangular`` (constant speed), or ``sawtooth``, which jumps back.
-    phase_deg
-        Phase of the cycle at time 0 [deg]. At phase 0 the beam is at the nadir and moves to the right; a ``sawtooth``
-        begins at the left end.
+    At phase 0 the beam is at the nadir and moves to the right; a ``sawtooth`` begins at the left end.
     """
 
-    half_angle_deg: float
-    rate_hz: float
-    wave: str = "sinusoidal"
-    phase_deg: float = 0.0
-
-    def _check(self) -> None:
-        angle = positive("half_angle_deg", self.half_angle_deg)
-        self._set("half_angle_deg", in_range("half_angle_deg", angle, 0.0, 90.0))
-        self._set("rate_hz", positive("rate_hz", self.rate_hz))
-        self._set("phase_deg", finite("phase_deg", self.phase_deg))
-        _check_wave(self.wave)
+    half_angle_deg: Annotated[
+        float, Option("Largest angle of the pulses from the nadir, to each side", 0, 90, "deg", above=True)
+    ]
+    rate_hz: Annotated[float, positive_option("Cycles per second: two lines each, or one for sawtooth", "Hz")]
+    wave: Annotated[Wave, Option("Angle over a cycle: triangular has constant speed, sawtooth jumps back")] = (
+        "sinusoidal"
+    )
+    phase_deg: Phase = 0.0
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         share = _wave(self.wave, _cycles(times, self.rate_hz, self.phase_deg))
@@ -216,37 +150,24 @@ class Raster(Scanner):
     The outer axis points to the right, and turns the beam from the nadir forward by the angle along; the inner one
     turns it to the right by the angle across. All points of a line follow each other, then those of the next line, at
     equal times: a pulse rate of rate_hz * lines * points gives one pulse to each point, also at GPS times, which are
-    rounded. A flight line begins with a whole point.
-
-    Parameters
-    ----------
-    along_deg
-        Angle along of the first and the last line [deg], -180 to 180; (60, 80) is in front of a mast.
-    across_deg
-        Angle across of the first and the last point of each line [deg], -90 to 90.
-    lines, points
-        Number of lines, and of points of each, 1 or more; one is in the middle.
-    rate_hz
-        Rasters per second [Hz], positive.
+    rounded. A flight line begins with a whole point. One line, or one point of each, is in the middle.
     """
 
-    along_deg: tuple[float, float]
-    across_deg: tuple[float, float]
-    lines: int
-    points: int
-    rate_hz: float
+    along_deg: Annotated[
+        tuple[float, float],
+        Option("Angle along of first and last line; (60, 80) is in front of a mast", -180, 180, "deg", form=_TWO),
+    ]
+    across_deg: Annotated[
+        tuple[float, float], Option("Angle across of first and last point of each line", -90, 90, "deg", form=_TWO)
+    ]
+    lines: Annotated[int, Option("Number of lines", 1, _MOST_POINTS)]
+    points: Annotated[int, Option("Number of points of each line", 1, _MOST_POINTS)]
+    rate_hz: Annotated[float, positive_option("Rasters per second", "Hz")]
 
-    def _check(self) -> None:
-        for name, most in (("along_deg", 180.0), ("across_deg", 90.0)):
-            ends = finite_array(name, getattr(self, name))
-            if ends.shape != (2,):
-                raise UserError(f"{name} = {shown(getattr(self, name))} must be two angles in degrees")
-            self._set(name, tuple(in_range(name, end, -most, most) for end in ends))
-        for name in ("lines", "points"):
-            self._set(name, integer(name, getattr(self, name), 1, _MOST_POINTS))
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.lines * self.points > _MOST_POINTS:
             raise UserError(f"lines x points = {self.lines * self.points} must be at most {_MOST_POINTS}")
-        self._set("rate_hz", positive("rate_hz", self.rate_hz))
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         count = self.lines * self.points
@@ -266,22 +187,10 @@ class Raster(Scanner):
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed(Scanner):
-    """One direction.
+    """One direction."""
 
-    Parameters
-    ----------
-    nadir_angle_deg
-        Angle of the pulses from the nadir of the scanner [deg], 0 to 180.
-    azimuth_deg
-        Azimuth of the pulses [deg], clockwise from forward.
-    """
-
-    nadir_angle_deg: float = 0.0
-    azimuth_deg: float = 0.0
-
-    def _check(self) -> None:
-        self._set("nadir_angle_deg", in_range("nadir_angle_deg", self.nadir_angle_deg, 0.0, 180.0))
-        self._set("azimuth_deg", finite("azimuth_deg", self.azimuth_deg))
+    nadir_angle_deg: Annotated[float, Option("Angle of the pulses from the nadir of the scanner", 0, 180, "deg")] = 0.0
+    azimuth_deg: Annotated[float, Option("Azimuth of the pulses, clockwise from forward", unit="deg")] = 0.0
 
     def _angles(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         nadir_angle, azimuth = np.radians(self.nadir_angle_deg), np.radians(self.azimuth_deg)
@@ -301,12 +210,6 @@ SCANNER_KINDS: dict[str, type[Scanner]] = {
 def _cycles(times: FloatArray, rate_hz: float, phase_deg: float) -> FloatArray:
     """Return the part of a cycle that has passed, 0 to 1, at times [s]."""
     return np.asarray((times * rate_hz + phase_deg / 360.0) % 1.0)
-
-
-def _check_wave(wave: str) -> None:
-    """Raise `UserError` unless a wave is one of `WAVES`."""
-    if wave not in WAVES:
-        raise UserError(f"wave = {shown(wave)} must be one of {', '.join(WAVES)}")
 
 
 def _wave(wave: str, cycles: FloatArray) -> FloatArray:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import datetime
 import logging
-from collections.abc import Mapping
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, shown
+from mitransient_lidar.core.validation import FloatArray
 
 _LOG = logging.getLogger(__name__)
 
 #: Systems of times: from any beginning, that of a GPS week, 6 January 1980, and 10^9 s later, in 2011.
-TIME_SYSTEMS = ("flight", "gps_week", "gps", "adjusted_gps")
+TimeSystem = Literal["flight", "gps_week", "gps", "adjusted_gps"]
 
 #: What adjusted GPS times are less than those since 1980 [s].
 ADJUSTMENT_S = 1e9
@@ -32,40 +31,37 @@ _UNIX_LESS_GPS = 315_964_782
 _EPOCH = datetime.datetime(1980, 1, 6)
 
 
-def time_system(platform: Mapping[str, Any], time_s: FloatArray) -> str:
-    """Return the system of the times of a platform, one of `TIME_SYSTEMS`.
+def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = False) -> TimeSystem:
+    """Return the system of the times of a platform, where its table does not state it.
 
-    Without ``time`` in its table, times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times.
-    Smaller ones are of a week in an SBET file, up to a day after its end, and of the flight in a text file. Other
-    platforms begin with their flight.
+    Times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times. Smaller ones are of a week in
+    an SBET file, up to a day after its end, and of the flight in a text file. Other platforms begin with their flight.
 
     Parameters
     ----------
-    platform
-        Table ``[platform]`` of a plan.
     time_s
         Times [s], not empty.
+    file
+        File of the trajectory, None for other platforms.
+    is_sbet
+        Whether that is an SBET file.
 
     Raises
     ------
     UserError
-        If ``time`` is no system, or the times may be Unix times.
+        If the times may be Unix times.
     """
-    given, latest = platform.get("time"), float(np.max(time_s))
-    if given is not None:
-        if given not in TIME_SYSTEMS:
-            raise UserError(f"time = {shown(given)} of a platform must be one of {', '.join(TIME_SYSTEMS)}")
-        return str(given)
-    if platform["kind"] not in ("csv", "sbet"):
+    latest = float(np.max(time_s))
+    if file is None:
         return "flight"
     if latest >= _MAY_BE_UNIX:
         raise UserError(
-            f"the times of {platform['file']}, up to {latest:.10g} s, may be Unix times, which are {_UNIX_LESS_GPS} s "
-            "more than GPS times: convert them, or give time = 'gps' in [platform]"
+            f"the times of {file}, up to {latest:.10g} s, may be Unix times, which are {_UNIX_LESS_GPS} s more than "
+            "GPS times: convert them, or give time = 'gps' in [platform]"
         )
     if latest >= _EARLIEST_ADJUSTED:
         return "gps" if latest >= ADJUSTMENT_S else "adjusted_gps"
-    return "gps_week" if platform["kind"] == "sbet" and latest <= _LATEST_OF_WEEK else "flight"
+    return "gps_week" if is_sbet and latest <= _LATEST_OF_WEEK else "flight"
 
 
 def tell_time_system(system: str, time_s: FloatArray) -> None:

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.toml_files import check_keys, required
+from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
-from mitransient_lidar.flights.poses.attitude import check_rotation_spec, rotation_matrices
-from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
-from mitransient_lidar.flights.poses.straight_lines import fixed_platform, straight_lines
-from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
-
-#: Kinds of platforms of a plan.
-PLATFORM_KINDS = ("lines", "mast", "csv", "sbet")
+from mitransient_lidar.flights.poses.attitude import RotationSpec, rotation_matrices
+from mitransient_lidar.flights.poses.records import PlatformPoses, check_records
 
 #: Interpolation between records.
-INTERPOLATIONS = ("linear", "cubic")
+Interpolation = Literal["linear", "cubic"]
 
 #: Longest time between records that splines go through, with its rounding, and fewest of such records [s].
 _DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
@@ -36,20 +28,24 @@ _MOST_PULSES = 10**8
 _LAST_PULSE = 1e-6
 
 
-class PlatformPoses(NamedTuple):
-    """Interpolated poses of a platform, and what they belong to."""
+@dataclass(frozen=True, eq=False)
+class InterpolatedPoses(PlatformPoses):
+    """Poses of a platform at any times, roll and pitch -180 to 180 and yaw 0 to 360 degrees.
 
-    time_s: FloatArray  #: Times [s], shape (n,).
-    position: FloatArray  #: Positions x, y, z [m], shape (n, 3).
-    roll_deg: FloatArray  #: Roll [deg], -180 to 180, shape (n,).
-    pitch_deg: FloatArray  #: Pitch [deg], -180 to 180, shape (n,).
-    yaw_deg: FloatArray  #: Yaw [deg], 0 to 360, shape (n,).
-    rotation: FloatArray  #: Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
-    line: IntArray  #: Number of the flight line, from 0, shape (n,).
+    Parameters
+    ----------
+    rotation
+        Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
+    line
+        Number of the flight line, from 0, shape (n,).
+    """
+
+    rotation: FloatArray
+    line: IntArray
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, eq=False)
+class Trajectory(PlatformPoses):
     """Position and attitude of a platform over time, and its flight lines.
 
     Axes of the platform are x to the right, y forward and z up. Between records, positions and angles are linear in
@@ -58,12 +54,8 @@ class Trajectory:
 
     Parameters
     ----------
-    time_s
-        Times [s], strictly increasing, shape (n,), n at least 2.
-    position
-        Positions x (east), y (north), z (up) [m], shape (n, 3).
-    roll_deg, pitch_deg, yaw_deg
-        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
+    time_s, position, roll_deg, pitch_deg, yaw_deg
+        The records, 2 or more at strictly increasing times.
     rotation_spec
         Order of the rotations, as in `attitude.rotation_matrices`.
     interpolation
@@ -79,82 +71,27 @@ class Trajectory:
         the one before.
     """
 
-    time_s: FloatArray
-    position: FloatArray
-    roll_deg: FloatArray
-    pitch_deg: FloatArray
-    yaw_deg: FloatArray
-    rotation_spec: str = "aerospace"
-    interpolation: str = "linear"
+    rotation_spec: RotationSpec = "aerospace"
+    interpolation: Interpolation = "linear"
     lines: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
     def __post_init__(self) -> None:
         for one in fields(self):
             if one.name not in ("rotation_spec", "interpolation"):
                 object.__setattr__(self, one.name, _array(one.name, getattr(self, one.name)))
-        check_rotation_spec(self.rotation_spec)
-        if self.interpolation not in INTERPOLATIONS:
-            raise UserError(f"interpolation = {shown(self.interpolation)} must be one of {', '.join(INTERPOLATIONS)}")
+        one_of("rotation_spec", self.rotation_spec, get_args(RotationSpec))
+        one_of("interpolation", self.interpolation, get_args(Interpolation))
         count = self.time_s.size
-        for name in TrajectoryRecords._fields:
+        for name in ("position", "roll_deg", "pitch_deg", "yaw_deg"):
             shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
             if shape != wanted:
                 raise UserError(f"{name} has the shape {shape}: it must be {wanted}")
-        check_records(self.records, "a trajectory", lambda row: f"record {row + 1} of a trajectory")
+        check_records(self, "a trajectory", lambda row: f"record {row + 1} of a trajectory")
         if self.lines.size == 0:
             object.__setattr__(self, "lines", self.time_s[[0, -1]][None])
         self._check_lines()
 
-    @property
-    def records(self) -> TrajectoryRecords:
-        """Times, positions and attitudes of the records."""
-        return TrajectoryRecords(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any], folder: str | os.PathLike[str] = ".") -> Trajectory:
-        """Return the trajectory of the table ``[platform]`` of a plan.
-
-        Parameters
-        ----------
-        given
-            Table with ``kind``: ``lines`` and ``mast`` have the keys of `straight_lines.straight_lines` and
-            `straight_lines.fixed_platform`; ``csv`` has ``file`` and ``rotation_spec`` (``ARINC 705``, as HELIOS++),
-            ``sbet`` has ``file`` and ``epsg``. Files may also have ``origin``, the position of the origin of the scene
-            in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); ``interpolation``
-            (``cubic``); ``lines_s``, a list of the first and last time of each flight line [s] (one line, of all
-            records); and ``time``, as of `times.time_system`.
-        folder
-            Folder from which relative paths of files count.
-
-        Raises
-        ------
-        UserError
-            For a key or a value that is not allowed or is missing, and for a file that cannot be read.
-        """
-        kind = required("[platform]", given, "kind")
-        if kind not in PLATFORM_KINDS:
-            raise UserError(f"kind = {shown(kind)} of a platform must be one of {', '.join(PLATFORM_KINDS)}")
-        if kind == "lines":
-            records, lines = straight_lines(given)
-            return cls(*records, lines=lines)
-        if kind == "mast":
-            return cls(*fixed_platform(given))
-        where, own = f"a platform of kind {kind!r}", "rotation_spec" if kind == "csv" else "epsg"
-        check_keys(where, given, ("kind", "file", own, "origin", "interpolation", "lines_s", "time"))
-        file = required(where, given, "file")
-        if not isinstance(file, str):
-            raise UserError(f"file = {shown(file)} must be the path of a trajectory")
-        origin = finite_array("origin", given.get("origin", (0.0, 0.0, 0.0)))
-        if origin.shape != (3,):
-            raise UserError(f"origin = {shown(given['origin'])} must be x, y and z in metres")
-        spec = check_rotation_spec(given.get("rotation_spec", "ARINC 705")) if kind == "csv" else "aerospace"
-        path = Path(folder) / file
-        records = read_text_records(path) if kind == "csv" else read_sbet_records(path, required(where, given, "epsg"))
-        records = records._replace(position=records.position - origin)
-        lines = finite_array("lines_s", given.get("lines_s", ()))
-        return cls(*records, spec, given.get("interpolation", "cubic"), lines)
-
-    def at(self, times: npt.ArrayLike) -> PlatformPoses:
+    def at(self, times: npt.ArrayLike) -> InterpolatedPoses:
         """Return the poses at times [s], shape (n,); raise `UserError` for a time that is on no flight line."""
         time = np.atleast_1d(finite_array("times", times))
         line = np.searchsorted(self.lines[:, 0], time, side="right") - 1
@@ -167,7 +104,7 @@ class Trajectory:
         position, (roll, pitch, yaw) = values[:, :3], values[:, 3:].T
         roll, pitch, yaw = 180 - (180 - roll) % 360, 180 - (180 - pitch) % 360, yaw % 360
         rotation = rotation_matrices(roll, pitch, yaw, self.rotation_spec)
-        return PlatformPoses(time, position, roll, pitch, yaw, rotation, line)
+        return InterpolatedPoses(time, position, roll, pitch, yaw, rotation, line)
 
     def _interpolated(self, time: FloatArray) -> FloatArray:
         """Return positions [m] and angles [deg], which may exceed a turn, at times on flight lines, shape (n, 6)."""

@@ -21,7 +21,7 @@ from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.headings import METRES, Column, Heading, read_headings
 from mitransient_lidar.core.long_tables import read_head, read_long_table
 from mitransient_lidar.core.validation import integer
-from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
+from mitransient_lidar.flights.poses.records import PlatformPoses, check_records
 
 _SECONDS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}
 _DEGREES = {"deg": 1.0, "degree": 1.0, "degrees": 1.0, "°": 1.0, "rad": math.degrees(1.0)}
@@ -40,11 +40,8 @@ _COLUMNS = (
 #: Numbers of a record of an SBET file, and the largest file [bytes]: eleven hours of 200 records a second.
 _SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
 
-#: Largest code of a coordinate system.
-_LARGEST_EPSG = 10**6
 
-
-def read_text_records(path: str | os.PathLike[str]) -> TrajectoryRecords:
+def read_text_records(path: str | os.PathLike[str]) -> PlatformPoses:
     """Read a trajectory from a text file as HELIOS++ does.
 
     Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], as `core.long_tables.read_long_table` reads
@@ -86,12 +83,12 @@ def read_text_records(path: str | os.PathLike[str]) -> TrajectoryRecords:
     names = [name.strip(" \"'") for name in head.get("HEADER", "").split(",")] if "HEADER" in head else []
     table = read_long_table(path, _COLUMNS, (), choose, names)
     time, roll, pitch, yaw, *position = (table.values * [heading.factor for heading in table.headings]).T
-    records = TrajectoryRecords(time, np.column_stack(position), roll, pitch, yaw)
+    records = PlatformPoses(time, np.column_stack(position), roll, pitch, yaw)
     check_records(records, str(path), lambda row: f"{path}, line {table.line(row)}")
     return records
 
 
-def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryRecords:
+def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
     """Read a trajectory from an SBET file, and project it into a coordinate system.
 
     A record is 17 little-endian 64-bit numbers: time [s]; latitude and longitude [rad] and ellipsoidal height [m] of
@@ -132,7 +129,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
     time, latitude, longitude, height = data[:, :4].T
     with np.errstate(over="ignore", invalid="ignore"):
         roll, pitch, heading = np.degrees([data[:, 7], data[:, 8], data[:, 9] - data[:, 10]])
-    check_records(TrajectoryRecords(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
+    check_records(PlatformPoses(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
     wrong = (np.abs(latitude) > np.pi / 2) | (np.abs(longitude) > 2 * np.pi)
     for row in np.flatnonzero(wrong)[:1]:
         raise UserError(
@@ -149,12 +146,12 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
             f" must lie where a metre is a metre within {LARGEST_DISTORTION:.0%} in epsg = {epsg}; its scale there is "
             f"{scale[row]:.3g}"
         )
-    return TrajectoryRecords(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
+    return PlatformPoses(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
 
 
 def _system(epsg: int) -> Any:
     """Return projected coordinates in metres by their EPSG code."""
-    system = parsed_system("epsg", integer("epsg", epsg, 1, _LARGEST_EPSG))
+    system = parsed_system("epsg", epsg)
     metric = all(axis.unit_conversion_factor == 1 for axis in system.axis_info[:2])
     if not (system.is_projected and metric and is_east_north(system)):
         raise UserError(f"epsg = {epsg} ({system.name}) must be projected coordinates in metres, east and north")

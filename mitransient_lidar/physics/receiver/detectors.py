@@ -15,21 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from mitransient_lidar.core.constants import C0, ELEMENTARY_CHARGE, PLANCK
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    IntArray,
-    checked,
-    finite_array,
-    in_range,
-    integer,
-    non_negative,
-    positive,
-)
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, positive
 from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.signal_tail import SignalTail
 
@@ -80,34 +73,11 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
     return float(1 + np.sum(1 / np.cumprod(gains)))
 
 
-def _efficiency(name: str, value: object) -> None:
-    """Reject an efficiency outside (0, 1]."""
-    if (number := positive(name, value)) > 1:
-        raise UserError(f"{name} = {number:g} must be above 0 and at most 1")
-
-
 @dataclass(frozen=True)
 class LinearDetector(SignalTail):
     """Detector whose charge is proportional to the light: photodiode, avalanche photodiode or photomultiplier.
 
-    Parameters
-    ----------
-    quantum_efficiency : float
-        Primary events per photon, above 0, at most 1; of a photomultiplier times the collection efficiency.
-    gain : float
-        Mean charge per event in electrons, at least 1.
-    excess_noise : float
-        Mean square of the charge over the square of its mean, at least 1.
-    dark_current_na : float
-        Multiplied dark current, before the multiplication [nA]: the anode's dark current over the gain.
-    leakage_current_na : float
-        Unmultiplied dark current [nA], such as the surface current of an avalanche photodiode.
-    dynode_gains : tuple of float
-        Gains of the dynodes of a photomultiplier, whose voltage can be lowered; empty for other detectors.
-    largest_current_ma : float
-        Largest output current in pulses [mA]: behind an amplifier, more saturates.
-    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
-        Signal-induced noise, and the afterpulses of a photomultiplier; see `SignalTail`.
+    A photomultiplier's afterpulses are a tail of its signal.
 
     Notes
     -----
@@ -115,18 +85,25 @@ class LinearDetector(SignalTail):
     the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
     """
 
-    quantum_efficiency: float = checked(_efficiency)
-    gain: float = checked(in_range, 1, np.inf, default=1.0)
-    excess_noise: float = checked(in_range, 1, np.inf, default=1.0)
-    dark_current_na: float = checked(non_negative, default=0.0)
-    leakage_current_na: float = checked(non_negative, default=0.0)
-    dynode_gains: tuple[float, ...] = ()
-    largest_current_ma: float = np.inf
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.largest_current_ma > 0:
-            raise UserError(f"largest_current_ma = {self.largest_current_ma:g} must be greater than 0")
+    quantum_efficiency: Annotated[
+        float,
+        Option("Primary events per photon, of a photomultiplier times the collection efficiency", 0, 1, above=True),
+    ]
+    gain: Annotated[float, Option("Mean charge per event in electrons", 1)] = 1.0
+    excess_noise: Annotated[float, Option("Mean square of the charge over the square of its mean", 1)] = 1.0
+    dark_current_na: Annotated[
+        float, Option("Dark current before the multiplication: the anode's over the gain", 0, unit="nA")
+    ] = 0.0
+    leakage_current_na: Annotated[
+        float, Option("Unmultiplied dark current, such as the surface current of an avalanche photodiode", 0, unit="nA")
+    ] = 0.0
+    dynode_gains: Annotated[
+        tuple[float, ...],
+        Option("Gains of the dynodes of a photomultiplier, whose voltage can be lowered; empty for other detectors"),
+    ] = ()
+    largest_current_ma: Annotated[
+        float, positive_option("Largest output current in pulses: behind an amplifier, more saturates", "mA")
+    ] = np.inf
 
     @classmethod
     def avalanche(
@@ -221,25 +198,6 @@ class LinearDetector(SignalTail):
 class SiliconPhotomultiplier(SignalTail):
     """Array of Geiger-mode cells in parallel (SiPM, MPPC).
 
-    Parameters
-    ----------
-    quantum_efficiency : float
-        Photon detection efficiency, fill factor and avalanche probability included; above 0, at most 1.
-    cells : int
-        Number of cells, 1 to 10^9, evenly illuminated.
-    recovery_time_ns : float
-        Dead time of a cell that has fired [ns], at least the width of a bin.
-    crosstalk : float
-        Probability that an avalanche immediately triggers further ones, 0 to 0.5.
-    dark_count_rate_hz : float
-        Dark counts of all cells [1/s], without crosstalk.
-    gain : float
-        Mean charge of an avalanche in electrons, at least 1.
-    gain_spread : float
-        Standard deviation of the charge over its mean, at least 0.
-    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
-        Afterpulses, per primary avalanche; see `SignalTail`.
-
     Notes
     -----
     Cells without crosstalk are independent: a bin holds a binomial number of primary avalanches. Each makes a
@@ -249,13 +207,17 @@ class SiliconPhotomultiplier(SignalTail):
     A cell recovers instantaneously. Afterpulses are in any cell, with equal probability.
     """
 
-    quantum_efficiency: float = checked(_efficiency)
-    cells: int = checked(integer, 1, 10**9)
-    recovery_time_ns: float = checked(positive)
-    crosstalk: float = checked(in_range, 0, 0.5, default=0.0)
-    dark_count_rate_hz: float = checked(non_negative, default=0.0)
-    gain: float = checked(in_range, 1, np.inf, default=1.0)
-    gain_spread: float = checked(non_negative, default=0.0)
+    quantum_efficiency: Annotated[
+        float, Option("Photon detection efficiency, with fill factor and avalanche probability", 0, 1, above=True)
+    ]
+    cells: Annotated[int, Option("Number of cells, evenly illuminated", 1, 10**9)]
+    recovery_time_ns: Annotated[
+        float, positive_option("Dead time of a cell that has fired, at least the width of a bin", "ns")
+    ]
+    crosstalk: Annotated[float, Option("Probability that an avalanche immediately triggers further ones", 0, 0.5)] = 0.0
+    dark_count_rate_hz: Annotated[float, Option("Dark counts of all cells, without crosstalk", 0, unit="1/s")] = 0.0
+    gain: Annotated[float, Option("Mean charge of an avalanche in electrons", 1)] = 1.0
+    gain_spread: Annotated[float, Option("Standard deviation of the charge over its mean", 0)] = 0.0
 
     @property
     def charge_spread(self) -> float:
@@ -312,27 +274,6 @@ class SiliconPhotomultiplier(SignalTail):
 class SinglePhotonDetector(SignalTail):
     """Single-photon avalanche diode, or several channels that share the light evenly, with a counter in time bins.
 
-    Parameters
-    ----------
-    quantum_efficiency : float
-        Photon detection efficiency, above 0, at most 1.
-    dead_time_ns : float
-        Dead time after a count [ns], at least the width of a bin. One longer than the record leaves only the first
-        photon.
-    dark_count_rate_hz : float
-        Dark counts [1/s], at least 0.
-    paralyzable : bool
-        Whether an event in the dead time prolongs it.
-    channels : int
-        Number of channels, each with its own dead time, whose counts are summed; 1 to 10^4. Dark counts are of all.
-    afterpulse_probability : float
-        Probability that a count causes another one in its channel after the dead time, 0 to 0.5, where no other event
-        is earlier. It needs a detector that is not paralyzable.
-    afterpulse_decay_ns : float or None
-        Mean time from the end of the dead time to an afterpulse [ns], positive; required for a probability above 0.
-    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
-        Events in proportion to the light that come later, such as by slow carriers; see `SignalTail`.
-
     Notes
     -----
     The detector is live at the first bin of the record, as if gated on there. The time to an afterpulse is
@@ -340,13 +281,32 @@ class SinglePhotonDetector(SignalTail):
     ones have trapped no longer count, so that the counts are a renewal process with exact moments.
     """
 
-    quantum_efficiency: float = checked(_efficiency)
-    dead_time_ns: float = checked(positive)
-    dark_count_rate_hz: float = checked(non_negative, default=0.0)
-    paralyzable: bool = False
-    channels: int = checked(integer, 1, 10_000, default=1)
-    afterpulse_probability: float = checked(in_range, 0, 0.5, default=0.0)
-    afterpulse_decay_ns: float | None = checked(positive, default=None)
+    quantum_efficiency: Annotated[float, Option("Photon detection efficiency", 0, 1, above=True)]
+    dead_time_ns: Annotated[
+        float,
+        positive_option(
+            "Dead time after a count, at least the width of a bin; one longer than the record leaves only the first "
+            "photon",
+            "ns",
+        ),
+    ]
+    dark_count_rate_hz: Annotated[float, Option("Dark counts of all channels", 0, unit="1/s")] = 0.0
+    paralyzable: Annotated[bool, Option("Whether an event in the dead time prolongs it")] = False
+    channels: Annotated[
+        int, Option("Number of channels, each with its own dead time, whose counts are summed", 1, 10_000)
+    ] = 1
+    afterpulse_probability: Annotated[
+        float,
+        Option(
+            "Probability that a count causes another one in its channel after the dead time, where no other event is "
+            "earlier; it needs a detector that is not paralyzable",
+            *(0, 0.5),
+        ),
+    ] = 0.0
+    afterpulse_decay_ns: Annotated[
+        float | None,
+        positive_option("Mean time from the end of the dead time to an afterpulse, for a probability above 0", "ns"),
+    ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

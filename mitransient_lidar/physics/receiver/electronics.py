@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.constants import BOLTZMANN
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import (
-    Checked,
-    FloatArray,
-    checked,
-    finite,
-    finite_array,
-    integer,
-    non_negative,
-    positive,
-)
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.physics.piecewise_linear import integral
 
 _TAIL = 1e-10  # fraction of a filter's response left out at its ends
@@ -85,32 +78,8 @@ MEAN_OF_BINS = LowPass(1, -1, np.ones(1))
 
 
 @dataclass(frozen=True)
-class Amplifier(Checked):
+class Amplifier(Plan):
     """Transimpedance amplifier or load resistor.
-
-    Parameters
-    ----------
-    transimpedance_ohm : float
-        Output voltage over input current [V/A], positive; load resistance times gain of a voltage amplifier.
-    noise_pa_per_rthz : float
-        White noise current density at the input, one-sided [pA/sqrt(Hz)], at least 0.
-    load_ohm : float or None
-        Resistance with the thermal noise 4 k T/R [ohm], positive; None for none.
-    temperature_k : float
-        Temperature of the resistance [K], at least 0.
-    bandwidth_mhz : float or None
-        Half-power frequency [MHz], positive; None for a bandwidth limited by the bins alone.
-    response : {'single_pole', 'gaussian'}
-        Shape of the low-pass: exp(-t/tau)/tau with tau = 1/(2 pi f), or a Gaussian without delay.
-    limit_v : float or None
-        Largest output of either sign [V], positive; None for no limit.
-    impulse_response : (tuple of float, tuple of float) or None
-        Measured response instead of a bandwidth: times after the light [ns], ascending, with 0 among them, and values
-        in any unit, linear between the times, of positive area, and at either end within 2 % of their peak about 0.
-    coupling_ns : float or None
-        Time constant of the coupling capacitor between detector and amplifier [ns], positive; None for DC coupling.
-    recovery_ns : float or None
-        Time for which the output stays at its limit after an overload has ended [ns], positive; None for none.
 
     Notes
     -----
@@ -122,21 +91,43 @@ class Amplifier(Checked):
     Thermal noise: J. B. Johnson and H. Nyquist, Phys. Rev. 32, 97 and 110 (1928), doi:10.1103/PhysRev.32.110.
     """
 
-    transimpedance_ohm: float = checked(positive)
-    noise_pa_per_rthz: float = checked(non_negative, default=0.0)
-    load_ohm: float | None = checked(positive, default=None)
-    temperature_k: float = checked(non_negative, default=293.15)
-    bandwidth_mhz: float | None = checked(positive, default=None)
-    response: Literal["single_pole", "gaussian"] = "single_pole"
-    limit_v: float | None = checked(positive, default=None)
-    impulse_response: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    coupling_ns: float | None = checked(positive, default=None)
-    recovery_ns: float | None = checked(positive, default=None)
+    transimpedance_ohm: Annotated[
+        float,
+        positive_option("Output voltage over input current; load resistance times gain of a voltage amplifier", "V/A"),
+    ]
+    noise_pa_per_rthz: Annotated[
+        float, Option("White noise current density at the input, one-sided", 0, unit="pA/sqrt(Hz)")
+    ] = 0.0
+    load_ohm: Annotated[
+        float | None, positive_option("Resistance with the thermal noise 4 k T/R, None for none", "ohm")
+    ] = None
+    temperature_k: Annotated[float, Option("Temperature of the resistance", 0, unit="K")] = 293.15
+    bandwidth_mhz: Annotated[
+        float | None, positive_option("Half-power frequency, None for a bandwidth limited by the bins alone", "MHz")
+    ] = None
+    response: Annotated[
+        Literal["single_pole", "gaussian"],
+        Option("Shape of the low-pass: exp(-t/tau)/tau with tau = 1/(2 pi f), or a Gaussian without delay"),
+    ] = "single_pole"
+    limit_v: Annotated[float | None, positive_option("Largest output of either sign, None for no limit", "V")] = None
+    impulse_response: Annotated[
+        tuple[tuple[float, ...], tuple[float, ...]] | None,
+        Option(
+            "Measured response instead of a bandwidth: times after the light [ns], ascending, with 0 among them, and "
+            "values in any unit, linear between them, of positive area, and at either end within 2 % of their peak"
+        ),
+    ] = None
+    coupling_ns: Annotated[
+        float | None,
+        positive_option("Time constant of the capacitor between detector and amplifier, None for DC coupling", "ns"),
+    ] = None
+    recovery_ns: Annotated[
+        float | None,
+        positive_option("Time for which the output stays at its limit after an overload, None for none", "ns"),
+    ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.response not in ("single_pole", "gaussian"):
-            raise UserError(f"response = {self.response!r} must be 'single_pole' or 'gaussian'")
         if self.impulse_response is not None:
             if self.bandwidth_mhz is not None:
                 raise UserError(f"bandwidth_mhz = {self.bandwidth_mhz:g} and an impulse_response are alternatives")
@@ -212,15 +203,15 @@ class Amplifier(Checked):
 
 
 @dataclass(frozen=True)
-class LogAmplifier(Checked):
+class LogAmplifier(Plan):
     """Logarithmic compression of voltages of either sign.
 
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
     knee, and smooth at 0, where noise makes the input negative.
     """
 
-    volts_per_decade: float = checked(positive)  #: Increase of the output per decade of the input [V], positive.
-    knee_v: float = checked(positive)  #: Input below which the output is linear [V], positive.
+    volts_per_decade: Annotated[float, positive_option("Increase of the output per decade of the input", "V")]
+    knee_v: Annotated[float, positive_option("Input below which the output is linear", "V")]
 
     def compress(self, volts: FloatArray) -> FloatArray:
         """Return the output [V] for an input [V]."""
@@ -239,25 +230,8 @@ class LogAmplifier(Checked):
 
 
 @dataclass(frozen=True)
-class Digitiser(Checked):
+class Digitiser(Plan):
     """Analogue-to-digital converter.
-
-    Parameters
-    ----------
-    bits : int
-        Resolution, 1 to 24.
-    full_scale_v : float
-        Width of the range [V], positive: 2^bits steps.
-    low_v : float
-        Voltage of code 0 [V].
-    sampling_ghz : float or None
-        Samples per ns, positive. The time between them must be an integer number of the record's bins; None for one
-        sample per bin.
-    block_threshold_v : float or None
-        Samples above the level without light by this voltage, positive, start a block that is stored; None to store
-        all samples.
-    block_before, block_after : int
-        Samples that are stored before and after those above the threshold, 0 to 100 000.
 
     Notes
     -----
@@ -265,13 +239,25 @@ class Digitiser(Checked):
     at least about half a step; a steady signal with less noise has an error of up to half a step instead.
     """
 
-    bits: int = checked(integer, 1, 24)
-    full_scale_v: float = checked(positive)
-    low_v: float = checked(finite, default=0.0)
-    sampling_ghz: float | None = checked(positive, default=None)
-    block_threshold_v: float | None = checked(positive, default=None)
-    block_before: int = checked(integer, 0, 100_000, default=0)
-    block_after: int = checked(integer, 0, 100_000, default=0)
+    bits: Annotated[int, Option("Resolution", 1, 24)]
+    full_scale_v: Annotated[float, positive_option("Width of the range: 2^bits steps", "V")]
+    low_v: Annotated[float, Option("Voltage of code 0", unit="V")] = 0.0
+    sampling_ghz: Annotated[
+        float | None,
+        positive_option(
+            "Samples per ns, the time between which must be an integer number of the record's bins; None for one a bin",
+            "GHz",
+        ),
+    ] = None
+    block_threshold_v: Annotated[
+        float | None,
+        positive_option(
+            "Height above the level without light from which samples start a block that is stored, None to store all",
+            "V",
+        ),
+    ] = None
+    block_before: Annotated[int, Option("Samples stored before those above the threshold", 0, 100_000)] = 0
+    block_after: Annotated[int, Option("Samples stored after those above the threshold", 0, 100_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -8,17 +8,20 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.text_tables import read_time_samples
-from mitransient_lidar.core.toml_files import parse_toml
-from mitransient_lidar.core.validation import positive, shown
+from mitransient_lidar.core.toml_files import check_keys, parse_toml, required
+from mitransient_lidar.core.validation import shown
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 Setting = float | Literal["auto"]
@@ -37,17 +40,45 @@ _STAGES: dict[str, Callable[..., Any]] = {
     "digitiser": Digitiser,
     "jitter": ShotJitter,
 }
-_OF_CHANNEL = ("detector", "amplifier", "logarithm", "digitiser", "gain", "optical_density")
-_OF_FILE = ("preset", *_OF_CHANNEL, "jitter", "wavelength_nm", "pulse_repetition_khz", "source", "channels")
 #: Names of the samples of an impulse response.
 _RESPONSE = Column(
     "impulse_response", ("response", "signal", "amplitude", "power", "v", "mv", "volt", "voltage", "counts")
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ChannelTable(Plan):
+    """Tables and numbers of a file for a channel; keys of tables are the parameters of the stages."""
+
+    detector: Annotated[Mapping[str, Any], Option(f"Detector, with type: {', '.join(_DETECTORS)}")] = field(
+        default_factory=dict
+    )
+    amplifier: Annotated[Mapping[str, Any], Option("Amplifier; its impulse_response may name a file")] = field(
+        default_factory=dict
+    )
+    logarithm: Annotated[Mapping[str, Any], Option("Logarithmic compression")] = field(default_factory=dict)
+    digitiser: Annotated[Mapping[str, Any], Option("Converter")] = field(default_factory=dict)
+    gain: Annotated[Setting | None, Option("Factor of the gain")] = None
+    optical_density: Annotated[Setting | None, Option("Optical density of a filter")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverFile(ChannelTable):
+    """A file of a receiver; `channels` hold what differs in some of them, by the name of the pixel."""
+
+    preset: Annotated[str | None, Option("Receiver whose stages count where the file has no others")] = None
+    jitter: Annotated[Mapping[str, Any], Option("Energy and time of the shots")] = field(default_factory=dict)
+    wavelength_nm: Annotated[float | None, positive_option("Vacuum wavelength of the light", "nm")] = None
+    pulse_repetition_khz: Annotated[float | None, positive_option("Pulse repetition rate", "kHz")] = None
+    source: Annotated[str | None, Option("Source of the numbers", form="a text")] = None
+    channels: Annotated[Mapping[str, Any], Option("Channels with own detectors, electronics or settings")] = field(
+        default_factory=dict
+    )
+
+
 @dataclass(frozen=True)
 class Channel:
-    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `presets`."""
+    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `ReceiverChain`."""
 
     chain: ReceiverChain
     gain: Setting = 1.0
@@ -163,77 +194,60 @@ def instrument_receiver(instrument: str) -> ReceiverChannels | None:
 
 
 def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
-    """Return the receiver that the text of a TOML file describes.
+    """Return the receiver that the text of a TOML file describes, whose keys are those of `ReceiverFile`.
 
-    Keys of the file: ``preset`` (a receiver of `presets.RECEIVERS` whose stages count where the file has no others),
-    ``wavelength_nm``, ``pulse_repetition_khz``, ``source``, ``gain`` and ``optical_density`` (numbers or "auto"), the
-    tables ``detector`` (with ``type``: photodiode, avalanche_photodiode, photomultiplier, silicon_photomultiplier or
-    photon_counter), ``amplifier`` (its ``impulse_response`` may name a file in `folder`), ``logarithm``,
-    ``digitiser`` and ``jitter`` (of all channels), and ``channels.NAME`` with those among the others that differ. Keys
-    of tables are the parameters of `detectors`, `electronics` and `shot_jitter`.
+    Files that it names are in `folder`.
 
     Raises
     ------
     UserError
         If a key is unknown, a parameter is out of range, or the stages do not fit together.
     """
-    values = parse_toml(text, name)
-    _check_keys(name, values, _OF_FILE)
-    chain = None
-    if "preset" in values:
-        if values["preset"] not in RECEIVERS:
-            raise UserError(f"{name}: preset = {shown(values['preset'])} must be one of {', '.join(RECEIVERS)}")
-        chain = RECEIVERS[values["preset"]]
-    others: dict[str, Any] = {key: values[key] for key in ("wavelength_nm", "source") if key in values}
-    default = _channel(name, values, None if chain is None else Channel(chain), folder, others)
+    return _receiver(parse_toml(text, name), name, folder, RECEIVERS)
+
+
+def _receiver(
+    given: Mapping[str, Any], name: str, folder: Path, presets: Mapping[str, ReceiverChain]
+) -> ReceiverChannels:
+    """Return the receiver of the tables of a file."""
+    values = ReceiverFile.of(given, name, f"{name}: ")
+    base = None
+    if values.preset is not None:
+        base = Channel(presets[one_of(f"{name}: preset", values.preset, presets)])
+    others: dict[str, Any] = {
+        key: value for key in ("wavelength_nm", "source") if (value := getattr(values, key)) is not None
+    }
+    default = _channel(name, values, base, folder, others)
     channels = {}
-    for channel, own in _table(name, values, "channels").items():
+    for channel, given in values.channels.items():
         label = f"{name}: channels.{channel}"
-        if not isinstance(own, dict):
-            raise UserError(f"{label} = {shown(own)} must be a table")
-        _check_keys(label, own, _OF_CHANNEL)
+        own = ChannelTable.of(given, label, f"{label}: ")
         channels[channel] = _channel(label, own, default, folder, {})
-    rate = values.get("pulse_repetition_khz")
-    rate = None if rate is None else positive("pulse_repetition_khz", rate)
-    return ReceiverChannels(default, channels, rate, name)
+    return ReceiverChannels(default, channels, values.pulse_repetition_khz, name)
 
 
-def _channel(
-    name: str, values: Mapping[str, Any], base: Channel | None, folder: Path, others: Mapping[str, Any]
-) -> Channel:
+def _channel(name: str, values: ChannelTable, base: Channel | None, folder: Path, others: Mapping[str, Any]) -> Channel:
     """Return a channel from the tables of a file, with the stages of another one where they are missing."""
     stages: dict[str, Any] = dict(others)
-    own = _table(name, values, "detector")
-    if own:
+    if own := dict(values.detector):
         kind, label = own.pop("type", None), f"{name}: detector"
         if kind is None and base is not None:
             stages["detector"] = _with_dynodes(label, _stage(label, own, base.chain.detector), own)
-        elif kind not in _DETECTORS:
-            raise UserError(f"{name}: detector.type = {shown(kind)} must be one of {', '.join(_DETECTORS)}")
         else:
-            stages["detector"] = _stage(label, own, _DETECTORS[kind])
+            stages["detector"] = _stage(label, own, _DETECTORS[one_of(f"{label}.type", kind, _DETECTORS)])
     elif base is None:
         raise UserError(f"{name} has neither a preset nor a detector")
     for stage, build in _STAGES.items():
-        own = _table(name, values, stage)
-        if not own:
+        if not (own := dict(getattr(values, stage, {}))):
             continue
         if "impulse_response" in own:
             own["impulse_response"] = _impulse_response(folder, own["impulse_response"])
             own.setdefault("bandwidth_mhz", None)
         former = None if base is None else getattr(base.chain, stage)
         stages[stage] = _stage(f"{name}: {stage}", own, build if former is None else former)
-    try:
-        chain = ReceiverChain(**stages) if base is None else replace(base.chain, **stages)
-    except UserError as error:
-        raise UserError(f"{name}: {error}") from None
-    settings = {}
-    for setting in ("gain", "optical_density"):
-        given = values.get(setting, (1.0, 0.0)[setting != "gain"] if base is None else getattr(base, setting))
-        if given != "auto" and (isinstance(given, bool) or not isinstance(given, int | float)):
-            raise UserError(f"{name}: {setting} = {shown(given)} must be a number or auto")
-        settings[setting] = given
-    return Channel(chain, settings["gain"], settings["optical_density"])
+    chain = _tried(name, lambda: ReceiverChain(**stages) if base is None else replace(base.chain, **stages))
+    settings = {key: value for key in ("gain", "optical_density") if (value := getattr(values, key)) is not None}
+    return Channel(chain, **settings) if base is None else replace(base, chain=chain, **settings)
 
 
 def _impulse_response(folder: Path, given: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -244,29 +258,14 @@ def _impulse_response(folder: Path, given: Any) -> tuple[tuple[float, ...], tupl
     return tuple(times.tolist()), tuple(values.tolist())
 
 
-def _table(name: str, values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return a copy of a table of a file, empty without it."""
-    given = values.get(key, {})
-    if not isinstance(given, dict):
-        raise UserError(f"{name}: {key} = {shown(given)} must be a table")
-    return dict(given)
-
-
-def _check_keys(name: str, values: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    """Refuse unknown keys."""
-    for key in values:
-        if key not in known:
-            raise UserError(f"{name}: {key} is not known; it must be one of {', '.join(known)}")
-
-
 def _stage(name: str, values: Mapping[str, Any], base: Any) -> Any:
     """Return a stage that a function or class makes from its parameters, or another stage with some of them changed."""
     is_stage = is_dataclass(base) and not isinstance(base, type)
     parameters = inspect.signature(type(base) if is_stage else base).parameters
-    _check_keys(name, values, tuple(parameters))
-    missing = [key for key, one in parameters.items() if one.default is one.empty and key not in values]
-    if missing and not is_stage:
-        raise UserError(f"{name} lacks {', '.join(missing)}")
+    check_keys(name, values, parameters)
+    for key, one in parameters.items():
+        if one.default is one.empty and not is_stage:
+            required(name, values, key)
     for key, value in values.items():
         if isinstance(value, dict):
             raise UserError(f"{name}.{key} must be a value, not a table")
@@ -291,3 +290,16 @@ def _tried(name: str, build: Callable[[], Any]) -> Any:
         raise UserError(f"{name}: {error}") from None
     except (TypeError, ValueError):
         raise UserError(f"{name} has a parameter of another type than its number or text") from None
+
+
+def _presets() -> Mapping[str, ReceiverChain]:
+    """Return the typical chains for 532 nm."""
+    path = Path(__file__).with_name("presets.toml")
+    found: dict[str, ReceiverChain] = {}
+    for name, given in parse_toml(path.read_text("utf-8"), path).items():
+        found[name] = _receiver(given, f"{path.name}: {name}", path.parent, found).default.chain
+    return MappingProxyType(found)
+
+
+#: Typical chains for 532 nm, with their sources.
+RECEIVERS = _presets()

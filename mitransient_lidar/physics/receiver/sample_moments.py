@@ -9,6 +9,7 @@ from scipy import sparse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, non_negative_array, positive
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
@@ -16,7 +17,6 @@ from mitransient_lidar.physics.receiver.detectors import (
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.electronics import LowPass
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
 _STEP = 1e-3  # events of a cell, or share of the light on a linear detector, in a central difference
 

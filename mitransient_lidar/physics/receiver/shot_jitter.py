@@ -4,27 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, non_negative
+from mitransient_lidar.core.options import Option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import FloatArray
 
 
 @dataclass(frozen=True)
-class ShotJitter(Checked):
+class ShotJitter(Plan):
     """Fluctuation of pulse energy, trigger and clocks from shot to shot.
-
-    Parameters
-    ----------
-    energy_rms : float
-        Standard deviation of the pulse energy over its mean, 0 to 1; the energy is gamma-distributed.
-    trigger_ns : float
-        Standard deviation of the record's start against the pulse [ns], at least 0; the same time in all channels of a
-        shot.
-    clock_ns : float
-        Standard deviation of the time of each channel against the others [ns], at least 0; all samples of a channel in
-        a shot are shifted alike.
 
     Notes
     -----
@@ -32,9 +23,16 @@ class ShotJitter(Checked):
     n the group index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom of one channel.
     """
 
-    energy_rms: float = checked(in_range, 0, 1, default=0.0)
-    trigger_ns: float = checked(non_negative, default=0.0)
-    clock_ns: float = checked(non_negative, default=0.0)
+    energy_rms: Annotated[
+        float, Option("Standard deviation of the pulse energy over its mean; the energy is gamma-distributed", 0, 1)
+    ] = 0.0
+    trigger_ns: Annotated[
+        float,
+        Option("Standard deviation of the record's start against the pulse, the same in all channels", 0, unit="ns"),
+    ] = 0.0
+    clock_ns: Annotated[
+        float, Option("Standard deviation of the time of each channel's samples against the others", 0, unit="ns")
+    ] = 0.0
 
     def draw(
         self, shots: int, records: tuple[int, ...], series: bool, seed: int, common_seed: int

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import Checked, FloatArray, finite_array
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class SignalTail(Checked):
+class SignalTail(Plan):
     """Events that follow those of the light, a sum of decaying exponentials; the default has none.
-
-    Parameters
-    ----------
-    tail_fractions : tuple of float
-        Events of each exponential per event of the light, or charge per charge; at least 0, of a sum of at most 1.
-    tail_decays_ns : tuple of float
-        Decay time of each exponential [ns], positive.
-    tail_delays_ns : tuple of float
-        Delay of each exponential's start after the light [ns], at least 0; empty for no delay.
 
     Notes
     -----
@@ -34,25 +28,23 @@ class SignalTail(Checked):
     doi:10.1364/AO.38.004639.
     """
 
-    tail_fractions: tuple[float, ...] = ()
-    tail_decays_ns: tuple[float, ...] = ()
-    tail_delays_ns: tuple[float, ...] = ()
+    tail_fractions: Annotated[
+        tuple[float, ...],
+        Option("Events of each exponential per event of the light, or charge per charge, of a sum of at most 1", 0),
+    ] = ()
+    tail_decays_ns: Annotated[tuple[float, ...], positive_option("Decay time of each exponential", "ns")] = ()
+    tail_delays_ns: Annotated[
+        tuple[float, ...], Option("Delay of each exponential's start after the light; empty for no delay", 0, unit="ns")
+    ] = ()
 
     def __post_init__(self) -> None:
-        fractions = _numbers("tail_fractions", self.tail_fractions, 0)
-        if fractions.sum() > 1:
-            raise UserError(f"tail_fractions = {list(self.tail_fractions)} must have a sum of at most 1")
-        decays = _numbers("tail_decays_ns", self.tail_decays_ns, np.finfo(float).tiny)
-        delays = _numbers("tail_delays_ns", self.tail_delays_ns, 0)
-        for name, values, sizes in (
-            ("tail_decays_ns", decays, (fractions.size,)),
-            ("tail_delays_ns", delays, (0, fractions.size)),
-        ):
-            if values.size not in sizes:
-                raise UserError(
-                    f"{name} = {values.tolist()} must have as many numbers as tail_fractions, {fractions.size}"
-                )
         super().__post_init__()
+        count = len(self.tail_fractions)
+        if sum(self.tail_fractions) > 1:
+            raise UserError(f"tail_fractions = {list(self.tail_fractions)} must have a sum of at most 1")
+        for name, sizes in (("tail_decays_ns", (count,)), ("tail_delays_ns", (0, count))):
+            if len(values := getattr(self, name)) not in sizes:
+                raise UserError(f"{name} = {list(values)} must have as many numbers as tail_fractions, {count}")
 
     def with_tail(self, events: FloatArray, steady: FloatArray, part_ns: float) -> FloatArray:
         """Return mean events with the delayed ones.
@@ -85,13 +77,3 @@ class SignalTail(Checked):
     def _tail_sources(self, events: FloatArray, part_ns: float) -> FloatArray:
         """Return the mean events that are followed by delayed ones."""
         return events
-
-
-def _numbers(name: str, given: object, least: float) -> FloatArray:
-    """Return a list of numbers of at least `least`."""
-    if not isinstance(given, tuple | list):
-        raise UserError(f"{name} = {given!r} must be a list of numbers")
-    values = finite_array(name, given)
-    if np.any(values < least):
-        raise UserError(f"{name} = {list(given)} must have numbers {'of at least' if least == 0 else 'above'} 0")
-    return values

@@ -13,10 +13,10 @@ from mitransient_lidar.analysis.receiver import describe_recording, detect_wavef
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS, Channel, ReceiverChannels
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.results import save
 

@@ -15,7 +15,7 @@ FLAT = {"spectrum": "flat", "surface_size": 60, "layout": "1x1"}
 def planned(parameters, fixed=FLAT, **design):
     """Return a campaign of a grid, or of a design, and its columns."""
     given = {"scene": "table1", "fixed": fixed, "parameters": parameters, "design": design or {"kind": "grid"}}
-    campaign = Campaign.of(given)
+    campaign = Campaign.of_file(given)
     return campaign, campaign.table()
 
 
@@ -49,7 +49,7 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
     )
     np.save(tmp_path / "map.npy", np.full((3, 3), -5.0))
     fixed = {"map_file": str(tmp_path / "map.npy")}
-    record = source_of(Campaign.of({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
+    record = source_of(Campaign.of_file({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
     assert record.parameters == {"map_file": "nowhere.npy"}
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "map.npy")]
 
@@ -96,7 +96,7 @@ def test_what_is_asked_of_a_run(asked):
 def test_time_of_a_run_without_all_shots_is_refused(monkeypatch):
     """Its arrays do not fit those of the store."""
     given = {"scene": "table1", "fixed": FLAT, "parameters": {"bottom_depth": [3.0]}, "max_time": 2}
-    campaign = Campaign.of({**given, "design": {"kind": "random", "count": 1, "shots": 4}})
+    campaign = Campaign.of_file({**given, "design": {"kind": "random", "count": 1, "shots": 4}})
     asked = []
 
     def render_shots(scene, params, **options):
@@ -112,7 +112,7 @@ def test_time_of_a_run_without_all_shots_is_refused(monkeypatch):
 
 @pytest.mark.slow
 def test_given_places_and_targets(asked):
-    campaign = Campaign.of(
+    campaign = Campaign.of_file(
         {
             "scene": "fig13_2x2",
             "keep": ["components"],

@@ -31,7 +31,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
-CAMPAIGN = Campaign.of(
+CAMPAIGN = Campaign.of_file(
     {
         "scene": "table1",
         "parameters": {"time": {"low": 1, "high": 2}, "layout": ["1x1", "2x2"]},
@@ -108,21 +108,29 @@ def test_new_store_is_empty_and_complete(store, path):
 
 
 def is_of(store, campaign, columns, scene=RECORD):
-    return store.is_of("campaign", campaign.text, columns, lambda: scene)
+    try:
+        store.require(campaign, columns, lambda: scene)
+    except UserError as error:
+        return "holds another campaign, or its scene has changed" not in str(error)
+    return True
 
 
 def test_renderer_of_a_store_is_that_of_its_campaign(store):
     renderer = store.renderer()
-    assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
+    assert (renderer.plan.text, renderer.axis) == (CAMPAIGN.text, AXIS)
     assert renderer.scene.parameters == {"time": "0"}
     assert is_of(store, CAMPAIGN, CAMPAIGN.table())
-    other = Campaign.of({"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}})
+    other = Campaign.of_file(
+        {"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}}
+    )
     assert not is_of(store, other, other.table())
     edited = CAMPAIGN.table()
     edited["time"] = edited["time"] + 1e-9
     assert not is_of(store, CAMPAIGN, edited)
     # The file of the scene has changed since.
     assert not is_of(store, CAMPAIGN, CAMPAIGN.table(), replace(RECORD, text="<scene></scene>"))
+    with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*, 4"):
+        store.require(CAMPAIGN, None, lambda: RECORD, 8)
 
 
 def test_store_of_other_versions(store, caplog):

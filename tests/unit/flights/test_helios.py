@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+from mitransient_lidar.flights.poses.platforms import platform_of
 from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 
@@ -64,7 +65,7 @@ def test_beams_of_arinc_705(angles, scanner, expected, tmp_path):
     file = tmp_path / "flight.trj"
     roll, pitch, yaw = angles
     file.write_text(f"0, {roll}, {pitch}, {yaw}, 0, 0, 400\n1, {roll}, {pitch}, {yaw}, 0, 60, 400\n")
-    trajectory = Trajectory.of({"kind": "csv", "file": "flight.trj"}, tmp_path)
+    trajectory = platform_of({"kind": "csv", "file": "flight.trj"}).trajectory(tmp_path)
     poses = pulse_poses(trajectory, Mounting(), scanner, [0.5])
     np.testing.assert_allclose(poses.axis, [expected], atol=1e-14)
     np.testing.assert_allclose(poses.origin, [(0, 30, 400)], atol=1e-12)

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pixel_turns, pulse_poses
+from mitransient_lidar.flights.poses.platforms import platform_of
 from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -103,24 +103,10 @@ def test_scan_angle_is_from_the_vertical_to_the_right(heading_deg):
 
 def test_lines_of_pulses():
     given = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 100, "length": 50, "count": 2, "spacing": 5}
-    trajectory = Trajectory.of(given)
+    trajectory = platform_of(given).trajectory()
     poses = pulse_poses(trajectory, Mounting(), Fixed(), trajectory.pulse_times(4))
     np.testing.assert_array_equal(poses.line, [0] * 5 + [1] * 5)
     np.testing.assert_allclose(poses.origin[:, 1], [0, 12.5, 25, 37.5, 50, 50, 37.5, 25, 12.5, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"tilt_deg": 3}, r"'tilt_deg' is no key of \[mounting\]: allowed are roll_deg, pitch_deg, yaw_deg, lever_arm"),
-        ({"roll_deg": "left"}, "roll_deg = 'left' must be a number"),
-        ({"lever_arm": [1, 2]}, r"lever_arm = \[1, 2\] must be x, y and z in metres"),
-        ({"lever_arm": [1, 2, float("inf")]}, "lever_arm holds inf"),
-    ],
-)
-def test_invalid_mountings(given, message):
-    with pytest.raises(UserError, match=message):
-        Mounting.of(given)
 
 
 def test_mounting_of_a_plan():

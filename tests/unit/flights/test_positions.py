@@ -433,14 +433,6 @@ def test_other_echoes_are_refused(change, message):
         located(change(mixed()), **poses(1), angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
 
 
-def test_standard_deviations_of_poses_are_checked():
-    assert PoseErrors.of({"roll_deg": 0.01}) == PoseErrors(roll_deg=0.01)
-    with pytest.raises(UserError, match="unknown standard deviation 'yaw_deg': allowed are roll_deg"):
-        PoseErrors.of({"yaw_deg": 0.1})
-    with pytest.raises(UserError, match="height_m = -1 must not be negative"):
-        PoseErrors.of({"height_m": -1.0})
-
-
 @pytest.mark.parametrize(
     ("points", "error", "options", "message"),
     [

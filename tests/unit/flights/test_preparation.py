@@ -2,7 +2,6 @@
 
 import logging
 import re
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.fly import STORE, _prepare
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
@@ -36,7 +34,7 @@ def from_file(folder, place, **others):
     """Return a flight along the records, whose platform has this origin."""
     (folder / "line.csv").write_text(RECORDS)
     platform = {"kind": "csv", "file": "line.csv", "origin": place}
-    return FlightPlan.of({**FLIGHT, "platform": platform, **others}, folder)
+    return FlightPlan.of_file({**FLIGHT, "platform": platform, **others}, folder)
 
 
 def loaded_scene(folder, **parameters):
@@ -96,14 +94,16 @@ def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
     (tmp_path / "step.asc").write_text(GRID)
     (tmp_path / "own.xml").write_text(OWN_SCENE.format(shared=scenes.__path__[0], own=own))
     given = {**FLIGHT, "scene": "own.xml", "parameters": {"map_file": str(tmp_path / "step.asc")}}
-    record = scene_of(FlightPlan.of({**given, "crs": "EPSG:32633", "origin": [500000.0, 6500000.0, 0.0]}, tmp_path))
+    record = scene_of(
+        FlightPlan.of_file({**given, "crs": "EPSG:32633", "origin": [500000.0, 6500000.0, 0.0]}, tmp_path)
+    )
     text = record.document().filled(lambda setting: setting.value)
     found = tuple(float(re.search(f'name="origin_{axis}" value="(.*?)"', text)[1]) for axis in "xy")
     assert found == place
     assert record.parameters["map_file"] == "nowhere.tif"
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "step.asc")]
     # Without map coordinates the map lies as it does in a render.
-    assert ("origin_x" in scene_of(FlightPlan.of(given, tmp_path)).text) == bool(own)
+    assert ("origin_x" in scene_of(FlightPlan.of_file(given, tmp_path)).text) == bool(own)
 
 
 def test_places_beyond_a_map(tmp_path, caplog):
@@ -119,9 +119,10 @@ def test_places_beyond_a_map(tmp_path, caplog):
 
 
 def test_a_map_without_coordinates_and_a_flight_without_them_go_together(tmp_path):
-    check_maps(FlightPlan.of(FLIGHT), loaded_scene(tmp_path))
+    check_maps(FlightPlan.of_file(FLIGHT), loaded_scene(tmp_path))
     check_maps(
-        FlightPlan.of({**FLIGHT, "origin": [5e5, 6e6, 0]}), mi.load_dict({"type": "scene", "b": {"type": "seabed"}})
+        FlightPlan.of_file({**FLIGHT, "origin": [5e5, 6e6, 0]}),
+        mi.load_dict({"type": "scene", "b": {"type": "seabed"}}),
     )
 
 
@@ -133,19 +134,6 @@ def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
     for wrong in ({"crs": "EPSG:32633"}, {"origin": [500021.0, 6500015.0, 0.0]}):
         with pytest.raises(UserError, match=r"origin = \[500020.0, .* of the platform must have the x and y of that"):
             from_file(tmp_path, place, **wrong).poses()
-
-
-def test_a_store_keeps_its_size_of_shards(tmp_path, monkeypatch):
-    """As that of a campaign: another size is refused instead of being ignored."""
-    store = SimpleNamespace(count=3, shard_size=16, inputs=lambda rows: {}, is_of=lambda *about: True)
-    monkeypatch.setattr("mitransient_lidar.flights.fly.Store", lambda path: store)
-    (tmp_path / STORE).mkdir()
-    for size in (None, 16, 8):
-        if size == 8:
-            with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*flight\.zarr, 16"):
-                _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size)
-        else:
-            assert _prepare(FlightPlan.of(FLIGHT), tmp_path / STORE, size) is store
 
 
 def test_what_is_told_before_a_flight(caplog):

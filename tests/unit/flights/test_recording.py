@@ -33,7 +33,7 @@ def rendered(instrument, pixels, *peaks):
 
 
 def test_all_pulses_have_the_gain_of_the_brightest_probe():
-    plan, pixels = FlightPlan.of(FLIGHT), ["red", "green"]
+    plan, pixels = FlightPlan.of_file(FLIGHT), ["red", "green"]
     bright, dim = (rendered("published_airborne", pixels, *peaks) for peaks in ((1e-4, 3e-5), (2e-5, 1e-5)))
     settings = chosen_settings([dim, bright], plan)
     gain = detect_waveforms(bright).attrs["gain"]
@@ -56,7 +56,7 @@ def test_pulses_that_saturate_are_counted():
     fits = detect_waveforms(rendered("", pixels, 1e-4), "apd", gain="auto").attrs["gain"]
     probes = [rendered("", pixels, 1e-4, 1.5e-4), rendered("", pixels, 0.7e-4)]
     for gain, count in ((0.9 * fits, 1), (2 * fits, 3), ("auto", 0)):
-        plan = FlightPlan.of({**FLIGHT, "receiver": {"chain": "apd", "gain": gain}})
+        plan = FlightPlan.of_file({**FLIGHT, "receiver": {"chain": "apd", "gain": gain}})
         settings = chosen_settings(probes, plan)
         assert bool(settings) == has_automatic_settings(plan, None) == (gain == "auto")
         assert saturated_pulses(probes, plan, settings) == count
@@ -64,7 +64,7 @@ def test_pulses_that_saturate_are_counted():
 
 def test_each_channel_has_its_own_gain():
     """The deep pixel has a third of the light, and about three times the gain."""
-    plan, pixels = FlightPlan.of(FLIGHT), ["shallow_0", "deep"]
+    plan, pixels = FlightPlan.of_file(FLIGHT), ["shallow_0", "deep"]
     series = rendered("teledyne_czmil", pixels, 1e-2)
     settings = chosen_settings([series], plan)
     assert settings.keys() == {f"receiver_{name}_{number}" for name in ("gain", "density") for number in (0, 1)}
@@ -78,7 +78,7 @@ def test_each_channel_has_its_own_gain():
     [({}, "published_airborne", True), ({"gain": 0.1}, "published_airborne", False), ({"chain": "apd"}, "", False)],
 )
 def test_settings_that_are_given_are_kept(receiver, instrument, automatic):
-    plan = FlightPlan.of({**FLIGHT, "receiver": receiver})
+    plan = FlightPlan.of_file({**FLIGHT, "receiver": receiver})
     assert has_automatic_settings(plan, instrument) is automatic
     settings = chosen_settings([rendered(instrument, ["red", "green"], 1e-4)], plan)
     assert bool(settings) is automatic

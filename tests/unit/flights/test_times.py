@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.poses.times import tell_time_system, time_system
+from mitransient_lidar.flights.poses.platforms import platform_of
+from mitransient_lidar.flights.poses.times import tell_time_system
 
-CSV, SBET, LINES = ({"kind": kind, "file": "line.txt"} for kind in ("csv", "sbet", "lines"))
+CSV, SBET = {"kind": "csv", "file": "line.txt"}, {"kind": "sbet", "file": "line.txt", "epsg": 32633}
+LINES = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 200, "length": 500}
 
 
 @pytest.mark.parametrize(
@@ -25,19 +27,19 @@ CSV, SBET, LINES = ({"kind": kind, "file": "line.txt"} for kind in ("csv", "sbet
     ],
 )
 def test_systems_of_times(platform, last, system):
-    assert time_system(platform, np.array([last - 10, last])) == system
+    assert platform_of(platform).time_system(np.array([last - 10, last])) == system
 
 
 @pytest.mark.parametrize(
     ("platform", "last", "message"),
     [
-        ({**CSV, "time": "utc"}, 10.0, "time = 'utc' of a platform must be one of flight, gps_week, gps, adjusted_gps"),
+        ({**CSV, "time": "utc"}, 10.0, "time = 'utc' must be one of flight, gps_week, gps, adjusted_gps"),
         (CSV, 1.764e9, r"the times of line\.txt, up to 1764000000 s, may be Unix times, which are 315964782 s more"),
     ],
 )
 def test_times_that_are_not_known(platform, last, message):
     with pytest.raises(UserError, match=message):
-        time_system(platform, np.array([last - 10, last]))
+        platform_of(platform).time_system(np.array([last - 10, last]))
 
 
 @pytest.mark.parametrize(("system", "time"), [("gps", 1_389_012_345.0), ("adjusted_gps", 389_012_345.0)])

@@ -10,9 +10,10 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.refraction import snell
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake

@@ -11,8 +11,8 @@ from differentiated import PHOTON, result
 from PIL import Image
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
 from mitransient_lidar.plots.studies.parameters import plot_bounds
 from mitransient_lidar.rendering.options import RenderOptions

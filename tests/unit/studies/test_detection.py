@@ -11,9 +11,9 @@ from significance import largest_z
 from mitransient_lidar.analysis.detection import trials
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment, Level
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.plots.studies.targets import plot_detection
 from mitransient_lidar.studies import detection
 

@@ -15,9 +15,10 @@ from mitransient_lidar.analysis.detection.statistics import (
     sample_moments,
     within_range,
 )
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 T = np.arange(60)
 LIGHT = 4e-8 * (0.2 + np.exp(-0.5 * ((T - 40) / 4) ** 2))

@@ -8,9 +8,9 @@ from significance import largest_chi2, largest_z
 from mitransient_lidar.analysis.information.fisher import fisher_information
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
 ELECTRON = 1.602176634e-19
 T = np.arange(60.0)

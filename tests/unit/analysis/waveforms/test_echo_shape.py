@@ -12,7 +12,7 @@ from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response,
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.receiver.presets import RECEIVERS
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 
 def test_a_gaussian_pulse_is_one_gaussian():

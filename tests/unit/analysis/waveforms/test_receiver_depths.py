@@ -12,9 +12,10 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 CHAIN = ReceiverChain(LinearDetector(0.5), Amplifier(1e5, 3.0))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from significance import largest_z
 
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, photons_per_joule
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
 ELECTRON = 1.602176634e-19

@@ -9,10 +9,10 @@ from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import instrument_receiver, parse_receiver, receiver
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS, instrument_receiver, parse_receiver, receiver
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 WHOLE = """
@@ -139,30 +139,27 @@ def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
         ("gain = ", "not a TOML file"),
         ('preset = "tube"', "preset = 'tube' must be one of"),
         ("gain = 1", "neither a preset nor a detector"),
-        ('preset = "apd"\ncolour = 3', "colour is not known; it must be one of"),
-        ('preset = "apd"\n[amplifier]\nohms = 3', "amplifier: ohms is not known"),
+        ('preset = "apd"\ncolour = 3', "'colour' is no key of own.toml: allowed are"),
+        ('preset = "apd"\n[amplifier]\nohms = 3', "'ohms' is no key of own.toml: amplifier"),
         ('preset = "apd"\n[detector]\ntype = "eye"', "detector.type = 'eye' must be one of"),
-        ('[detector]\ntype = "photodiode"', "detector lacks quantum_efficiency"),
+        ('[detector]\ntype = "photodiode"', "detector has no quantum_efficiency"),
         ('preset = "apd"\n[amplifier]\nbandwidth_mhz = -1', "amplifier: bandwidth_mhz = -1"),
-        ('preset = "apd"\n[amplifier]\nbandwidth_mhz = "wide"', "amplifier"),
-        ('preset = "apd"\ngain = true', "gain = True must be a number or auto"),
         ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
-        ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "channels.deep: preset is not known"),
+        ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "'preset' is no key of own.toml: channels.deep"),
         ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
         (
             'preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8',
             "amplifier of channel 'deep' must have the resp",
         ),
         ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
-        ('preset = "apd"\npulse_repetition_khz = 0', "pulse_repetition_khz = 0"),
-        ('preset = "apd"\namplifier = 3', "amplifier = 3 must be a table"),
         ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
         ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),
         ('preset = "apd"\n[detector]\ntail_fractions = 0.1', "detector: tail_fractions = 0.1 must be a list of num"),
-        ('preset = "apd"\n[detector]\ntail_fractions = ["a"]', "detector: tail_fractions"),
-        ('preset = "pmt"\n[detector]\nafterpulse_probability = 0.1', "afterpulse_probability is not known"),
-        ('preset = "apd"\n[jitter]\nenergy_rms = 2', "jitter: energy_rms = 2 must lie between 0 and 1"),
-        ('preset = "apd"\n[channels.deep.jitter]\nclock_ns = 1', "channels.deep: jitter is not known"),
+        (
+            'preset = "pmt"\n[detector]\nafterpulse_probability = 0.1',
+            "'afterpulse_probability' is no key of own.toml: detector",
+        ),
+        ('preset = "apd"\n[channels.deep.jitter]\nclock_ns = 1', "'jitter' is no key of own.toml: channels.deep"),
         ('preset = "apd"\n[amplifier.limit_v]\nhigh = 3', "limit_v must be a value, not a table"),
     ],
 )

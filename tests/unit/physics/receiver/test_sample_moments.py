@@ -6,9 +6,10 @@ from differentiated import PHOTON
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
 T = np.arange(24.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from significance import largest_z
 
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, photons_per_joule
-from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter, delayed
 
 IDEAL = ReceiverChain(LinearDetector(1.0))

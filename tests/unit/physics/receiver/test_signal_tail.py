@@ -9,13 +9,14 @@ from significance import largest_z
 from mitransient_lidar.analysis.detection import statistics
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import sample_moments
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
     SinglePhotonDetector,
     photons_per_joule,
 )
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 FRACTIONS, DECAYS, DELAYS = (0.02, 0.05), (30.0, 90.0), (0.0, 24.5)
 TUBE = LinearDetector.photomultiplier(
@@ -127,10 +128,7 @@ def test_a_tube_at_another_voltage_keeps_its_tail():
     ("values", "message"),
     [
         ({"tail_fractions": (0.1,)}, r"tail_decays_ns = \[\] must have as many numbers as tail_fractions, 1"),
-        ({"tail_fractions": (-0.1,), "tail_decays_ns": (9.0,)}, r"tail_fractions = \[-0.1\] must have .* at least 0"),
         ({"tail_fractions": (0.7, 0.6), "tail_decays_ns": (9.0, 8.0)}, "tail_fractions .* a sum of at most 1"),
-        ({"tail_fractions": (0.1,), "tail_decays_ns": (0.0,)}, r"tail_decays_ns = \[0.0\] must have numbers above 0"),
-        ({"tail_fractions": 0.1}, "tail_fractions = 0.1 must be a list of numbers"),
         (
             {"tail_fractions": (0.1,), "tail_decays_ns": (9.0,), "tail_delays_ns": (1.0, 2.0)},
             "tail_delays_ns = .* must have as many numbers as tail_fractions",

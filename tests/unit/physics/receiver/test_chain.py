@@ -8,6 +8,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
@@ -15,7 +16,7 @@ from mitransient_lidar.physics.receiver.detectors import (
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 SHOTS = 10_000
 ELECTRON = 1.602176634e-19

@@ -1,4 +1,4 @@
-"""Receiver chains, from the optical power on a detector to recorded samples with noise, and presets of them.
+"""Receiver chains, from the optical power on a detector to recorded samples with noise.
 
 Powers are means over time bins; before and after a record there is only the background, such as that of
 `clear_sky.background_power`.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ from mitransient_lidar.core.validation import FloatArray, integer, non_negative_
 from mitransient_lidar.physics.receiver.detectors import (
     Detector,
     LinearDetector,
-    SiliconPhotomultiplier,
     SinglePhotonDetector,
     photons_per_joule,
 )
@@ -439,62 +437,3 @@ class ReceiverChain:
             normal = random.standard_normal((*volts.shape[:-1], volts.shape[-1] + weights.size - 1))
             volts += deviation * filtered(normal, weights)
         return self.readout(bin_width_ns).read(volts)
-
-
-# A gain of 5 and six of 4 give an excess noise of 1.27; photomultipliers have 1.2 to 1.3 (Hamamatsu, questions and
-# answers on avalanche photodiodes). Quantum efficiency of a multialkali cathode at 532 nm, dark current and the largest
-# linear current in pulses are typical.
-_TUBE = LinearDetector.photomultiplier(
-    0.15, (5.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0), dark_current_na=1e-5, largest_current_ma=50.0
-)
-_LOAD = Amplifier(500.0, noise_pa_per_rthz=40.0, load_ohm=50.0, bandwidth_mhz=350.0)
-
-#: Typical chains for 532 nm. Numbers that the `source` does not cover are typical values.
-RECEIVERS = MappingProxyType(
-    {
-        "ideal": ReceiverChain(LinearDetector(1.0), source="one electron per photon, without other noise"),
-        "photodiode": ReceiverChain(
-            LinearDetector(0.7, leakage_current_na=1.0),
-            Amplifier(20e3, noise_pa_per_rthz=3.0, bandwidth_mhz=200.0),
-            digitiser=Digitiser(12, 1.0, -0.1),
-            source="typical silicon PIN photodiode with a transimpedance amplifier",
-        ),
-        "pmt": ReceiverChain(
-            _TUBE,
-            _LOAD,
-            digitiser=Digitiser(10, 1.0, -0.05, sampling_ghz=1.0),
-            source="typical photomultiplier; 10 bits at 1 GHz as in CZMIL (Proposed lidar receiver architecture, 2010)",
-        ),
-        "pmt_log": ReceiverChain(
-            _TUBE,
-            _LOAD,
-            LogAmplifier(0.25, 1e-3),
-            Digitiser(10, 1.2, -0.2, sampling_ghz=1.0),
-            source="typical photomultiplier; logarithm and 10 bits at 1 GHz as in CZMIL (Proposed lidar receiver "
-            "architecture, 2010)",
-        ),
-        "apd": ReceiverChain(
-            # 15 nA in all, and a noise of 0.23 pA per root Hz, as in the data sheet.
-            LinearDetector.avalanche(0.6, 150.0, 0.02, dark_current_na=1.35e-3, leakage_current_na=14.8),
-            Amplifier(10e3, noise_pa_per_rthz=3.0, bandwidth_mhz=200.0),
-            digitiser=Digitiser(12, 1.0, -0.1),
-            source="Excelitas C30902EH at its gain of 150: dark current and noise of the data sheet; typical quantum "
-            "efficiency and amplifier",
-        ),
-        "sipm": ReceiverChain(
-            SiliconPhotomultiplier(0.33, 3600, 50.0, 0.087, 5.07e5, 1.7e6, 0.05),
-            Amplifier(50.0, noise_pa_per_rthz=20.0, load_ohm=50.0, bandwidth_mhz=50.0),
-            digitiser=Digitiser(12, 4.0, -0.2),
-            source="Hamamatsu S13360-3050CS: cells; crosstalk, dark counts of Li and Smoot (2019), arXiv:1908.10547",
-        ),
-        "spad": ReceiverChain(
-            SinglePhotonDetector(0.5, 30.0, 100.0),
-            source="typical counting module with the dead time of 30 ns of EG&G SPCM-AQ",
-        ),
-        "spad_array": ReceiverChain(
-            SinglePhotonDetector(0.15, 3.2, 1600.0, channels=16),
-            source="typical photomultiplier that counts photons in 16 channels, each dead for 3.2 ns, as behind a "
-            "strong beam of ATLAS",
-        ),
-    }
-)
