@@ -24,6 +24,9 @@ from mitransient_lidar.core.validation import (
     relative_error,
 )
 
+#: Annotations as texts that may have an `Option`.
+_MAY_HAVE = re.compile(r"\w+$|Annotated\[")
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -149,10 +152,12 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
     """Return types and `Option` of those parameters of a function, or fields of a class, that have one."""
     found: dict[str, tuple[Any, Option]] = {}
     hinted: Any = inspect.unwrap(function)
-    if not isinstance(function, type):  # whose type of the result may be known to checkers alone
-        annotations = {name: one for name, one in hinted.__annotations__.items() if name != "return"}
-        hinted = types.SimpleNamespace(__annotations__=annotations, __globals__=hinted.__globals__)
-    for name, hint in get_type_hints(hinted, include_extras=True).items():
+    if isinstance(function, type):
+        hints = get_type_hints(function, include_extras=True)
+    else:  # other types are not evaluated: checkers alone may know them, and help does without xarray
+        given = {name: str(text) for name, text in hinted.__annotations__.items() if name != "return"}
+        hints = {name: eval(text, hinted.__globals__) for name, text in given.items() if _MAY_HAVE.match(text)}
+    for name, hint in hints.items():
         if get_origin(hint) is Annotated:
             kind, *others = get_args(hint)
             found.update((name, (kind, one)) for one in others if isinstance(one, Option))

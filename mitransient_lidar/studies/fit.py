@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,7 +51,7 @@ _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of th
 def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
-        str | os.PathLike[str] | Callable[[Mapping[str, float]], xr.Dataset] | None,
+        str | os.PathLike[str] | Model | None,
         Option("Name or XML file of the scene; by default that of the result"),
     ] = None,
     free: Annotated[
