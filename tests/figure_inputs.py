@@ -17,7 +17,6 @@ from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plots.campaigns import plot_campaign
 from mitransient_lidar.plots.comparison import plot_comparison
 from mitransient_lidar.plots.derivatives import plot_derivatives
-from mitransient_lidar.plots.flights import plot_axes_and_angles
 from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
@@ -314,5 +313,4 @@ FIGURES = {
     "pure sea water": lambda: plot_phase_function(water_phase_function, "this", "water"),
     "profile": lambda: plot_profile(profile(), profile().layers(0.1), "station"),
     "profile of backscattering": lambda: plot_profile(profile(VARYING), profile(VARYING).layers(0.02), "station"),
-    "axes of flights": lambda: plot_axes_and_angles(None),
 }
