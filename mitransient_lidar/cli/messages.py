@@ -191,7 +191,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
             def show(state: Progress) -> None:
                 expected = state.planned or (None if state.needed_passes is None else state.done + state.needed_passes)
-                text = printable(progress_line(state))
+                text = printable(str(state))
                 bar.update(task, description=text, completed=state.done, total=expected)
 
             yield show
@@ -208,7 +208,7 @@ def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
 
     def report() -> None:
         while not finished.wait(_REPORT_S):
-            text = progress_line(latest[-1]) if latest else "preparing"
+            text = str(latest[-1]) if latest else "preparing"
             typer.echo(f"{text}, {time.monotonic() - began:.0f} s so far", err=True)
 
     thread = threading.Thread(target=report, daemon=True)
@@ -218,26 +218,6 @@ def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
     finally:
         finished.set()
         thread.join()
-
-
-def progress_line(state: Progress) -> str:
-    """Describe the progress in one line."""
-    from mitransient_lidar.rendering.passes import describe_quantile
-
-    planned = f"/{state.planned}" if state.planned is not None else ""
-    parts = [f"{state.unit} {state.done}{planned}"]
-    if state.failed:
-        parts.append(f"{state.failed} failed")
-    if state.rate is not None:
-        parts.append(f"{state.rate:.3g} a second")
-    if state.error is not None:
-        parts.append(f"{describe_quantile(state.target_quantile, state.errors_of)} within {100 * state.error:.3g} %")
-    if state.target_error is not None:
-        needed = "" if state.needed_s is None else f" in {state.needed_passes} more passes, {state.needed_s:.0f} s"
-        parts.append(f"target {100 * state.target_error:.3g} %{needed}")
-    if state.remaining_s is not None and state.remaining_s != state.needed_s:
-        parts.append(f"ends in {state.remaining_s:.0f} s")
-    return ", ".join(parts)
 
 
 def summarise(dataset: xr.Dataset) -> None:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args,
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.progress import progress_of
 from mitransient_lidar.core.validation import (
     FloatArray,
     in_range,
@@ -167,6 +168,8 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that checks its arguments by the `Option` of their annotations; None may stay where allowed.
 
+    A notebook shows the progress of a function that has the parameter ``progress``, unless one is given.
+
     Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
     Python.
 
@@ -184,7 +187,10 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
             if name in options and not is_unset(value, signature.parameters[name].default):
                 kind, option = options[name]
                 given.arguments[name] = option.check(name, value, kind)
-        return function(*given.args, **given.kwargs)
+        if "progress" not in signature.parameters:
+            return function(*given.args, **given.kwargs)
+        with progress_of(given.arguments.get("progress")) as given.arguments["progress"]:
+            return function(*given.args, **given.kwargs)
 
     shown = [
         one.replace(annotation=options[name][0]) if name in options else one
