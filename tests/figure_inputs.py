@@ -266,13 +266,13 @@ def compared(pixels):
 
 #: A triangle, and a square with a hole.
 OUTLINES = json.dumps([[[1, 2, 3, 2, 3, 4]], [[-4, -4, -4, 4, 0, 4, 0, -4], [-3, -1, -1, -1, -1, 1, -3, 1]]])
-TARGET = json.dumps([{"z": [-6.0, -6.0], "line": [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]}])
+SQUARE = [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]
+TARGET = json.dumps([{"z": [-6.0, -6.0], "line": SQUARE, "seen": [one - 0.5 for one in SQUARE]}])
 VARYING = (0.005, 0.02, 0.01, 0.04)
 
 FIGURES = {
     "waveforms": lambda: plot_waveforms(result()),
     "waveforms, linear": lambda: plot_waveforms(result(), scale="linear"),
-    "waveforms of strips": lambda: plot_waveforms(result(layout="1x4")),
     "waveforms of outlines": lambda: plot_waveforms(result(2, layout="", pixel_outlines=OUTLINES)),
     "waveforms of dots": lambda: plot_waveforms(result(3, layout="")),
     "waveforms of an image": lambda: plot_waveforms(result(6, (2, 3))),
