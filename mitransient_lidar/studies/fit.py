@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -34,6 +34,9 @@ from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import MOST_PASSES
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 logger = logging.getLogger(__name__)
 
@@ -351,11 +354,8 @@ def describe_fit(fitted: xr.Dataset) -> list[str]:
     return [*lines, text, f"{chi['renders']} renders", *chi["messages"]]
 
 
-def table_rows(fitted: xr.Dataset) -> tuple[Sequence[str], list[list[object]]]:
-    """Return the columns and rows of a table of the parameters of a fit, as for a CSV file."""
-    columns = ("value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
-    rows: list[list[object]] = []
-    for name in fitted["parameter"].values:
-        one = fitted.sel(parameter=name)
-        rows.append([str(name), one["parameter_units"].item(), *(one[column].item() for column in columns)])
-    return ("parameter", "unit", *columns), rows
+def parameter_frame(fitted: xr.Dataset) -> pd.DataFrame:
+    """Return the table of the parameters of a fit, as for a CSV file."""
+    columns = ("parameter_units", "value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
+    frame = fitted.reset_coords()[[*columns]].to_dataframe().reset_index()[["parameter", *columns]]
+    return frame.rename(columns={"parameter_units": "unit"})

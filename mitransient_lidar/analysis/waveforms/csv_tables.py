@@ -1,18 +1,19 @@
-"""Tables of echoes as flat rows, as printed lines, and as CSV files."""
+"""Tables of echoes as frames of pandas, as printed lines, and as CSV files."""
 
 from __future__ import annotations
 
-import csv
 import math
 import os
-from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.tables import write_csv
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Most lines of a printed table, and most waveforms whose layers are printed.
 _MOST_LINES, _MOST_WAVEFORMS = 200, 16
@@ -36,8 +37,8 @@ def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
     return "no surface echo" if not has_surface else "signal below its own level"
 
 
-def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
-    """Return column names and rows of a table of `echo_table.extract`, one row per waveform, estimator and echo.
+def echo_frame(table: xr.Dataset) -> pd.DataFrame:
+    """Return a table of `echo_table.extract` with one row per waveform, estimator and echo.
 
     The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
     quantities of the echo, ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
@@ -49,42 +50,19 @@ def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
     extra = sorted(known, key=lambda name: not name.startswith("angle_"))
     numbers = [name + suffix for name in NUMBERS for suffix in ("", "_stderr")]
     numbers.insert(numbers.index("depth_m_stderr") + 1, "depth_m_method_error")
-    columns = [
-        *extra,
-        *numbers,
-        "flags",
-        "unknown_depth",
-        *(name for name in ("attenuation", "attenuation_stderr") if name in table),
-    ]
-    kept = [name for name in (*columns, "surface_time_ns") if name in table]
-    wide = {name: table[name].broadcast_like(table["time_ns"]).transpose(*dims).values for name in kept}
-
-    def lines() -> Iterator[list[Any]]:
-        for place in np.ndindex(*(table.sizes[dim] for dim in dims)):
-            labels = [table[dim].values[index] for dim, index in zip(dims, place, strict=True)]
-            cells: dict[str, Any] = {name: float(values[place]) for name, values in wide.items()}
-            flags, surface = int(cells["flags"]), cells.get("surface_time_ns", math.nan)
-            reason = unknown_depth(str(labels[-1]), flags, math.isfinite(surface))
-            cells |= {"flags": flag_names(flags), "unknown_depth": reason if math.isnan(cells["depth_m"]) else ""}
-            yield [*labels, *(cells[name] for name in columns)]
-
-    return [*dims, *columns], lines()
+    attenuation = [name for name in ("attenuation", "attenuation_stderr") if name in table]
+    surface = [name for name in ("surface_time_ns",) if name in table]
+    frame = table[[*extra, *numbers, "flags", *attenuation, *surface]].to_dataframe(dims).reset_index()
+    has_surface = np.isfinite(frame.get("surface_time_ns", math.nan * frame["flags"]))
+    reasons = map(unknown_depth, frame["echo"], frame["flags"], has_surface)
+    frame["unknown_depth"] = np.where(frame["depth_m"].isna(), [*reasons], "")
+    frame["flags"] = frame["flags"].map(flag_names)
+    return frame[[*dims, *extra, *numbers, "flags", "unknown_depth", *attenuation]]
 
 
 def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write or replace a CSV file of a table of `echo_table.extract`, with empty cells for unknown values."""
-    names, lines = rows(table)
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows([_cell(value) for value in line] for line in lines)
-
-
-def _cell(value: Any) -> Any:
-    """Return a float with nine digits, empty for NaN; other values unchanged."""
-    if not isinstance(value, float):
-        return value
-    return "" if math.isnan(value) else f"{value:.9g}"
+    write_csv(echo_frame(table), path, digits=9)
 
 
 def describe_echoes(found: xr.Dataset) -> list[str]:
@@ -92,7 +70,8 @@ def describe_echoes(found: xr.Dataset) -> list[str]:
     from rich.console import Console
     from rich.table import Table
 
-    names, lines = rows(found)
+    frame = echo_frame(found)
+    names = [*frame]
     labels = [name for name in names[: names.index("echo") + 1] if name != "estimator" or found.sizes["estimator"] > 1]
     unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
     heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
@@ -105,8 +84,7 @@ def describe_echoes(found: xr.Dataset) -> list[str]:
     table.add_column("flags")
     table.add_column("depth unknown")
     left_out = 0
-    for line in lines:
-        cells = dict(zip(names, line, strict=True))
+    for cells in frame.to_dict("records"):
         # Of missing echoes, only surface and bottom are listed.
         if "no_echo" in cells["flags"] and cells["echo"] not in ("surface", "bottom"):
             continue
