@@ -20,17 +20,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def check_writable(folder: Path, targets: list[Path], option: str = "-o") -> None:
-    """Check that files can be written into a folder, without creating it, and replace none that must be kept.
+def check_targets(folder: Path, targets: list[Path], source: str = "", option: str = "-o") -> None:
+    """Check that files can be written into a folder, without creating it, and that none must be kept.
 
-    `option` chooses another place.
+    None may be the result `source`, which is rendered again; `option` chooses another place.
     """
-    _check_places(folder, targets)
-    check_kept(targets, option)
-
-
-def _check_places(folder: Path, targets: list[Path]) -> None:
-    """Check that files can be written into a folder, without creating it."""
     for path in (folder, *targets):
         check_encodable(path)
     existing = folder
@@ -44,6 +38,9 @@ def _check_places(folder: Path, targets: list[Path]) -> None:
     for target in targets:
         if target.is_dir():
             raise UserError(f"cannot write {target}: it is a folder.")
+        if source and target.exists() and Path(source).exists() and target.samefile(source):
+            raise UserError(f"{source} would be overwritten with its repetition: choose another place with -o")
+    check_kept(targets, option)
 
 
 def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
@@ -61,15 +58,6 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
     return source.name, source.text, attributes
 
 
-def check_targets(output: Path, targets: list[Path], scene: str) -> None:
-    """Check that files can be written, and that none of them is kept or the result that is rendered again."""
-    _check_places(output, targets)
-    for target in targets:
-        if target.exists() and Path(scene).exists() and target.samefile(scene):
-            raise UserError(f"{scene} would be overwritten with its repetition: choose another place with -o")
-    check_kept(targets)
-
-
 def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
     """Check that a figure can be written, and files of its data beside it, of other suffixes."""
     if path is None:
@@ -77,14 +65,14 @@ def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
     from mitransient_lidar.plots.drawing import check_format
 
     check_format(path)
-    check_writable(path.parent, [path, *map(path.with_suffix, suffixes)], option)
+    check_targets(path.parent, [path, *map(path.with_suffix, suffixes)], option=option)
 
 
 def check_suffix(option: str, path: Path, suffix: str) -> None:
     """Check that a file can be written and that its name ends with a suffix."""
     if path.suffix.lower() != suffix:
         raise UserError(f"{option} {path} must end in {suffix}.")
-    check_writable(path.parent, [path], "-o" if option == "--output" else option)
+    check_targets(path.parent, [path], option="-o" if option == "--output" else option)
 
 
 @contextlib.contextmanager
@@ -129,7 +117,7 @@ class GateFiles:
         """Check that the files can be written."""
         numbered = f"{glob.escape(self.stem)}_gate[0-9]*.exr"
         sequence = sorted(self.folder.glob(numbered)) if "sequence" in self.wanted else []
-        check_writable(self.folder, [*self.names(), *sequence])
+        check_targets(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
         """Return the paths of the files, without those of a sequence."""
