@@ -93,6 +93,10 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
         save(dataset, path)
 
 
+#: Largest size of a page [MB].
+PAGE_MB = 200.0
+
+
 @dataclass(frozen=True)
 class GateFiles:
     """Files of a gate stack in a folder, with the beginning of their names.
@@ -128,8 +132,8 @@ class GateFiles:
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
         """Write the files and print their paths; `result` provides the waveforms of the page."""
         from mitransient_lidar import results
-        from mitransient_lidar.plots.gate_viewer import page as gate_page
         from mitransient_lidar.plots.gates import images
+        from mitransient_lidar.plots.viewer import view
         from mitransient_lidar.results import exr
         from mitransient_lidar.results.gate_stack import check_stack
 
@@ -142,7 +146,8 @@ class GateFiles:
                 if path.suffix == ".exr":
                     results.save(check_stack(stack), path)
                 elif path.suffix == ".html":
-                    gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
+                    record = result if result is not None and "waveform" in result else None
+                    view(stack, record, limit_mb=PAGE_MB).save(path)
                 elif path.suffix != ".png":
                     images.animate_gates(stack, path)
                 elif path.name.endswith("_gates.png"):
