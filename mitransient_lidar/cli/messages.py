@@ -14,6 +14,7 @@ import typer
 
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
+from mitransient_lidar.core.tables import aligned_lines
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -222,14 +223,12 @@ def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
 
 def summarise(dataset: xr.Dataset) -> None:
     """Print passes, time, error and the peak power of each pixel on stderr."""
-    from rich.table import Table
-
-    table = Table.grid(padding=(0, 2))
+    rows: list[tuple[str, str]] = []
 
     def add(name: str, key: str, form: str, scale: float = 1.0) -> None:
         value: Any = dataset.attrs.get(key)
         if isinstance(value, (int, float)):
-            table.add_row(name, format(scale * value, form))
+            rows.append((name, format(scale * value, form)))
 
     add("passes", "passes", ".0f")
     add("time (s)", "elapsed_s", ".2f")
@@ -239,16 +238,16 @@ def summarise(dataset: xr.Dataset) -> None:
     if dataset.attrs.get("target_quantile") not in (None, 0.95):
         add(f"{100 * dataset.attrs['target_quantile']:g}th percentile error (%)", "error_at_quantile", ".3g", 100.0)
     if "waveform" not in dataset:
-        table.add_row("gates", str(dataset.sizes["gate"]))
-        table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")
+        rows.append(("gates", str(dataset.sizes["gate"])))
+        rows.append(("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}"))
     else:
         peaks = dataset["waveform"].max("time")
         if "pixel" in peaks.dims and peaks.size <= _MOST_PIXELS:
-            for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):
-                table.add_row(printable(f"peak power, {name} (W)"), f"{peak:.4g}")
+            named = zip(peaks["pixel"].values, peaks.values, strict=True)
+            rows += [(printable(f"peak power, {name} (W)"), f"{peak:.4g}") for name, peak in named]
         else:
-            table.add_row("highest peak power (W)", f"{float(peaks.max()):.4g}")
-    _console().print(table, markup=False)
+            rows.append(("highest peak power (W)", f"{float(peaks.max()):.4g}"))
+    typer.echo("\n".join(aligned_lines(rows)), err=True)
 
 
 def _console() -> Console:

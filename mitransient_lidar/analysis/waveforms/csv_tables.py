@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.tables import write_csv
+from mitransient_lidar.core.tables import aligned_lines, write_csv
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,41 +67,22 @@ def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 def describe_echoes(found: xr.Dataset) -> list[str]:
     """Return the lines of a table of the echoes, and the properties of the columns."""
-    from rich.console import Console
-    from rich.table import Table
-
     frame = echo_frame(found)
-    names = [*frame]
-    labels = [name for name in names[: names.index("echo") + 1] if name != "estimator" or found.sizes["estimator"] > 1]
+    # Of missing echoes, only surface and bottom are listed; the printed error of a depth includes that of the method.
+    frame = frame[~frame["flags"].str.contains("no_echo") | frame["echo"].isin(["surface", "bottom"])]
+    frame["depth_m_stderr"] = np.hypot(frame["depth_m_stderr"], frame["depth_m_method_error"])
+    names = [str(dim) for dim in found["time_ns"].dims]
+    labels = [name for name in names if name != "estimator" or found.sizes["estimator"] > 1]
     unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
     heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
     heads |= {name: f"{name} ({of})" if of else name for name, of in unit.items()}
-    table = Table(box=None, padding=(0, 1), header_style=None)
-    for name in labels:
-        table.add_column(name)
-    for name in NUMBERS:
-        table.add_column(heads[name], justify="right")
-    table.add_column("flags")
-    table.add_column("depth unknown")
-    left_out = 0
-    for cells in frame.to_dict("records"):
-        # Of missing echoes, only surface and bottom are listed.
-        if "no_echo" in cells["flags"] and cells["echo"] not in ("surface", "bottom"):
-            continue
-        if table.row_count >= _MOST_LINES:
-            left_out += 1
-            continue
-        # The printed error of a depth includes that of the method.
-        cells["depth_m_stderr"] = math.hypot(cells["depth_m_stderr"], cells["depth_m_method_error"])
+    rows = [[*labels, *(heads[name] for name in NUMBERS), "flags", "depth unknown"]]
+    for cells in frame[:_MOST_LINES].to_dict("records"):
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in NUMBERS]
-        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"])
-    # A fixed width keeps the lines unfolded.
-    console = Console(highlight=False, width=240, markup=False)
-    with console.capture() as printed:
-        console.print(table)
-    listed = printed.get().splitlines()
-    if left_out:
-        listed.append(f"{left_out} more lines: write them all with --csv OUT.")
+        rows.append([*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"]])
+    listed = aligned_lines(rows, right=range(len(labels), len(labels) + len(NUMBERS)))
+    if len(frame) > _MOST_LINES:
+        listed.append(f"{len(frame) - _MOST_LINES} more lines: write them all with --csv OUT.")
     return listed + _columns(found)
 
 
