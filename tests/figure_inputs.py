@@ -267,7 +267,7 @@ def compared(pixels):
 #: A triangle, and a square with a hole.
 OUTLINES = json.dumps([[[1, 2, 3, 2, 3, 4]], [[-4, -4, -4, 4, 0, 4, 0, -4], [-3, -1, -1, -1, -1, 1, -3, 1]]])
 SQUARE = [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]
-TARGET = json.dumps([{"z": [-6.0, -6.0], "line": SQUARE, "seen": [one - 0.5 for one in SQUARE]}])
+TARGET = json.dumps([{"z": [-6.0, -6.0], "line": SQUARE, "seen": [0.4 * one for one in SQUARE]}])
 VARYING = (0.005, 0.02, 0.01, 0.04)
 
 FIGURES = {

@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import Patch
 from matplotlib.path import Path as Line
 from matplotlib.patheffects import withStroke
 
@@ -281,9 +281,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[A
         loops = [ground.project(ground.receiver, _points(line)) for line in lines]
         loops = [loop for loop in loops if np.isfinite(loop).all()]
         if loops:
-            # One patch of all lines keeps holes open.
-            shape = Line.make_compound_path(*(Line(loop, closed=True) for loop in loops))
-            ax.add_patch(PathPatch(shape, facecolor=fill, edgecolor=edge, linewidth=1.3))
+            ax.add_patch(drawing.outline_patch(loops, facecolor=fill, edgecolor=edge, linewidth=1.3))
             drawn += loops
     return np.concatenate(drawn)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, PathPatch
-from matplotlib.path import Path as Line
+from matplotlib.patches import Patch
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -209,35 +208,21 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
         )
         legend.set_in_layout(False)  # it fits into the space below the square axes
     ax.set_anchor("N")
-    angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
-    width = optional_number(attributes, "field_of_view_mrad")
-    outlines = json.loads(attributes.get("pixel_outlines", "[]"))
+    points = np.stack([dataset["angle_y"].values, dataset["angle_x"].values], axis=-1)
+    outlines = json.loads(attributes.get("pixel_outlines", "[]"))  # lines angle_x, angle_y, ... of each [mrad]
     if len(outlines) == len(names) and all(outlines):
-        _draw_outlines(ax, outlines, colours, width)
+        shapes = [[np.reshape([*line, *line[:2]], (-1, 2))[:, ::-1] for line in lines] for lines in outlines]
+        for loops, colour in zip(shapes, colours, strict=True):
+            ax.add_patch(drawing.outline_patch(loops, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
+        points = np.concatenate([loop for loops in shapes for loop in loops])
+    elif len(names) > 1:  # of another program, or too many for the attributes of a result
+        ax.scatter(points[:, 0], points[:, 1], c=colours, s=24)
+    else:
         return
-    # Results keep no outlines of more pixels than their attributes have room for.
-    if len(names) > 1:
-        ax.scatter(angle_y, angle_x, c=colours, s=24)
-        ax.set_aspect("equal", "datalim")
-        ax.invert_xaxis()
-
-
-def _draw_outlines(ax: Axes, outlines: list[list[list[float]]], colours: list[Any], width: float | None) -> None:
-    """Draw the pixels in the shapes of their outlines, lines angle_x, angle_y, ... of each [mrad]."""
-    corners = []
-    for lines, colour in zip(outlines, colours, strict=True):
-        # One patch of all lines keeps holes open; the first point again closes a line.
-        loops = [np.reshape(line, (-1, 2))[:, ::-1] for line in lines]
-        shape = Line.make_compound_path(*(Line(np.vstack([loop, loop[:1]]), closed=True) for loop in loops))
-        ax.add_patch(PathPatch(shape, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
-        corners += loops
-    low, high = (
-        np.min([loop.min(axis=0) for loop in corners], axis=0),
-        np.max([one.max(axis=0) for one in corners], axis=0),
-    )
-    middle, edge = (low + high) / 2, 0.56 * float((high - low).max())
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, edge = (low + high) / 2, 0.56 * (float((high - low).max()) or 1.0)
     ax.set(xlim=(middle[0] + edge, middle[0] - edge), ylim=(middle[1] - edge, middle[1] + edge), aspect="equal")
-    _name_edges(ax, width)
+    _name_edges(ax, optional_number(attributes, "field_of_view_mrad"))
 
 
 def _name_edges(ax: Axes, width: float | None) -> None:
