@@ -17,7 +17,6 @@ from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plots.campaigns import plot_campaign
 from mitransient_lidar.plots.comparison import plot_comparison
 from mitransient_lidar.plots.derivatives import plot_derivatives
-from mitransient_lidar.plots.flights import plot_axes_and_angles
 from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
@@ -264,13 +263,13 @@ def compared(pixels):
 
 #: A triangle, and a square with a hole.
 OUTLINES = json.dumps([[[1, 2, 3, 2, 3, 4]], [[-4, -4, -4, 4, 0, 4, 0, -4], [-3, -1, -1, -1, -1, 1, -3, 1]]])
-TARGET = json.dumps([{"z": [-6.0, -6.0], "line": [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]}])
+SQUARE = [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]
+TARGET = json.dumps([{"z": [-6.0, -6.0], "line": SQUARE, "seen": [0.4 * one for one in SQUARE]}])
 VARYING = (0.005, 0.02, 0.01, 0.04)
 
 FIGURES = {
     "waveforms": lambda: plot_waveforms(result()),
     "waveforms, linear": lambda: plot_waveforms(result(), scale="linear"),
-    "waveforms of strips": lambda: plot_waveforms(result(layout="1x4")),
     "waveforms of outlines": lambda: plot_waveforms(result(2, layout="", pixel_outlines=OUTLINES)),
     "waveforms of dots": lambda: plot_waveforms(result(3, layout="")),
     "waveforms of an image": lambda: plot_waveforms(result(6, (2, 3))),
@@ -311,5 +310,4 @@ FIGURES = {
     "pure sea water": lambda: plot_phase_function(water_phase_function, "this", "water"),
     "profile": lambda: plot_profile(profile(), profile().layers(0.1), "station"),
     "profile of backscattering": lambda: plot_profile(profile(VARYING), profile(VARYING).layers(0.02), "station"),
-    "axes of flights": lambda: plot_axes_and_angles(None),
 }

@@ -259,8 +259,8 @@ FAULTS = (
     ),
     Fault(
         *("five_digits_in_tables", f"{_A}/waveforms/csv_tables.py"),
-        "{value:.9g}",
-        "{value:.5g}",
+        "path, digits=9)",
+        "path, digits=5)",
         near=f"{_UNIT}/analysis/waveforms",
     ),
     Fault(

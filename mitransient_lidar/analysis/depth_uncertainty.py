@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.tables import write_csv
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative
 from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
 from mitransient_lidar.results.geometry import required_number
@@ -237,13 +236,10 @@ def write_fits(found: xr.Dataset, part: str, path: str | os.PathLike[str]) -> No
         CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation; rows
         by wind [m/s] and then by water, nan where there is no fit.
     """
-    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("Wind", "JerlovType", "a", "b"))
-        for wind in found["wind_speed"].values:
-            for water in found["water"].values:
-                cell = found.sel(wind_speed=wind, water=water)
-                rows.writerow((f"{wind:g}", water, *(f"{float(cell[f'{part}_{name}']):.6g}" for name in "ab")))
+    fits = {f"{part}_{name}": name for name in "ab"}
+    frame = found[[*fits]].to_dataframe(["wind_speed", "water"]).reset_index()
+    frame = frame.rename(columns={"wind_speed": "Wind", "water": "JerlovType", **fits})
+    write_csv(frame[["Wind", "JerlovType", "a", "b"]], path, digits=6, unknown="nan")
 
 
 def _subaqueous_horizontal(table: xr.Dataset, attributes: Any) -> xr.DataArray:

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,9 @@ from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverC
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.variables import label
+
+#: A power, or those of pixels.
+Powers = Union[npt.ArrayLike, "xr.DataArray"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,7 +43,7 @@ def detect_waveforms(
     shots: Annotated[int, Option("Number of records of each waveform with independent noise", 1, 10**9)] = 1,
     seed: Seed = 0,
     background_power: Annotated[
-        npt.ArrayLike | xr.DataArray,
+        Powers,
         Option("Power of the daylight on each pixel (at least 0) [W]", flag="--background-power-w"),
     ] = 0.0,
     *,

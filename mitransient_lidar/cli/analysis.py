@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +12,8 @@ from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
 from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.tables import write_csv
 
 _REFUSED = 1  # exit code of a fit that is refused
 
@@ -149,11 +148,9 @@ def _fit(
     with DeferredInterrupt(at_once=False):
         fitted = call(file)
         output.mkdir(parents=True, exist_ok=True)
-        heading, rows = study.table_rows(fitted)
         with announced():
             write_netcdf(fitted, targets[0])
-            with replacing(targets[1]) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-                csv.writer(stream).writerows([heading, *rows])
+            write_csv(study.parameter_frame(fitted), targets[1], unknown="nan")
             plot_fit(fitted, targets[2])
     typer.echo("\n".join(study.describe_fit(fitted)))
     exit_if_interrupted(fitted)

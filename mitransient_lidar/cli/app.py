@@ -8,12 +8,13 @@ stderr. Commands import what they need when they run, so that help appears at on
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import signal
 import sys
 import warnings
 from collections.abc import Iterator
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Annotated, Any
 
 import typer
@@ -179,7 +180,18 @@ def _run() -> None:
         # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it. An
         # xarray that a script has imported before remembers where Dask is, and goes on with it.
         sys.modules["dask"] = None  # type: ignore[assignment]
+    if {"-h", "--help"} & {*sys.argv} and "xarray" not in sys.modules:
+        sys.modules["xarray"] = _Late("xarray")
     app(prog_name="mitransient-lidar")
+
+
+class _Late(ModuleType):
+    """A module that is imported when something of it is needed: help needs signatures alone."""
+
+    def __getattr__(self, name: str) -> Any:
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+        return getattr(importlib.import_module(self.__name__), name)
 
 
 def _end_at_once(number: int, _frame: FrameType | None) -> None:

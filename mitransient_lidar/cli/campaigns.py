@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_writable
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
 from mitransient_lidar.cli.options import OUTPUT, Quiet
@@ -55,7 +55,7 @@ def _campaign(
         kept = {name: call.arguments[name] for name in ("workers", "scheduler", "retry_failed")}
         replace(call, function=campaigns.resume, arguments=kept)(store)
     else:
-        check_writable(store.parent, [])
+        check_targets(store.parent, [])
         call(store=store)
     typer.echo(store)
     if not quiet:
@@ -109,7 +109,7 @@ def _fly(
     files = [*written, folder / "flight.png", folder / "profile.png"]
     if (folder / STORE).is_dir():  # which goes on only if it is of this flight
         replace_freely(path for path in files if _is_of_a_flight(path))
-    check_writable(folder, files)
+    check_targets(folder, files)
     points = call(folder=folder)
     for path in (*written, *plot_flight(Flown.of(Store(folder / STORE)), points, folder)):
         typer.echo(path)
@@ -134,7 +134,7 @@ def _figures(
     from mitransient_lidar.studies.publication.statements import describe_statements
 
     chosen = publication.check_names(call.arguments["names"])
-    check_writable(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
+    check_targets(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
     made = call(names=chosen, output=output)
     for path in made.files:
         typer.echo(path)

@@ -20,17 +20,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def check_writable(folder: Path, targets: list[Path], option: str = "-o") -> None:
-    """Check that files can be written into a folder, without creating it, and replace none that must be kept.
+def check_targets(folder: Path, targets: list[Path], source: str = "", option: str = "-o") -> None:
+    """Check that files can be written into a folder, without creating it, and that none must be kept.
 
-    `option` chooses another place.
+    None may be the result `source`, which is rendered again; `option` chooses another place.
     """
-    _check_places(folder, targets)
-    check_kept(targets, option)
-
-
-def _check_places(folder: Path, targets: list[Path]) -> None:
-    """Check that files can be written into a folder, without creating it."""
     for path in (folder, *targets):
         check_encodable(path)
     existing = folder
@@ -44,6 +38,9 @@ def _check_places(folder: Path, targets: list[Path]) -> None:
     for target in targets:
         if target.is_dir():
             raise UserError(f"cannot write {target}: it is a folder.")
+        if source and target.exists() and Path(source).exists() and target.samefile(source):
+            raise UserError(f"{source} would be overwritten with its repetition: choose another place with -o")
+    check_kept(targets, option)
 
 
 def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
@@ -61,15 +58,6 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
     return source.name, source.text, attributes
 
 
-def check_targets(output: Path, targets: list[Path], scene: str) -> None:
-    """Check that files can be written, and that none of them is kept or the result that is rendered again."""
-    _check_places(output, targets)
-    for target in targets:
-        if target.exists() and Path(scene).exists() and target.samefile(scene):
-            raise UserError(f"{scene} would be overwritten with its repetition: choose another place with -o")
-    check_kept(targets)
-
-
 def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
     """Check that a figure can be written, and files of its data beside it, of other suffixes."""
     if path is None:
@@ -77,14 +65,14 @@ def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
     from mitransient_lidar.plots.drawing import check_format
 
     check_format(path)
-    check_writable(path.parent, [path, *map(path.with_suffix, suffixes)], option)
+    check_targets(path.parent, [path, *map(path.with_suffix, suffixes)], option=option)
 
 
 def check_suffix(option: str, path: Path, suffix: str) -> None:
     """Check that a file can be written and that its name ends with a suffix."""
     if path.suffix.lower() != suffix:
         raise UserError(f"{option} {path} must end in {suffix}.")
-    check_writable(path.parent, [path], "-o" if option == "--output" else option)
+    check_targets(path.parent, [path], option="-o" if option == "--output" else option)
 
 
 @contextlib.contextmanager
@@ -103,6 +91,10 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced():
         save(dataset, path)
+
+
+#: Largest size of a page [MB].
+PAGE_MB = 200.0
 
 
 @dataclass(frozen=True)
@@ -129,7 +121,7 @@ class GateFiles:
         """Check that the files can be written."""
         numbered = f"{glob.escape(self.stem)}_gate[0-9]*.exr"
         sequence = sorted(self.folder.glob(numbered)) if "sequence" in self.wanted else []
-        check_writable(self.folder, [*self.names(), *sequence])
+        check_targets(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
         """Return the paths of the files, without those of a sequence."""
@@ -140,8 +132,8 @@ class GateFiles:
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
         """Write the files and print their paths; `result` provides the waveforms of the page."""
         from mitransient_lidar import results
-        from mitransient_lidar.plots.gate_viewer import page as gate_page
         from mitransient_lidar.plots.gates import images
+        from mitransient_lidar.plots.viewer import view
         from mitransient_lidar.results import exr
         from mitransient_lidar.results.gate_stack import check_stack
 
@@ -154,7 +146,8 @@ class GateFiles:
                 if path.suffix == ".exr":
                     results.save(check_stack(stack), path)
                 elif path.suffix == ".html":
-                    gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
+                    record = result if result is not None and "waveform" in result else None
+                    view(stack, record, limit_mb=PAGE_MB).save(path)
                 elif path.suffix != ".png":
                     images.animate_gates(stack, path)
                 elif path.name.endswith("_gates.png"):

@@ -14,6 +14,7 @@ import typer
 
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
+from mitransient_lidar.core.tables import aligned_lines
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -191,7 +192,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
             def show(state: Progress) -> None:
                 expected = state.planned or (None if state.needed_passes is None else state.done + state.needed_passes)
-                text = printable(progress_line(state))
+                text = printable(str(state))
                 bar.update(task, description=text, completed=state.done, total=expected)
 
             yield show
@@ -208,7 +209,7 @@ def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
 
     def report() -> None:
         while not finished.wait(_REPORT_S):
-            text = progress_line(latest[-1]) if latest else "preparing"
+            text = str(latest[-1]) if latest else "preparing"
             typer.echo(f"{text}, {time.monotonic() - began:.0f} s so far", err=True)
 
     thread = threading.Thread(target=report, daemon=True)
@@ -220,36 +221,14 @@ def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
         thread.join()
 
 
-def progress_line(state: Progress) -> str:
-    """Describe the progress in one line."""
-    from mitransient_lidar.rendering.passes import describe_quantile
-
-    planned = f"/{state.planned}" if state.planned is not None else ""
-    parts = [f"{state.unit} {state.done}{planned}"]
-    if state.failed:
-        parts.append(f"{state.failed} failed")
-    if state.rate is not None:
-        parts.append(f"{state.rate:.3g} a second")
-    if state.error is not None:
-        parts.append(f"{describe_quantile(state.target_quantile, state.errors_of)} within {100 * state.error:.3g} %")
-    if state.target_error is not None:
-        needed = "" if state.needed_s is None else f" in {state.needed_passes} more passes, {state.needed_s:.0f} s"
-        parts.append(f"target {100 * state.target_error:.3g} %{needed}")
-    if state.remaining_s is not None and state.remaining_s != state.needed_s:
-        parts.append(f"ends in {state.remaining_s:.0f} s")
-    return ", ".join(parts)
-
-
 def summarise(dataset: xr.Dataset) -> None:
     """Print passes, time, error and the peak power of each pixel on stderr."""
-    from rich.table import Table
-
-    table = Table.grid(padding=(0, 2))
+    rows: list[tuple[str, str]] = []
 
     def add(name: str, key: str, form: str, scale: float = 1.0) -> None:
         value: Any = dataset.attrs.get(key)
         if isinstance(value, (int, float)):
-            table.add_row(name, format(scale * value, form))
+            rows.append((name, format(scale * value, form)))
 
     add("passes", "passes", ".0f")
     add("time (s)", "elapsed_s", ".2f")
@@ -259,16 +238,16 @@ def summarise(dataset: xr.Dataset) -> None:
     if dataset.attrs.get("target_quantile") not in (None, 0.95):
         add(f"{100 * dataset.attrs['target_quantile']:g}th percentile error (%)", "error_at_quantile", ".3g", 100.0)
     if "waveform" not in dataset:
-        table.add_row("gates", str(dataset.sizes["gate"]))
-        table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")
+        rows.append(("gates", str(dataset.sizes["gate"])))
+        rows.append(("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}"))
     else:
         peaks = dataset["waveform"].max("time")
         if "pixel" in peaks.dims and peaks.size <= _MOST_PIXELS:
-            for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):
-                table.add_row(printable(f"peak power, {name} (W)"), f"{peak:.4g}")
+            named = zip(peaks["pixel"].values, peaks.values, strict=True)
+            rows += [(printable(f"peak power, {name} (W)"), f"{peak:.4g}") for name, peak in named]
         else:
-            table.add_row("highest peak power (W)", f"{float(peaks.max()):.4g}")
-    _console().print(table, markup=False)
+            rows.append(("highest peak power (W)", f"{float(peaks.max()):.4g}"))
+    typer.echo("\n".join(aligned_lines(rows)), err=True)
 
 
 def _console() -> Console:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix
+from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix
 from mitransient_lidar.cli.generator import Command
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import DrawingOnly, Quiet
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _DIFFERENT = 1
-_PAGE_MB = 200.0
 
 
 def _view(
@@ -88,7 +87,7 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
 
     with reporting(quiet):
         dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates")
-        page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=_PAGE_MB)
+        page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
     with announced():

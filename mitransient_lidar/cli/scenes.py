@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -9,20 +10,23 @@ import typer
 
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.tables import aligned_lines
 
 _HEADING = "Scenes and system"
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
 
 
+def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
+    """Print rows of texts in columns."""
+    typer.echo("\n".join(aligned_lines(rows, right)))
+
+
 def list_scenes() -> None:
     """List the shipped scenes."""
     from mitransient_lidar.loading import catalogue
 
-    names = catalogue.scene_names()
-    width = max(map(len, names), default=0)
-    for name in names:
-        typer.echo(f"{name:{width}}  {catalogue.scene_summary(name)}".rstrip())
+    _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
 def _show(name: Name) -> None:
@@ -53,21 +57,16 @@ def _instruments(
     if name is None:
         if xml:
             raise UserError("--xml needs the name of an instrument")
-        names = shipped.instrument_names()
-        width = max(map(len, names), default=0)
-        for known in map(shipped.read_instrument, names):
-            count = len(known.channels)
-            typer.echo(f"{known.name:{width}}  {known.title}; {count} channel{'s' * (count > 1)}")
+        known = [shipped.read_instrument(each) for each in shipped.instrument_names()]
+        counts = [f"{len(one.channels)} channel{'s' * (len(one.channels) > 1)}" for one in known]
+        _print((one.name, f"{one.title}; {count}") for one, count in zip(known, counts, strict=True))
         return
     if xml:
         typer.echo(shipped.instrument_text(name), nl=False)
         return
-    known = shipped.read_instrument(name)
-    typer.echo(f"{known.title}\n\n{known.description}\n\nchannels: {', '.join(known.channels)}\n")
-    parameters = [parameter for parameter in known.parameters if parameter.value]
-    widths = [max(len(getattr(parameter, field)) for parameter in parameters) for field in ("name", "value")]
-    for parameter in parameters:
-        typer.echo(f"{parameter.name:{widths[0]}}  {parameter.value:>{widths[1]}}  {parameter.source}")
+    one = shipped.read_instrument(name)
+    typer.echo(f"{one.title}\n\n{one.description}\n\nchannels: {', '.join(one.channels)}\n")
+    _print(((each.name, each.value, each.source) for each in one.parameters if each.value), right=(1,))
     typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
 
 
@@ -83,9 +82,7 @@ def _info(
         from mitransient_lidar.rendering.again import describe_result
 
         facts = describe_result(file)
-    width = max(map(len, facts), default=0)
-    for name, value in facts.items():
-        typer.echo(f"{name:{width}}  {value}")
+    _print((name, str(value)) for name, value in facts.items())
 
 
 def _bench(

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args,
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.progress import progress_of
 from mitransient_lidar.core.validation import (
     FloatArray,
     in_range,
@@ -23,6 +24,9 @@ from mitransient_lidar.core.validation import (
     positive,
     relative_error,
 )
+
+#: Annotations as texts that may have an `Option`.
+_MAY_HAVE = re.compile(r"\w+$|Annotated\[")
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -149,10 +153,12 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
     """Return types and `Option` of those parameters of a function, or fields of a class, that have one."""
     found: dict[str, tuple[Any, Option]] = {}
     hinted: Any = inspect.unwrap(function)
-    if not isinstance(function, type):  # whose type of the result may be known to checkers alone
-        annotations = {name: one for name, one in hinted.__annotations__.items() if name != "return"}
-        hinted = types.SimpleNamespace(__annotations__=annotations, __globals__=hinted.__globals__)
-    for name, hint in get_type_hints(hinted, include_extras=True).items():
+    if isinstance(function, type):
+        hints = get_type_hints(function, include_extras=True)
+    else:  # other types are not evaluated: checkers alone may know them, and help does without xarray
+        given = {name: str(text) for name, text in hinted.__annotations__.items() if name != "return"}
+        hints = {name: eval(text, hinted.__globals__) for name, text in given.items() if _MAY_HAVE.match(text)}
+    for name, hint in hints.items():
         if get_origin(hint) is Annotated:
             kind, *others = get_args(hint)
             found.update((name, (kind, one)) for one in others if isinstance(one, Option))
@@ -161,6 +167,8 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that checks its arguments by the `Option` of their annotations; None may stay where allowed.
+
+    A notebook shows the progress of a function that has the parameter ``progress``, unless one is given.
 
     Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
     Python.
@@ -179,7 +187,10 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
             if name in options and not is_unset(value, signature.parameters[name].default):
                 kind, option = options[name]
                 given.arguments[name] = option.check(name, value, kind)
-        return function(*given.args, **given.kwargs)
+        if "progress" not in signature.parameters:
+            return function(*given.args, **given.kwargs)
+        with progress_of(given.arguments.get("progress")) as given.arguments["progress"]:
+            return function(*given.args, **given.kwargs)
 
     shown = [
         one.replace(annotation=options[name][0]) if name in options else one

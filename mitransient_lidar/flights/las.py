@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +35,7 @@ MOST_CHANNELS, MOST_RETURNS = 4, 15
 _SCAN_ANGLE_DEG = 0.006
 _LAST_INTENSITY = 2**16 - 1
 
-Chunks = xr.Dataset | Iterable[xr.Dataset]
+Chunks = Union["xr.Dataset", Iterable["xr.Dataset"]]
 
 
 def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None = None) -> int:

@@ -18,6 +18,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.tables import table_lines
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
@@ -216,13 +217,13 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
 
 def describe_points(points: xr.Dataset) -> list[str]:
     """Return the lines of a table of points by class: numbers, and errors of their heights against the truth [cm]."""
-    lines = [f"{'class':<22}{'points':>9}{'bias':>8}{'spread':>8}{'rms':>8}{'stated':>8}{'z':>7}{'> 0.5 m':>9}"]
+    columns = [("class", "<22"), ("points", ">9"), *((name, ">8.1f") for name in ("bias", "spread", "rms", "stated"))]
     error = points["z"].values - points["true_z"].values
     stated = points["vertical_uncertainty"].values
     target = points["true_target"].values.astype(bool)
     kind = points["kind"].values
     withheld = points["withheld"].values.astype(bool)
-    rows = {
+    classes = {
         "water surface": (kind == PointClass.SURFACE) & ~withheld,
         "bottom": (kind == PointClass.BOTTOM) & ~target & ~withheld,
         "bottom, above a target": (kind == PointClass.BOTTOM) & target & ~withheld,
@@ -230,16 +231,16 @@ def describe_points(points: xr.Dataset) -> list[str]:
         **({"withheld": withheld} if withheld.any() else {}),
         "no echo": kind == PointClass.NO_ECHO,
     }
-    for name, chosen in rows.items():
+    rows: list[list[Any]] = []
+    for name, chosen in classes.items():
         own = chosen & np.isfinite(error)
-        line = f"{name:<22}{np.count_nonzero(chosen):>9}"
+        rows.append([name, np.count_nonzero(chosen)])
         if np.any(own) and name != "no echo":
             values = error[own]
             numbers = (values.mean(), values.std(), np.sqrt(np.mean(values**2)), np.median(stated[own]))
-            line += "".join(f"{100 * number:>8.1f}" for number in numbers)
-            line += f"{np.sqrt(np.mean((values / stated[own]) ** 2)):>7.2f}{np.mean(np.abs(values) > 0.5):>9.2%}"
-        lines.append(line)
-    return lines
+            rows[-1] += [100 * number for number in numbers]
+            rows[-1] += [np.sqrt(np.mean((values / stated[own]) ** 2)), np.mean(np.abs(values) > 0.5)]
+    return table_lines([*columns, ("z", ">7.2f"), ("> 0.5 m", ">9.2%")], rows)
 
 
 @alone

@@ -13,7 +13,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -170,9 +169,7 @@ def _set_scale(scale: Callable[[str], Any], axis: Axis, column: npt.NDArray[Any]
     """Draw an axis of values in their logarithms where they are spread so, with plain numbers."""
     if _is_logarithmic(column):
         scale("log")
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        drawing.plain_logarithms(axis)
 
 
 def _is_logarithmic(column: npt.NDArray[Any]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,9 @@ from matplotlib.axis import XAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Line
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
@@ -119,6 +122,18 @@ def add_grid(ax: Axes, axis: Literal["both", "x", "y"] = "both", hide: tuple[str
     ax.set_axisbelow(True)
     for side in hide:
         ax.spines[side].set_visible(False)
+
+
+def plain_logarithms(axis: Any) -> None:
+    """Label a logarithmic axis, or that of a colour bar, with the plain numbers 1, 2, 5, 10, ..."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def outline_patch(loops: Sequence[FloatArray], **style: Any) -> PathPatch:
+    """Return the shape of a pixel, given its closed lines (x, y): as one patch, they keep holes open."""
+    return PathPatch(Line.make_compound_path(*(Line(loop, closed=True) for loop in loops)), **style)
 
 
 def add_top_axis(ax: Axes, offset: float, slope: float, label: str) -> XAxis:

@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import Patch
 from matplotlib.path import Path as Line
 from matplotlib.patheffects import withStroke
 
@@ -185,7 +185,7 @@ def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, h
     else:
         seen = _draw_field(ax, attributes, ground)
     lit = _draw_beam(ax, attributes, ground)
-    lines = [_target_line(target, plane.outline, ground) for target in plane.targets]
+    lines = [_points(target.get(plane.outline, [])) for target in plane.targets]
     outlines = [ground.place(line) for line in lines if len(line)]
     height = _set_limits(ax, seen, lit, np.concatenate([np.zeros((0, 2)), *outlines]))
     _draw_targets(ax, ground, plane)
@@ -281,9 +281,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[A
         loops = [ground.project(ground.receiver, _points(line)) for line in lines]
         loops = [loop for loop in loops if np.isfinite(loop).all()]
         if loops:
-            # One patch of all lines keeps holes open.
-            shape = Line.make_compound_path(*(Line(loop, closed=True) for loop in loops))
-            ax.add_patch(PathPatch(shape, facecolor=fill, edgecolor=edge, linewidth=1.3))
+            ax.add_patch(drawing.outline_patch(loops, facecolor=fill, edgecolor=edge, linewidth=1.3))
             drawn += loops
     return np.concatenate(drawn)
 
@@ -344,7 +342,7 @@ def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
     """Draw the outlines of the targets, with the depths of their highest points, or of their shadows."""
     marks: dict[str, Any] = {"color": _TARGET_COLOUR, "path_effects": _HALO, "zorder": 5}
     for target in plane.targets:
-        line = _target_line(target, plane.outline, ground)
+        line = _points(target.get(plane.outline, []))
         if len(line) == 0:
             continue
         points = ground.place(line)
@@ -369,17 +367,6 @@ def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
             fontsize="small",
             **marks,
         )
-
-
-def _target_line(target: dict[str, Any], outline: str, ground: _Ground) -> FloatArray:
-    """Return an outline (x, y) of a target, empty without one.
-
-    In a result of an earlier version, the outline seen is that of the vertical projection at the mean height.
-    """
-    if outline == "seen" and outline not in target:
-        line = _points(target["line"])
-        return ground.sea.crossing(ground.receiver.origin, np.insert(line, 2, _middle(target), axis=1))
-    return _points(target.get(outline, []))
 
 
 def _once(ax: Axes, label: str) -> str:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
-from matplotlib.path import Path as Line
+from matplotlib.patches import Patch
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -31,8 +29,8 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     Bands are +-1 standard error; of a series of shots, the curve is the mean of the shots, and the band holds 90 % of
     them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight of a single pixel, and on the
     axis of the receiver for several.
-    Pixels are drawn in the shapes of their outlines; a result of an earlier version shows the cells of its layout, or
-    dots. The depth axis and the pixels are left out if the result lacks their attributes.
+    Pixels are drawn in the shapes of their outlines, or as dots without them. The depth axis is left out if the result
+    lacks its attributes.
 
     Parameters
     ----------
@@ -210,55 +208,21 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
         )
         legend.set_in_layout(False)  # it fits into the space below the square axes
     ax.set_anchor("N")
-    angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
-    width = optional_number(attributes, "field_of_view_mrad")
-    outlines = json.loads(attributes.get("pixel_outlines", "[]"))
+    points = np.stack([dataset["angle_y"].values, dataset["angle_x"].values], axis=-1)
+    outlines = json.loads(attributes.get("pixel_outlines", "[]"))  # lines angle_x, angle_y, ... of each [mrad]
     if len(outlines) == len(names) and all(outlines):
-        _draw_outlines(ax, outlines, colours, width)
-        return
-    if width is None or width <= 0:
-        if len(names) > 1:
-            ax.scatter(angle_y, angle_x, c=colours, s=24)
-            ax.set_aspect("equal", "datalim")
-            ax.invert_xaxis()
-        return
-    sides = tuple(attributes.get("field_of_view_sides_mrad") or (width, width))
-    outline: Patch
-    if attributes.get("field_of_view_shape", "circle") == "circle":
-        outline = Circle((0, 0), width / 2)
+        shapes = [[np.reshape([*line, *line[:2]], (-1, 2))[:, ::-1] for line in lines] for lines in outlines]
+        for loops, colour in zip(shapes, colours, strict=True):
+            ax.add_patch(drawing.outline_patch(loops, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
+        points = np.concatenate([loop for loops in shapes for loop in loops])
+    elif len(names) > 1:  # of another program, or too many for the attributes of a result
+        ax.scatter(points[:, 0], points[:, 1], c=colours, s=24)
     else:
-        outline = Rectangle((-sides[1] / 2, -sides[0] / 2), sides[1], sides[0])
-    outline.set(facecolor="none", edgecolor="0.25", linewidth=1.2)
-    ax.add_patch(outline)
-    cells = _cells(str(attributes.get("layout", "")), angle_x, angle_y, sides)
-    if cells is None:
-        ax.scatter(angle_y, angle_x, c=colours, s=12)
-    else:
-        for (right, bottom, cell_width, cell_height), colour in zip(cells, colours, strict=True):
-            cell = Rectangle((right, bottom), cell_width, cell_height, facecolor=colour, edgecolor="white", alpha=0.9)
-            ax.add_patch(cell)
-            cell.set_clip_path(outline)
-    edge = 0.56 * width
-    ax.set(xlim=(edge, -edge), ylim=(-edge, edge), aspect="equal")
-    _name_edges(ax, width)
-
-
-def _draw_outlines(ax: Axes, outlines: list[list[list[float]]], colours: list[Any], width: float | None) -> None:
-    """Draw the pixels in the shapes of their outlines, lines angle_x, angle_y, ... of each [mrad]."""
-    corners = []
-    for lines, colour in zip(outlines, colours, strict=True):
-        # One patch of all lines keeps holes open; the first point again closes a line.
-        loops = [np.reshape(line, (-1, 2))[:, ::-1] for line in lines]
-        shape = Line.make_compound_path(*(Line(np.vstack([loop, loop[:1]]), closed=True) for loop in loops))
-        ax.add_patch(PathPatch(shape, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
-        corners += loops
-    low, high = (
-        np.min([loop.min(axis=0) for loop in corners], axis=0),
-        np.max([one.max(axis=0) for one in corners], axis=0),
-    )
-    middle, edge = (low + high) / 2, 0.56 * float((high - low).max())
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, edge = (low + high) / 2, 0.56 * (float((high - low).max()) or 1.0)
     ax.set(xlim=(middle[0] + edge, middle[0] - edge), ylim=(middle[1] - edge, middle[1] + edge), aspect="equal")
-    _name_edges(ax, width)
+    _name_edges(ax, optional_number(attributes, "field_of_view_mrad"))
 
 
 def _name_edges(ax: Axes, width: float | None) -> None:
@@ -266,30 +230,6 @@ def _name_edges(ax: Axes, width: float | None) -> None:
     near = "near" if width is None else f"near · {width:g} mrad"
     for y, text, side in ((1, "far", "bottom"), (0, near, "top")):
         ax.text(0.5, y, text, ha="center", va=side, fontsize="small", color="0.3", transform=ax.transAxes)
-
-
-def _cells(
-    layout: str, angle_x: FloatArray, angle_y: FloatArray, sides: Sequence[float]
-) -> list[tuple[float, float, float, float]] | None:
-    """Return the rectangle (right, bottom, width, height) of each pixel in a layout of equal cells, else None.
-
-    The layout counts cells in both directions; the centres of the pixels show which count is along range.
-    """
-    first, separator, second = layout.lower().partition("x")
-    if not (separator and first.isdecimal() and second.isdecimal() and int(first) * int(second) == len(angle_x) > 0):
-        return None
-    for along, across in {(int(first), int(second)), (int(second), int(first))}:
-        height, breadth = sides[0] / along, sides[1] / across
-        rows = np.floor((sides[0] / 2 - angle_x) / height).astype(int)
-        columns = np.floor((sides[1] / 2 - angle_y) / breadth).astype(int)
-        inside = ((rows >= 0) & (rows < along) & (columns >= 0) & (columns < across)).all()
-        places = list(zip(rows.tolist(), columns.tolist(), strict=True))
-        if inside and len(set(places)) == len(angle_x):
-            return [
-                (sides[1] / 2 - (column + 1) * breadth, sides[0] / 2 - (row + 1) * height, breadth, height)
-                for row, column in places
-            ]
-    return None
 
 
 def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:

@@ -56,6 +56,22 @@ class Progress:
     failed: int = 0
     rate: float | None = None
 
+    def __str__(self) -> str:
+        """Return the progress in one line."""
+        parts = [f"{self.unit} {self.done}" + ("" if self.planned is None else f"/{self.planned}")]
+        if self.failed:
+            parts.append(f"{self.failed} failed")
+        if self.rate is not None:
+            parts.append(f"{self.rate:.3g} a second")
+        if self.error is not None:
+            parts.append(f"{describe_quantile(self.target_quantile, self.errors_of)} within {100 * self.error:.3g} %")
+        if self.target_error is not None:
+            needed = "" if self.needed_s is None else f" in {self.needed_passes} more passes, {self.needed_s:.0f} s"
+            parts.append(f"target {100 * self.target_error:.3g} %{needed}")
+        if self.remaining_s is not None and self.remaining_s != self.needed_s:
+            parts.append(f"ends in {self.remaining_s:.0f} s")
+        return ", ".join(parts)
+
 
 ProgressCallback = Callable[[Progress], None]
 

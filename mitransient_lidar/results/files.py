@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Union
 
 import xarray as xr
 
@@ -33,7 +34,7 @@ _KINDS = {
     "campaign": ("the store of a campaign", ("status", "error")),
 }
 
-Given = xr.Dataset | str | os.PathLike[str]
+Given = Union["xr.Dataset", str, os.PathLike[str]]
 
 
 def open(path: str | os.PathLike[str]) -> xr.Dataset:

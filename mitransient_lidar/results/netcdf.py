@@ -13,10 +13,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-import h5netcdf
 import numpy as np
 import xarray as xr
-from xarray.backends import H5NetCDFStore
 
 from mitransient_lidar.core.array_files import check_hdf5, check_size, damaged_file, largest_result
 from mitransient_lidar.core.documents import parse_json
@@ -49,6 +47,9 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     OSError
         If the file cannot be written.
     """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
     dataset = dataset.drop_encoding()
     attributes = {str(name): attribute(str(name), value) for name, value in dataset.attrs.items()}
     dataset.attrs = shown(attributes)

@@ -7,10 +7,10 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -36,6 +36,9 @@ from mitransient_lidar.rendering.options import MOST_PASSES
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 logger = logging.getLogger(__name__)
 
 _COARSE_PASSES = 4  # of renders that approach the solution
@@ -52,7 +55,7 @@ _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of th
 def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
-        str | os.PathLike[str] | Callable[[Mapping[str, float]], xr.Dataset] | None,
+        str | os.PathLike[str] | Model | None,
         Option("Name or XML file of the scene; by default that of the result"),
     ] = None,
     free: Annotated[
@@ -340,11 +343,8 @@ def describe_fit(fitted: xr.Dataset) -> list[str]:
     return [*lines, text, f"{chi['renders']} renders", *chi["messages"]]
 
 
-def table_rows(fitted: xr.Dataset) -> tuple[Sequence[str], list[list[object]]]:
-    """Return the columns and rows of a table of the parameters of a fit, as for a CSV file."""
-    columns = ("value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
-    rows: list[list[object]] = []
-    for name in fitted["parameter"].values:
-        one = fitted.sel(parameter=name)
-        rows.append([str(name), one["parameter_units"].item(), *(one[column].item() for column in columns)])
-    return ("parameter", "unit", *columns), rows
+def parameter_frame(fitted: xr.Dataset) -> pd.DataFrame:
+    """Return the table of the parameters of a fit, as for a CSV file."""
+    columns = ("parameter_units", "value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
+    frame = fitted.reset_coords()[[*columns]].to_dataframe().reset_index()[["parameter", *columns]]
+    return frame.rename(columns={"parameter_units": "unit"})

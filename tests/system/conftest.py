@@ -5,7 +5,7 @@ from browser_page import BROWSER, DRIVER, Page
 from few_paths import few_paths
 from quick_campaign import QUICK
 
-from mitransient_lidar.plots.gate_viewer.page import write_page
+from mitransient_lidar.plots.gate_viewer.page import page_text
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def show(browser, tmp_path):
     """Function that writes the page of a stack and opens it; fails if the browser has logged an error."""
 
     def open_page(stack, result=None, **options):
-        write_page(stack, tmp_path / "page.html", result, **options)
+        (tmp_path / "page.html").write_text(page_text(stack, result, **options), "utf-8")
         browser.get(f"file://{tmp_path}/page.html")
         page = Page(browser)
         page.wait("return document.querySelectorAll('#curve-plot .line').length > 0")

@@ -16,7 +16,7 @@ import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.plots.gate_viewer.page import write_page
+from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
 
@@ -128,9 +128,8 @@ def test_pictures(stack, imager, tmp_path):
 
 
 @pytest.mark.slow
-def test_page(stack, tmp_path):
-    write_page(stack, tmp_path / "page.html")
-    (text,) = re.findall(r'id="gate_energy">([^<]*)<', (tmp_path / "page.html").read_text(encoding="utf-8"))
+def test_page(stack):
+    (text,) = re.findall(r'id="gate_energy">([^<]*)<', page_text(stack))
     planes = np.frombuffer(zlib.decompress(base64.b64decode(text), -15), np.uint8).reshape(4, -1)
     values = np.ascontiguousarray(planes.T).view("<f4").reshape(3, SIZE, SIZE)
     assert far_left_exceeds(values[1])

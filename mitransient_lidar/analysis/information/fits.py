@@ -30,7 +30,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 
 #: A function that returns a render, with derivatives, of values of the free parameters.
-Model = Callable[[Mapping[str, float]], xr.Dataset]
+Model = Callable[[Mapping[str, float]], "xr.Dataset"]
 
 _WINDOW = 10.0  # model bins by which the time offset may change before samples in use are chosen anew
 _MOST_ROUNDS = 8  # of weights that follow the model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.bottom_errors import REASONS, ReflectanceFlag
 from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
+from mitransient_lidar.core.tables import table_lines
 from mitransient_lidar.core.validation import FloatArray
 
 _MOST_SHOTS = 200  # of a table
@@ -77,16 +79,14 @@ def _table(found: Any) -> list[str]:
     """Return a line for each shot of a series, with the truth if known, and lines that compare both."""
     columns = estimates(found)
     numbers = found["shot"].values if "shot" in found.coords else range(found.sizes["shot"])
-    line = f"{'shot':>5}"
+    heads, cells = [("shot", ">5")], [numbers]
     for one in columns:
-        line += f"{one.head:>18}" + (f"{'true':>9}" if one.truth is not None else "")
-    lines = [line]
-    for place, number in list(enumerate(numbers))[:_MOST_SHOTS]:
-        line = f"{number:>5}"
-        for one in columns:
-            line += f"{_with_error(one.values[place], one.errors[place]):>18}"
-            line += f"{one.truth[place]:>9.3f}" if one.truth is not None else ""
-        lines.append(line)
+        heads.append((one.head, ">18"))
+        cells.append(list(map(_with_error, one.values, one.errors)))
+        if one.truth is not None:
+            heads.append(("true", ">9.3f"))
+            cells.append(one.truth)
+    lines = table_lines(heads, itertools.islice(zip(*cells, strict=True), _MOST_SHOTS))
     if len(numbers) > _MOST_SHOTS:
         lines.append(f"{len(numbers) - _MOST_SHOTS} more shots: write them all with -o OUT.nc")
     return lines + [text for one in columns if (text := truth_statistics(one))]

@@ -1,18 +1,19 @@
-"""Tables of echoes as flat rows, as printed lines, and as CSV files."""
+"""Tables of echoes as frames of pandas, as printed lines, and as CSV files."""
 
 from __future__ import annotations
 
-import csv
 import math
 import os
-from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.tables import aligned_lines, write_csv
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Most lines of a printed table, and most waveforms whose layers are printed.
 _MOST_LINES, _MOST_WAVEFORMS = 200, 16
@@ -36,8 +37,8 @@ def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
     return "no surface echo" if not has_surface else "signal below its own level"
 
 
-def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
-    """Return column names and rows of a table of `echo_table.extract`, one row per waveform, estimator and echo.
+def echo_frame(table: xr.Dataset) -> pd.DataFrame:
+    """Return a table of `echo_table.extract` with one row per waveform, estimator and echo.
 
     The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
     quantities of the echo, ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
@@ -49,81 +50,39 @@ def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
     extra = sorted(known, key=lambda name: not name.startswith("angle_"))
     numbers = [name + suffix for name in NUMBERS for suffix in ("", "_stderr")]
     numbers.insert(numbers.index("depth_m_stderr") + 1, "depth_m_method_error")
-    columns = [
-        *extra,
-        *numbers,
-        "flags",
-        "unknown_depth",
-        *(name for name in ("attenuation", "attenuation_stderr") if name in table),
-    ]
-    kept = [name for name in (*columns, "surface_time_ns") if name in table]
-    wide = {name: table[name].broadcast_like(table["time_ns"]).transpose(*dims).values for name in kept}
-
-    def lines() -> Iterator[list[Any]]:
-        for place in np.ndindex(*(table.sizes[dim] for dim in dims)):
-            labels = [table[dim].values[index] for dim, index in zip(dims, place, strict=True)]
-            cells: dict[str, Any] = {name: float(values[place]) for name, values in wide.items()}
-            flags, surface = int(cells["flags"]), cells.get("surface_time_ns", math.nan)
-            reason = unknown_depth(str(labels[-1]), flags, math.isfinite(surface))
-            cells |= {"flags": flag_names(flags), "unknown_depth": reason if math.isnan(cells["depth_m"]) else ""}
-            yield [*labels, *(cells[name] for name in columns)]
-
-    return [*dims, *columns], lines()
+    attenuation = [name for name in ("attenuation", "attenuation_stderr") if name in table]
+    surface = [name for name in ("surface_time_ns",) if name in table]
+    frame = table[[*extra, *numbers, "flags", *attenuation, *surface]].to_dataframe(dims).reset_index()
+    has_surface = np.isfinite(frame.get("surface_time_ns", math.nan * frame["flags"]))
+    reasons = map(unknown_depth, frame["echo"], frame["flags"], has_surface)
+    frame["unknown_depth"] = np.where(frame["depth_m"].isna(), [*reasons], "")
+    frame["flags"] = frame["flags"].map(flag_names)
+    return frame[[*dims, *extra, *numbers, "flags", "unknown_depth", *attenuation]]
 
 
 def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write or replace a CSV file of a table of `echo_table.extract`, with empty cells for unknown values."""
-    names, lines = rows(table)
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows([_cell(value) for value in line] for line in lines)
-
-
-def _cell(value: Any) -> Any:
-    """Return a float with nine digits, empty for NaN; other values unchanged."""
-    if not isinstance(value, float):
-        return value
-    return "" if math.isnan(value) else f"{value:.9g}"
+    write_csv(echo_frame(table), path, digits=9)
 
 
 def describe_echoes(found: xr.Dataset) -> list[str]:
     """Return the lines of a table of the echoes, and the properties of the columns."""
-    from rich.console import Console
-    from rich.table import Table
-
-    names, lines = rows(found)
-    labels = [name for name in names[: names.index("echo") + 1] if name != "estimator" or found.sizes["estimator"] > 1]
+    frame = echo_frame(found)
+    # Of missing echoes, only surface and bottom are listed; the printed error of a depth includes that of the method.
+    frame = frame[~frame["flags"].str.contains("no_echo") | frame["echo"].isin(["surface", "bottom"])]
+    frame["depth_m_stderr"] = np.hypot(frame["depth_m_stderr"], frame["depth_m_method_error"])
+    names = [str(dim) for dim in found["time_ns"].dims]
+    labels = [name for name in names if name != "estimator" or found.sizes["estimator"] > 1]
     unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
     heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
     heads |= {name: f"{name} ({of})" if of else name for name, of in unit.items()}
-    table = Table(box=None, padding=(0, 1), header_style=None)
-    for name in labels:
-        table.add_column(name)
-    for name in NUMBERS:
-        table.add_column(heads[name], justify="right")
-    table.add_column("flags")
-    table.add_column("depth unknown")
-    left_out = 0
-    for line in lines:
-        cells = dict(zip(names, line, strict=True))
-        # Of missing echoes, only surface and bottom are listed.
-        if "no_echo" in cells["flags"] and cells["echo"] not in ("surface", "bottom"):
-            continue
-        if table.row_count >= _MOST_LINES:
-            left_out += 1
-            continue
-        # The printed error of a depth includes that of the method.
-        cells["depth_m_stderr"] = math.hypot(cells["depth_m_stderr"], cells["depth_m_method_error"])
+    rows = [[*labels, *(heads[name] for name in NUMBERS), "flags", "depth unknown"]]
+    for cells in frame[:_MOST_LINES].to_dict("records"):
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in NUMBERS]
-        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"])
-    # A fixed width keeps the lines unfolded.
-    console = Console(highlight=False, width=240, markup=False)
-    with console.capture() as printed:
-        console.print(table)
-    listed = printed.get().splitlines()
-    if left_out:
-        listed.append(f"{left_out} more lines: write them all with --csv OUT.")
+        rows.append([*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"]])
+    listed = aligned_lines(rows, right=range(len(labels), len(labels) + len(NUMBERS)))
+    if len(frame) > _MOST_LINES:
+        listed.append(f"{len(frame) - _MOST_LINES} more lines: write them all with --csv OUT.")
     return listed + _columns(found)
 
 

@@ -12,13 +12,11 @@ import base64
 import html
 import json
 import logging
-import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -26,7 +24,6 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gate_viewer.time_bins import RECORDS, one_record, time_bins
@@ -59,29 +56,7 @@ class _Blocks:
         return sum(map(len, self.encoded.values()))
 
 
-def write_page(
-    stack: xr.Dataset, path: str | os.PathLike[str], result: xr.Dataset | None = None, limit_mb: float = 200.0
-) -> None:
-    """Write the HTML page that shows a gate stack or waveforms.
-
-    An existing file is replaced. The other arguments are those of `page_text`, with its errors.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix than ``.html`` or cannot be written.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".html":
-        raise UserError(f"cannot write {path}: the file name must end in .html.")
-    text = page_text(stack, result, limit_mb, name=str(path))
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def page_text(
-    stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: float = 200.0, *, name: str = "the page"
-) -> str:
+def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: float = 200.0) -> str:
     """Return the text of the HTML page that shows a gate stack or waveforms.
 
     A page that would exceed `limit_mb` shows means over blocks of 2 by 2, 4 by 4, ... pixels, of the waveforms first,
@@ -104,8 +79,6 @@ def page_text(
         record of a pixel is its energy in the gates.
     limit_mb : float
         Largest size of the page [MB of 1e6 bytes], above 0.
-    name : str
-        Name of the page in warnings.
 
     Raises
     ------
@@ -129,7 +102,7 @@ def page_text(
     if is_record and "shot" in stack.dims:
         notes.insert(0, f"The waveforms are means over {stack.sizes['shot']} shots.")
     for note in notes:
-        _LOG.warning("%s: %s", name, note)
+        _LOG.warning("the page: %s", note)
     metadata = _metadata(gated, record, gates, waveforms) | {"notes": notes}
     metadata |= _words(record if is_record else None)
     filled = {

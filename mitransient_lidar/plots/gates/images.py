@@ -19,7 +19,6 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
@@ -58,10 +57,7 @@ class ColourScale(NamedTuple):
         """Draw the colour bar of some axes, with plain numbers on a logarithmic scale too."""
         bar = figure.colorbar(image, ax=axes, extend=self.extend, label=label, **options)
         if isinstance(self.norm, LogNorm):
-            bar.locator = LogLocator(subs=(1.0, 2.0, 5.0))
-            bar.formatter = FuncFormatter(lambda value, _: f"{value:g}")
-            bar.minorformatter = NullFormatter()
-            bar.update_ticks()
+            drawing.plain_logarithms(bar.long_axis)
         return bar
 
 

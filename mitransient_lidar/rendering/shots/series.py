@@ -19,6 +19,7 @@ from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
+from mitransient_lidar.core.tables import table_lines
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
@@ -44,11 +45,15 @@ FARTHEST = 1e4
 _METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
 _PLACE = Column("x", ("aim x",), _METRES), Column("y", ("aim y",), _METRES)
 
-#: Coordinates in the table of a series.
-_LISTED = (
-    *(*AIM, "true_slope_along", "true_slope_across", "true_surface_height"),
-    *("true_bottom_depth", "true_bottom_depth_below_surface"),
-)
+#: Coordinates in the table of a series, with heading and format.
+_LISTED = {
+    **dict(zip(AIM, (("x (m)", ">10.2f"), ("y (m)", ">10.2f")), strict=True)),
+    "true_slope_along": ("along (deg)", ">13.2f"),
+    "true_slope_across": ("across (deg)", ">14.2f"),
+    "true_surface_height": ("height (m)", ">12.3f"),
+    "true_bottom_depth": ("bottom (m)", ">12.3f"),
+    "true_bottom_depth_below_surface": ("depth (m)", ">12.3f"),
+}
 
 
 def read_places(path: str | os.PathLike[str]) -> FloatArray:
@@ -270,14 +275,11 @@ def describe_shots(series: xr.Dataset) -> list[str]:
     The bottom is below the mean sea level, the depth below the mean surface in the beam.
     """
     peak = series["waveform"].max([dim for dim in series["waveform"].dims if dim != "shot"]).values
-    lines = [f"{'shot':>5}{'x (m)':>10}{'y (m)':>10}{'along (deg)':>13}{'across (deg)':>14}{'height (m)':>12}"]
-    lines[0] += f"{'bottom (m)':>12}{'depth (m)':>12}{'peak (W)':>12}"
-    columns = zip(series["shot"].values, *(series[name].values for name in _LISTED), peak, strict=True)
-    for shot, x, y, along, across, height, bottom, depth, power in columns:
-        slopes = (math.degrees(math.atan(slope)) for slope in (along, across))
-        line = f"{shot:>5}{x:>10.2f}{y:>10.2f}" + "{:>13.2f}{:>14.2f}".format(*slopes)
-        lines.append(f"{line}{height:>12.3f}{bottom:>12.3f}{depth:>12.3f}{power:>12.4g}")
-    return lines
+    values = {name: series[name].values for name in _LISTED}
+    for name in ("true_slope_along", "true_slope_across"):
+        values[name] = np.degrees(np.arctan(values[name]))
+    columns = ("shot", ">5"), *_LISTED.values(), ("peak (W)", ">12.4g")
+    return table_lines(columns, zip(series["shot"].values, *values.values(), peak, strict=True))
 
 
 def _checked_places(places: npt.ArrayLike) -> FloatArray:

@@ -222,25 +222,6 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
     assert (tmp_path / "out" / "fig09.exr").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--target-error", "nan"], "--target-error = nan must be finite"),
-        (["--max-time", "inf"], "--max-time = inf must be finite"),
-        (["-D", "wind"], "-D wind is not of the form name=value."),
-        (["-D", "=3"], "-D =3 is not of the form name=value."),
-    ],
-)
-def test_render_rejects_options(tmp_path, arguments, sentence):
-    assert_refused(run("render", "table1", "-o", tmp_path / "out", *arguments), sentence)
-    assert not (tmp_path / "out").exists()
-
-
-def test_render_of_an_unknown_scene(scene, calls, tmp_path):
-    assert_refused(run("render", "fig9", "-o", tmp_path / "out"), "'fig9'", "did you mean fig09")
-    assert not calls.seen
-
-
 def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
     (tmp_path / "file").write_text("regular")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
@@ -248,13 +229,6 @@ def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
     (tmp_path / "fig09.nc").mkdir()
     assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder.")
     assert not calls.seen
-
-
-def test_mistake_found_by_the_renderer(scene, calls, tmp_path):
-    calls.extra["error"] = UserError("backscattering = 0.5 must not exceed scattering = 0.15.")
-    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
-    assert_refused(result, "backscattering = 0.5 must not exceed scattering = 0.15.")
-    assert not (tmp_path / "out").exists()
 
 
 def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):

@@ -130,12 +130,6 @@ def test_a_stack_of_gates_has_no_histogram(stored):
     assert "dataset holds a gate stack, but must have waveforms over time" in result.stderr
 
 
-def test_missing_files(tmp_path):
-    result = run(tmp_path / "none.nc", *TRAIN)
-    assert result.exit_code == 2
-    assert "cannot read" in result.stderr
-
-
 @pytest.mark.slow
 def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
     path, _ = stored

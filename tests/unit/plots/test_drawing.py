@@ -79,14 +79,6 @@ def test_bands_end_at_the_lowest_value():
     np.testing.assert_array_equal(ax.collections[0].get_facecolor()[0, :3], [1, 0, 0])
 
 
-def test_top_axis_is_linear():
-    ax = Figure().subplots()
-    ax.set_xlim(0, 10)
-    top = drawing.add_top_axis(ax, 5.0, 2.0, "value")
-    ax.figure.draw_without_rendering()
-    assert top.axes.get_xlim() == pytest.approx((5.0, 25.0))
-
-
 @pytest.mark.parametrize(
     ("attributes", "limits"),
     [

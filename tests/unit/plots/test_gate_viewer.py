@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.gate_viewer.page import write_page
+from mitransient_lidar.plots.gate_viewer.page import page_text
 
 ROWS, COLUMNS, GATES, BINS = 30, 21, 40, 120
 
@@ -36,6 +36,10 @@ def scene():
         xr.Dataset(stack, angles | gates | depth, attributes),
         xr.Dataset(render, angles | {"time": 1400.5 + np.arange(BINS)}),
     )
+
+
+def write_page(stack, path, *options, **named):
+    path.write_text(page_text(stack, *options, **named), "utf-8")
 
 
 def embedded(path):
@@ -193,7 +197,7 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
         notes = metadata["notes"]
         assert len(notes) == (block > 1) + (waveform_block > 1)
         assert all(f"{limit:g} MB" in note for note in notes)
-        assert [record.getMessage() for record in caplog.records] == [f"{path}: {note}" for note in notes]
+        assert [record.getMessage() for record in caplog.records] == [f"the page: {note}" for note in notes]
 
 
 def test_waveforms_are_left_out_where_pixels_form_no_image(scene, tmp_path):
@@ -222,8 +226,6 @@ def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda stack, result: (stack, "page.htm"), "the file name must end in .html"),
-        (lambda stack, result: (stack, "no/page.html"), "No such file"),
         (
             lambda stack, result: (result[["waveform_stderr"]], "page.html"),
             "the dataset is no gate stack: it has no variable gate_energy.",

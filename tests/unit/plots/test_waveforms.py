@@ -59,18 +59,6 @@ def test_odd_names_are_plain_text(tmp_path):
     assert figure.get_suptitle() == "a$b_{  ·  median standard error 0.98 %"
 
 
-@pytest.mark.slow
-def test_png_is_complete_or_absent(tmp_path):
-    waveforms.plot_waveforms(result(), tmp_path / "a.png")
-    data = (tmp_path / "a.png").read_bytes()
-    assert data.startswith(b"\x89PNG")
-    assert data.rstrip().endswith(b"IEND\xaeB`\x82")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot write .*file/b\.png: Not a directory"):
-        waveforms.plot_waveforms(result(), tmp_path / "file" / "b.png")
-
-
 def test_rejects(tmp_path):
     with pytest.raises(ValueError, match="scale = 'sqrt' must be one of both, linear, log"):
         waveforms.plot_waveforms(result(), scale="sqrt")

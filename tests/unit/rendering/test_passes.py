@@ -5,7 +5,6 @@ import re
 import numpy as np
 import pytest
 
-from mitransient_lidar.cli import messages
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import passes
 from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, run_passes
@@ -120,13 +119,8 @@ def test_a_quantile_alone_applies_to_the_default_goal():
 
 def test_the_progress_line_names_the_request_and_its_forecast():
     state = Progress(12, None, target_error=0.03, error=0.041, needed_passes=24, needed_s=12.0, remaining_s=12.0)
-    assert messages.progress_line(state) == (
-        "pass 12, 95 % of the bins of lit pixels within 4.1 %, target 3 % in 24 more passes, 12 s"
-    )
+    assert str(state) == ("pass 12, 95 % of the bins of lit pixels within 4.1 %, target 3 % in 24 more passes, 12 s")
     state = Progress(2, 9, errors_of="gates", error=0.2, target_quantile=0.5, remaining_s=4.0)
-    assert (
-        messages.progress_line(state)
-        == "pass 2/9, 50 % of the gates (medians over lit pixels) within 20 %, ends in 4 s"
-    )
+    assert str(state) == "pass 2/9, 50 % of the gates (medians over lit pixels) within 20 %, ends in 4 s"
     state = passes.Progress(done=30, planned=90, unit="run", failed=2, rate=1.234, remaining_s=48.6)
-    assert messages.progress_line(state) == "run 30/90, 2 failed, 1.23 a second, ends in 49 s"
+    assert str(state) == "run 30/90, 2 failed, 1.23 a second, ends in 49 s"

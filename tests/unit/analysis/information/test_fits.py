@@ -13,7 +13,7 @@ from mitransient_lidar.analysis.information.fits import WaveformFit
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.fit import describe_fit, table_rows
+from mitransient_lidar.studies.fit import describe_fit, parameter_frame
 
 #: Starts that are wrong by half.
 WRONG = {name: value * factor for (name, value), factor in zip(TRUTH.items(), (0.5, 1.5, 0.5), strict=True)}
@@ -211,9 +211,9 @@ def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
     assert lines[1].split()[0] == "attenuation"
     assert float(lines[1].split()[1]) == pytest.approx(0.2, rel=1e-3)
     assert lines[-1] == f"{fitted.attrs['renders']} renders"
-    heading, rows = table_rows(fitted)
-    assert heading[:3] == ("parameter", "unit", "value")
-    assert [row[0] for row in rows] == list(TRUTH)
+    frame = parameter_frame(fitted)
+    assert [*frame][:3] == ["parameter", "unit", "value"]
+    assert [*frame["parameter"]] == list(TRUTH)
 
 
 @pytest.mark.parametrize("deviation", [0.02, 0.0002])

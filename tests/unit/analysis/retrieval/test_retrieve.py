@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 from command_line import assert_refused, run
 from scipy.stats import truncnorm
-from significance import largest_z
 from synthetic_shots import (
     ANGLE_X,
     ANGLE_Y,
@@ -362,49 +361,6 @@ def test_command_lists_the_shots_of_a_series(shots_with_truth, tmp_path):
     results.save(result(), tmp_path / "one.nc")
     sentence = "needs a series of shots with true slopes"
     assert_refused(run("retrieve", tmp_path / "one.nc", "--figure", tmp_path / "one.png"), sentence)
-
-
-def test_errors_of_the_drawing(tmp_path):
-    rng = np.random.default_rng(5)
-    truth = rng.normal(0, 0.05, 400)
-    slopes = xr.Dataset(
-        {
-            "true_slope_along": ("shot", truth),
-            "slope_along": ("shot", truth + 0.01 + rng.normal(0, 0.05, 400)),
-            "true_slope_across": ("shot", truth),
-            "slope_across": ("shot", np.full(400, np.nan)),
-        }
-    )
-    guess = slopes["slope_along"].values
-    one = retrieval.slope_statistics(truth, guess)
-    # Equal variances of slope and error: a correlation of 0.71; Fisher's z has the standard error 0.05.
-    assert abs(math.atanh(one["correlation"]) - math.atanh(math.sqrt(0.5))) < largest_z(400, 3) * 0.05
-    assert one["low"] < one["correlation"] < one["high"]
-    assert one["bias_deg"] == pytest.approx(math.degrees(0.01), abs=largest_z(400, 3) * math.degrees(0.05) / 20)
-    assert one["rms_deg"] == pytest.approx(math.degrees(math.hypot(0.05, 0.01)), rel=largest_z(400, 3) / math.sqrt(800))
-    (ax,) = retrieval.plot_slopes({"1x4": slopes}).axes
-    # Across nothing is known, and nothing is drawn but the diagonal.
-    dots, diagonal = ax.lines
-    np.testing.assert_allclose(dots.get_data(), np.degrees(np.arctan([truth, guess])))
-    assert (diagonal.get_slope(), diagonal.get_xy1()) == (1, (0, 0))
-    label = f"towards the lidar: r = {one['correlation']:.2f}, bias {one['bias_deg']:+.1f}°, RMS {one['rms_deg']:.1f}°"
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == [label]
-    assert ax.get_title() == "1x4, 400 shots"
-    with pytest.raises(UserError, match="must hold at least one"):
-        retrieval.plot_slopes({}, tmp_path / "slope.png")
-    with pytest.raises(UserError, match="slopes of 2 shots are known"):
-        retrieval.slope_statistics(truth[:2], truth[:2])
-
-
-def test_slopes_without_spread_have_an_interval_of_one_point_or_none():
-    """Fisher's z of a correlation of 1 is infinite, and slopes that are all equal have no correlation."""
-    truth = np.array([-0.1, 0.0, 0.1, 0.2])
-    for sign in (1, -1):
-        one = retrieval.slope_statistics(truth, sign * truth)
-        assert [one[name] for name in ("correlation", "low", "high")] == pytest.approx([sign] * 3)
-    level = retrieval.slope_statistics(np.zeros(4), truth)
-    assert np.isnan([level[name] for name in ("correlation", "low", "high")]).all()
-    assert level["bias_deg"] == pytest.approx(np.degrees(np.arctan(truth)).mean())
 
 
 def drop(name):

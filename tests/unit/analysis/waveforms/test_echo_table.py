@@ -148,8 +148,7 @@ def test_rows_say_why_a_depth_is_unknown():
     dark = 0 * TIME
     surface_only = echo(SURFACE, 3e-13)
     dataset = lit(result(np.stack([waveform(), dark, surface_only])), [0.4, 0.3, 0.3])
-    names, lines = csv_tables.rows(echo_table.extract(dataset))
-    cells = [dict(zip(names, line, strict=True)) for line in lines]
+    cells = csv_tables.echo_frame(echo_table.extract(dataset)).to_dict("records")
     reasons = {(row["pixel"], row["echo"]): row["unknown_depth"] for row in cells}
     assert reasons["red", "bottom"] == ""
     assert reasons["green", "surface"] == "no surface echo"

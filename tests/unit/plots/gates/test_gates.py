@@ -42,19 +42,6 @@ def colour_at(figure, ax, x, y):
 
 
 @pytest.mark.slow
-def test_far_row_is_on_top_and_left_is_left():
-    energy = np.full((ROWS, COLUMNS, 4), 1e-18)
-    energy[0, 0] = 1e-15
-    figure = plot_gates(make(4, energy))
-    ax = images(figure)[2].axes
-    assert colour_at(figure, ax, 6.0, 6.0).sum() > 600  # far, on the left
-    for angle_x, angle_y in ((6.0, -6.0), (-6.0, 6.0), (-6.0, -6.0)):
-        assert colour_at(figure, ax, angle_y, angle_x).sum() < 30
-    assert ax.transData.transform((0, 6.0))[1] > ax.transData.transform((0, -6.0))[1]
-    assert ax.transData.transform((6.0, 0))[0] < ax.transData.transform((-6.0, 0))[0]
-
-
-@pytest.mark.slow
 def test_surface_echo_does_not_darken_the_rest():
     made = make(16)
     # A pulse of 5 ns reaches gates that open less than 7.5 ns after the surface: 0, 1 and 2.

@@ -1,13 +1,14 @@
-"""Drawing of the axes and angles of flights."""
+"""Draws the axes and angles of docs/guide/flights.md: ``python docs/images/draw_flights.py [FOLDER]``."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.poses.attitude import rotation_matrices
@@ -33,19 +34,8 @@ _ABOVE, _BEHIND, _SIDE = ((0, 1), (0, 2), (1, 2))
 _GREY, _BLUE, _GREEN, _RED = "#9aa0a6", "#1f5fd6", "#17963f", "#d81e1e"
 
 
-def plot_axes_and_angles(path: drawing.FilePath | None = None) -> Figure:
-    """Draw the axes, and the signs of yaw, roll, pitch and the angles of a scanner, as the flights have them.
-
-    Parameters
-    ----------
-    path
-        PNG, PDF or SVG file to write, optional.
-
-    Raises
-    ------
-    UserError
-        If the file has another format or cannot be written.
-    """
+def main(path: Path) -> None:
+    """Draw the axes, and the signs of yaw, roll, pitch and the angles of a scanner, as the flights have them."""
     figure = drawing.new_figure(path, 8.5, 8.5)
     above, behind, side, scan = figure.subplots(2, 2).ravel()
 
@@ -83,7 +73,7 @@ def plot_axes_and_angles(path: drawing.FilePath | None = None) -> Figure:
     ax = _view(scan, "Scanner: angle from its nadir, azimuth\nfrom forward; far and left of the pixels", ("", ""))
     ax.set(xlim=(-1.5, 2.7), ylim=(-2.7, 1.5))
     _draw_scanner(ax)
-    return drawing.save(figure, path)
+    drawing.save(figure, path)
 
 
 def _draw_scanner(ax: Axes) -> None:
@@ -176,3 +166,7 @@ def _pair(point: npt.ArrayLike) -> tuple[float, float]:
     """Return a point of the page as Matplotlib takes it."""
     x, y = np.asarray(point, dtype=np.float64).tolist()
     return x, y
+
+
+if __name__ == "__main__":
+    main((Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent) / "flights_mounting.png")

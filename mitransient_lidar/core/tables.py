@@ -1,0 +1,58 @@
+"""Tables as printed lines, and as CSV files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from mitransient_lidar.core.files import replacing
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def table_lines(columns: Sequence[tuple[str, str]], rows: Iterable[Iterable[Any]]) -> list[str]:
+    """Return the heading and the rows of a table as lines.
+
+    Parameters
+    ----------
+    columns
+        Heading and format of each, such as ``>10.2f``: side, width with the blanks before it, and digits.
+    rows
+        Numbers, or texts in their places; the cells of a row may end before those of the heading.
+    """
+    places = [re.sub(r"(?<=\d)[,.a-z%].*", "", form) for _, form in columns]
+
+    def line(cells: Iterable[Any]) -> str:
+        return "".join(
+            format(cell, place if isinstance(cell, str) else form)
+            for cell, (_, form), place in zip(cells, columns, places, strict=False)
+        )
+
+    return [line(head for head, _ in columns), *map(line, rows)]
+
+
+def aligned_lines(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> list[str]:
+    """Return rows of texts as lines, two blanks between the columns, those of the numbers `right` on their right."""
+    rows = [*rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = [">" if number in right else "<" for number in range(len(widths))]
+    return [
+        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def write_csv(frame: pd.DataFrame, path: str | os.PathLike[str], digits: int | None = None, unknown: str = "") -> None:
+    """Write or replace a CSV file: numbers of so many digits, or all, and a word for NaN; no index.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+    form = None if digits is None else f"%.{digits}g"
+    with replacing(path) as temporary:
+        frame.to_csv(temporary, index=False, float_format=form, na_rep=unknown, lineterminator="\n", encoding="utf-8")
