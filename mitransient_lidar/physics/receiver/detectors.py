@@ -80,10 +80,11 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
     return float(1 + np.sum(1 / np.cumprod(gains)))
 
 
-def _efficiency(name: str, value: object) -> None:
-    """Reject an efficiency outside (0, 1]."""
+def _efficiency(name: str, value: object) -> float:
+    """Return an efficiency; reject one outside (0, 1]."""
     if (number := positive(name, value)) > 1:
         raise UserError(f"{name} = {number:g} must be above 0 and at most 1")
+    return number
 
 
 @dataclass(frozen=True)

@@ -173,10 +173,6 @@ def test_response_of_a_gate_with_edges_agrees_with_quadrature():
     assert table.step_ns * table.values.sum() == pytest.approx(8.0, rel=1e-9)
 
 
-def test_response_takes_a_step_but_not_too_many():
+def test_a_long_response_of_a_short_pulse_has_a_step_that_fits():
     train = GateTrain(1400.0, 8.0, 4.0, 3)
-    assert train.response_weights(Pulse.gaussian(5.0), step_ns=0.25).step_ns == 0.25
-    with pytest.raises(ValueError, match="at most 262144 are allowed"):
-        train.response_weights(Pulse.gaussian(5.0), step_ns=1e-6)
-    # A long response of a short pulse chooses a step that fits.
     assert train.response_weights(Pulse.gaussian(0.01), 50.0).values.size <= 2**18
