@@ -17,7 +17,7 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -70,7 +70,7 @@ class SeaSurface:
     spectrum: str  #: Name of the source of the waves.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
-    waves: PeriodicHeights | NestedHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
     cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
     centre: tuple[float, float]  #: Position of the patch [m].
     refined_size: float  #: Side of the patch [m].
@@ -84,7 +84,7 @@ class SeaSurface:
     #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
-    waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
+    waves_at: Callable[[float], PeriodicHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
 
     @classmethod
@@ -120,8 +120,8 @@ class SeaSurface:
         series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
-        waves: PeriodicHeights | NestedHeights | HeightMap | None = None
-        waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
+        waves: PeriodicHeights | HeightMap | None = None
+        waves_at: Callable[[float], PeriodicHeights] | None = None
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
         if is_placeholder:
@@ -285,7 +285,7 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
 
 def _waves_at(
     given: tuple[SeaState, float, float, int], motion: Motion, rest: tuple[float, float], time: float
-) -> PeriodicHeights | NestedHeights:
+) -> PeriodicHeights:
     """Return the waves of `realise_heights`, whose parameters are given, at a time [s]."""
     return realise_heights(*given, replace(motion, time=time), *rest)[0]
 
