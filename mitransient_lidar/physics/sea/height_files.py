@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import Array, Variable, check_size, read_netcdf
+from mitransient_lidar.core.array_files import Variable, check_size, read_netcdf
 from mitransient_lidar.core.coordinate_systems import map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, stated_by, undeclared_no_data, without_no_data
@@ -96,9 +96,10 @@ def heights_in_metres(
     metres = _height_unit(path, stated, unit)
     values = without_no_data(values, None if no_data is None else finite("map_no_data", no_data))
     if suspect := undeclared_no_data(values, metres):
+        value, times, reason = suspect
         raise UserError(
-            f"{path} has {suspect.times} of {values.size} heights of {suspect.value:.9g}, {suspect.reason}, which it"
-            f" does not declare to be no data: map_no_data = {suspect.value:.9g} of a seabed must say so if they are."
+            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
+            f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
         )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"
     return -metres * values if is_down else metres * values
@@ -171,22 +172,13 @@ def described(stated: Stated, values: str | None, unit: str | None, holes: int) 
     )
 
 
-def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
+def read_netcdf_heights(path: Path) -> Grid:
     """Read heights or depths from a NetCDF-4 file.
 
     The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are
     (y, x) or (x, y), with or without the coordinates ``x`` and ``y``, which may have other names if their
     ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions of other names count as
     (y, x). Read are ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid mapping.
-
-    Returns
-    -------
-    values : ndarray, shape (rows, columns)
-        Values as in the file, NaN where they are missing.
-    positions : dict
-        Positions ``x`` and ``y``, as far as the file has them, as in the file.
-    stated : Stated
-        What the file states of both.
 
     Raises
     ------
@@ -225,7 +217,7 @@ def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
         for attribute in ("_FillValue", "missing_value"):
             number = heights.attributes.get(attribute)
             values = without_no_data(values, None if number is None else float(number))
-    return values, {name: variable.values for name, variable in positions.items()}, stated
+    return Grid(values, {name: variable.values for name, variable in positions.items()}, stated)
 
 
 def _axis(variables: Mapping[str, Variable], axis: str) -> str:
@@ -296,7 +288,7 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     return points, Stated(z.unit, True if z.column is _DEPTH else None, x.unit)
 
 
-def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
+def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float | None) -> Grid:
     """Return points on a grid: their own, if they have one, or else interpolated.
 
     Parameters
@@ -305,6 +297,8 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         Their file, for messages.
     points : ndarray, shape (points, 3)
         Positions and heights [m]; points with a height of NaN are left out.
+    stated : Stated
+        What the file states of them.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m].
 
@@ -319,11 +313,10 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         points = points[~np.isnan(points[:, 2])]
     if len(points) < 3:
         raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
-    # Map coordinates have up to eight digits: distances are exact about the lower corner.
     corner = points[:, :2].min(axis=0)
     places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
-    if cell is None and (grid := _own_grid(places, points[:, 2])) is not None:
-        return grid._replace(first=(float(corner[0]), float(corner[1])))
+    if cell is None and (own := _own_grid(places, points[:, 2])) is not None:
+        return Grid.of_cells(own[0], (float(corner[0]), float(corner[1])), own[1], stated)
     if len(points) > _MOST_SCATTERED:
         raise UserError(
             f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
@@ -345,11 +338,12 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         for one, count in zip(extent, (columns, rows), strict=True)
     )
     values = LinearNDInterpolator(triangles, points[:, 2])(*np.meshgrid(x, y))
-    return Grid(np.asarray(values), (float(corner[0] + x[0]), float(corner[1] + y[0])), (size, size))
+    first = float(corner[0] + x[0]), float(corner[1] + y[0])
+    return Grid.of_cells(np.asarray(values), first, (size, size), stated)
 
 
-def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
-    """Return the even grid that places from its corner are on, shape (n, 2), and None if there is none."""
+def _own_grid(places: FloatArray, heights: FloatArray) -> tuple[FloatArray, tuple[float, float]] | None:
+    """Return values and cells of the even grid that places from its corner are on, shape (n, 2); None without one."""
     index, cells = [], []
     for axis in range(2):
         gaps = np.diff(np.unique(places[:, axis]))
@@ -370,4 +364,4 @@ def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
         return None
     values = np.full((rows, columns), np.nan)
     values[index[1], index[0]] = heights
-    return Grid(values, (0.0, 0.0), (cells[0], cells[1]))
+    return values, (cells[0], cells[1])

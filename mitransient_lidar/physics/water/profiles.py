@@ -354,8 +354,9 @@ def _checked(path: Path, columns: _Columns) -> _Columns:
             _require(z >= 0, "z = {:g} must not be negative, unless all z are heights of at most 0", z)
         columns["depth"] = np.abs(z)
     if suspect := undeclared_no_data(columns["depth"], numbers=NO_DATA[1:]):
-        text = f"{suspect.times} depths of {suspect.value:g} m, {suspect.reason}, must not stand for missing values"
-        _require(columns["depth"] != suspect.value, text, columns["depth"])
+        value, times, reason = suspect
+        text = f"{times} depths of {value:g} m, {reason}, must not stand for missing values"
+        _require(columns["depth"] != value, text, columns["depth"])
     for name, values in columns.items():
         _require(np.isfinite(values), name + " = {:g} must be finite", values)
         _require(values >= 0, name + " = {:g} must not be negative", values)
