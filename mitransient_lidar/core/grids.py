@@ -156,7 +156,7 @@ def _read_raster(path: Path, driver: str, kind: str) -> Grid:
     if driver == "BAG":
         with damaged_file(f"{path} is damaged, or is not a {kind}."):
             check_hdf5(path)
-    # GDAL reads files beside it of the same name, such as .tfw and .tif.aux.xml. A raster without coordinates is refused.
+    # GDAL reads files beside it of the same name, such as .tfw and .tif.aux.xml.
     for beside in path.parent.iterdir():
         if beside.name.startswith(f"{path.stem}."):
             check_regular(beside)
