@@ -7,11 +7,12 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import Variable, check_size, read_netcdf
+from mitransient_lidar.core.array_files import check_size, read_netcdf
 from mitransient_lidar.core.coordinate_systems import map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, stated_by, undeclared_no_data, without_no_data
@@ -44,6 +45,9 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 #: Names of heights in NetCDF files, and units that are none.
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
+
+#: Attributes of a grid mapping.
+_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
 
 
 def length_unit(name: str, unit: str) -> float:
@@ -185,9 +189,9 @@ def read_netcdf_heights(path: Path) -> Grid:
     UserError
         If it has no such variable or several, or positions in degrees.
     """
-    variables = read_netcdf(path)
-    data = {name: variable for name, variable in variables.items() if not variable.is_coordinate}
-    flat = [name for name, variable in data.items() if variable.values.ndim == 2]
+    dataset = read_netcdf(path)
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    flat = [str(name) for name, variable in dataset.data_vars.items() if variable.ndim == 2]
     names = [name for name in _NETCDF_NAMES if name in flat] or flat
     if len(names) != 1:
         found = f" ({', '.join(names)})" if names else ""
@@ -195,48 +199,37 @@ def read_netcdf_heights(path: Path) -> Grid:
             f"{path} has {len(names)} variables that may be the heights{found}: it must have one called"
             f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions."
         )
-    heights = data[names[0]]
+    heights = variables[names[0]]
     x, y = _axis(variables, "x"), _axis(variables, "y")
     positions = {axis: variables[name] for axis, name in (("x", x), ("y", y)) if name in variables}
-    for name in (*heights.dims, x, y):
-        units = variables[name].units if name in variables else ""
+    for name in (*map(str, heights.dims), x, y):
+        units = str(variables[name].attrs["units"]) if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
             raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
-    stated = stated_by(None if (mapping := _mapping(variables)) is None else map_system(path, mapping))
-    of_axes = {variable.units for variable in positions.values()}
+    mapping = next((one.attrs for one in variables.values() if not _GRID_MAPPING.isdisjoint(one.attrs)), None)
+    stated = stated_by(None if mapping is None else map_system(path, mapping))
+    of_axes = {str(variable.attrs["units"]) for variable in positions.values()}
     if len(of_axes) > 1:
         raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")
     unit = "".join(of_axes - set(_NO_UNIT))
     stated = stated._replace(
-        unit=stated.unit if heights.units in _NO_UNIT else heights.units,
-        is_down=_is_down(names[0], heights.attributes, stated.is_down),
+        unit=stated.unit if heights.attrs["units"] in _NO_UNIT else str(heights.attrs["units"]),
+        is_down=_is_down(names[0], heights.attrs, stated.is_down),
         position_unit=unit or stated.position_unit,
     )
     values = heights.values.T if heights.dims == (x, y) else heights.values
     if values.dtype.kind == "f":
         for attribute in ("_FillValue", "missing_value"):
-            number = heights.attributes.get(attribute)
+            number = heights.attrs.get(attribute)
             values = without_no_data(values, None if number is None else float(number))
     return Grid(values, {name: variable.values for name, variable in positions.items()}, stated)
 
 
-def _axis(variables: Mapping[str, Variable], axis: str) -> str:
+def _axis(variables: Mapping[str, Any], axis: str) -> str:
     """Return the name of the positions along x or y."""
     standard = f"projection_{axis}_coordinate"
-    found = [name for name, one in variables.items() if one.attributes.get("standard_name") == standard]
+    found = [name for name, one in variables.items() if one.attrs.get("standard_name") == standard]
     return found[0] if axis not in variables and len(found) == 1 else axis
-
-
-def _mapping(variables: Mapping[str, Variable]) -> dict[str, object] | str | None:
-    """Return the attributes of a grid mapping, or its WKT, if there is one."""
-    for variable in variables.values():
-        attributes = variable.attributes
-        for name in ("crs_wkt", "spatial_ref"):
-            if attributes.get(name):
-                return str(attributes[name])
-        if "grid_mapping_name" in attributes:
-            return {name: value for name, value in attributes.items() if name not in ("dtype", "source")}
-    return None
 
 
 def _is_down(name: str, attributes: Mapping[str, object], default: bool | None) -> bool | None:
