@@ -238,7 +238,7 @@ class GateTrain(Checked):
         return np.asarray(self.starts_ns[:, None] + np.array(self.shape.span_ns))
 
     def gate_bins(self, gate: int, time_start_ns: float, bin_width_ns: float, bin_count: int) -> tuple[int, FloatArray]:
-        """Mean transmission of a gate in the bins of a record that it overlaps.
+        """Mean transmission of a gate in the bins of a time axis that it overlaps.
 
         Parameters
         ----------
@@ -254,7 +254,7 @@ class GateTrain(Checked):
         first : int
             First bin that the gate overlaps.
         weights : ndarray, shape (M,)
-            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the record.
+            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the axis.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
         bins = integer("bin_count", bin_count, 1, 10**9)
