@@ -127,7 +127,9 @@ class SeaSurface:
         if is_placeholder:
             cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
-            period = period or _period(state)
+            longest = max(2 * math.pi / component.peak_wavenumber for component in state.components)
+            automatic = _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP)
+            period = period or min(_LONGEST_PERIOD, automatic)
             if cell <= period / _FEWEST_CELLS or read("cell_size") != AUTO:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
@@ -332,12 +334,6 @@ def _matched(
             more = variances_along(swell.slope_covariance(), wind_direction)
             along, across = along + more[0], across + more[1]
     return SeaState(tuple(components)), (along, across)
-
-
-def _period(state: SeaState) -> float:
-    """Return the default period of the sea [m]."""
-    longest = max(2 * math.pi / component.peak_wavenumber for component in state.components)
-    return min(_LONGEST_PERIOD, _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP))
 
 
 def _check_number_of_cells(refined_size: float, cell: float) -> None:
