@@ -155,17 +155,7 @@ class ResponseTable(NamedTuple):
 
     start_ns: float  #: Arrival time of the first value [ns].
     step_ns: float  #: Time between values [ns].
-    values: FloatArray  #: Weights, shape (N,), 0 to 1; 0 at both ends.
-
-    @property
-    def end_ns(self) -> float:
-        """Arrival time of the last value [ns]."""
-        return self.start_ns + (self.values.size - 1) * self.step_ns
-
-    def at(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Weights at arrival times [ns], linear between the values and 0 outside."""
-        times = self.start_ns + self.step_ns * np.arange(self.values.size)
-        return np.asarray(np.interp(np.asarray(time_ns, dtype=np.float64), times, self.values, left=0.0, right=0.0))
+    values: FloatArray  #: Weights, shape (N,), 0 to 1, linear between them; 0 at both ends.
 
 
 @dataclass(frozen=True)
