@@ -8,7 +8,7 @@ import os
 import zipfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,26 +18,15 @@ from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.files import check_regular, open_file
 from mitransient_lidar.core.validation import usable_memory
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
 LARGEST_ARRAY = 2**28
 
 EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
 
 Array = npt.NDArray[Any]
-
-
-class Variable(NamedTuple):
-    """One variable of a NetCDF file."""
-
-    dims: tuple[str, ...]  #: Names of its dimensions.
-    values: Array
-    is_coordinate: bool
-    attributes: dict[str, Any]  #: Among them ``_FillValue`` and ``missing_value``, which are NaN in the values.
-
-    @property
-    def units(self) -> str:
-        """Its attribute ``units``, "" if it has none."""
-        return str(self.attributes.get("units", ""))
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
@@ -162,8 +151,11 @@ def check_hdf5(path: str | os.PathLike[str]) -> None:
                     groups.append(part)
 
 
-def read_netcdf(path: Path) -> dict[str, Variable]:
-    """Read the variables of a NetCDF-4 file, coordinates included; times are not decoded."""
+def read_netcdf(path: Path) -> xr.Dataset:
+    """Read a NetCDF-4 file; times are not decoded.
+
+    Attributes of its variables include ``_FillValue`` and ``missing_value``, which are NaN in the values.
+    """
     import xarray as xr
 
     damaged = f"{path} is damaged, or is not a NetCDF-4 file."
@@ -175,12 +167,6 @@ def read_netcdf(path: Path) -> dict[str, Variable]:
     ):
         check_size(path, file.nbytes)
         dataset = file.load()
-    return {
-        str(name): Variable(
-            dims=tuple(map(str, variable.dims)),
-            values=variable.values,
-            is_coordinate=name in dataset.coords,
-            attributes={**variable.encoding, **variable.attrs},
-        )
-        for name, variable in dataset.variables.items()
-    }
+    for variable in dataset.variables.values():
+        variable.attrs = {"units": "", **variable.encoding, **variable.attrs}
+    return dataset

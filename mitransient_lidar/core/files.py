@@ -26,7 +26,7 @@ from mitransient_lidar.core.validation import shown
 #: tell leftovers of processes that were killed from files of running ones.
 _PREFIX = ".mitransient-lidar."
 _TEMPORARY = re.compile(
-    re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<space>[0-9a-f]{12})\.(?P<process>\d+)\.[0-9a-f]{32}(?P<suffix>\..*)?"
+    re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<space>[0-9a-f]{12})\.(?P<process>\d{1,9})\.[0-9a-f]{32}(?P<suffix>\..*)?"
 )
 
 #: Time after which a temporary file of another process space that nobody has changed is a leftover [s]. None is open as
@@ -303,7 +303,9 @@ def sweep(folder: Path) -> None:
             with contextlib.suppress(OSError):
                 found = entry.stat(follow_symlinks=False)
                 if match["space"] == _process_space():
-                    is_left = not _is_running(int(match["process"]))
+                    import psutil
+
+                    is_left = not psutil.pid_exists(int(match["process"]))
                 else:
                     is_left = time.time() - found.st_ctime > _FORGOTTEN_S
                 if is_left and found.st_uid == os.getuid():
@@ -335,17 +337,6 @@ def _process_space() -> str:
     with contextlib.suppress(OSError):
         found.append(str(os.stat("/proc/self/ns/pid").st_ino))
     return hashlib.sha256(" ".join(found).encode()).hexdigest()[:12]
-
-
-def _is_running(process: int) -> bool:
-    """Return whether a process of this process space exists."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True
 
 
 def _remove(path: Path) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import LARGEST_ARRAY, check_hdf5, check_size, damaged_file
+from mitransient_lidar.core.array_files import LARGEST_ARRAY, Array, check_hdf5, check_size, damaged_file
 from mitransient_lidar.core.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text
@@ -42,12 +43,23 @@ class Stated(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Raster in map coordinates, in the units of its file."""
+    """Heights on a grid, in the units of their file."""
 
-    values: FloatArray  #: Shape (rows, columns) of increasing y and x; NaN where there is no value.
-    first: tuple[float, float]  #: Position x, y of the centre of the cell in row 0 and column 0.
-    cell: tuple[float, float]  #: Size of the cells along x and y.
+    values: Array  #: Shape (rows, columns) of increasing y and x; NaN where there is no value.
+    positions: dict[str, Array]  #: Those of the columns, ``x``, and of the rows, ``y``, as far as the file has them.
     stated: Stated = Stated()
+    centre: tuple[float, float] | None = None  #: Point x, y from which the positions count; None for the origin.
+
+    @classmethod
+    def of_cells(
+        cls, values: FloatArray, first: tuple[float, float], cell: tuple[float, float], stated: Stated
+    ) -> Grid:
+        """Return a grid from the centre (x, y) of the cell in row 0 and column 0, and the sizes of cells along x and y.
+
+        Map coordinates have up to eight digits: positions are exact about the centre.
+        """
+        x, y = ((np.arange(n) - (n - 1) / 2) * size for n, size in zip(values.shape[::-1], cell, strict=True))
+        return cls(values, {"x": x, "y": y}, stated, (first[0] - float(x[0]), first[1] - float(y[0])))
 
 
 def without_no_data(values: npt.NDArray[Any], no_data: float | None) -> FloatArray:
@@ -59,18 +71,13 @@ def without_no_data(values: npt.NDArray[Any], no_data: float | None) -> FloatArr
     return values
 
 
-class Suspect(NamedTuple):
-    """Value that looks like one for no data."""
-
-    value: float
-    times: int  #: How often it occurs.
-    reason: str
-
-
-def undeclared_no_data(values: FloatArray, metres: float = 1.0, numbers: tuple[float, ...] = NO_DATA) -> Suspect | None:
+def undeclared_no_data(
+    values: FloatArray, metres: float = 1.0, numbers: tuple[float, ...] = NO_DATA
+) -> tuple[float, int, str] | None:
     """Return the most frequent height, in a unit in metres, that is none but is not declared to be no data.
 
-    Such heights are beyond 12 000 m, or one of `numbers` of either sign that is far from all others.
+    Such heights are beyond 12 000 m, or one of `numbers` of either sign that is far from all others. Returned are the
+    height, how often it occurs, and the reason; None if there is no such height.
     """
     known = values[np.isfinite(values)]
     suspects, reason = known[np.abs(metres * known) > _HIGHEST], f"beyond {_HIGHEST:g} m"
@@ -81,7 +88,7 @@ def undeclared_no_data(values: FloatArray, metres: float = 1.0, numbers: tuple[f
     if not suspects.size:
         return None
     kinds, counts = np.unique(suspects, return_counts=True)
-    return Suspect(float(kinds[np.argmax(counts)]), int(counts.max()), reason)
+    return float(kinds[np.argmax(counts)]), int(counts.max()), reason
 
 
 def read_ascii_grid(path: Path) -> Grid:
@@ -110,7 +117,7 @@ def read_ascii_grid(path: Path) -> Grid:
         for axis, size in zip("xy", cell, strict=True)
     ]
     values = without_no_data(values, header.get("nodata_value", _ASCII_EMPTY)).reshape(rows, columns)[::-1]
-    return Grid(values, (first[0], first[1]), cell, stated_by(read_prj(path)))
+    return Grid.of_cells(values, (first[0], first[1]), cell, stated_by(read_prj(path)))
 
 
 def _entry(path: Path, header: dict[str, float], *names: str) -> float:
@@ -153,17 +160,12 @@ def _read_raster(path: Path, driver: str, kind: str) -> Grid:
     for beside in path.parent.iterdir():
         if beside.name.startswith(f"{path.stem}."):
             check_regular(beside)
-    try:
-        with damaged_file(f"{path} is damaged, or is not a {kind}."), rasterio.open(path, driver=driver) as file:
-            return _raster(path, file, driver == "BAG")
-    except UserError as error:
-        if isinstance(error.__cause__, rasterio.errors.NotGeoreferencedWarning):  # where warnings are errors
-            raise UserError(_without_coordinates(path)) from error
-        raise
-
-
-def _without_coordinates(path: Path) -> str:
-    return f"{path} has no map coordinates: it must have them."
+    with (
+        warnings.catch_warnings(action="ignore", category=rasterio.errors.NotGeoreferencedWarning),
+        damaged_file(f"{path} is damaged, or is not a {kind}."),
+        rasterio.open(path, driver=driver) as file,
+    ):
+        return _raster(path, file, driver == "BAG")
 
 
 def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
@@ -172,7 +174,7 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
     if file.count != 1 and not is_bag:
         raise UserError(f"{path} has {file.count} bands: a height map must have one.")
     if place.is_identity:
-        raise UserError(_without_coordinates(path))
+        raise UserError(f"{path} has no map coordinates: it must have them.")
     if place.b != 0 or place.d != 0:
         raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
     system = map_system(path, file.crs.to_wkt()) if file.crs else None
@@ -193,7 +195,7 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
         stated = stated._replace(unit="m", is_down=False)
         shift = _corner_shift(path, file.tags(ns="xml:BAG"), (columns, rows), cell)
         x, y = x + shift[0] * cell[0], y + shift[1] * cell[1]
-    return Grid(values, (x, y), cell, stated)
+    return Grid.of_cells(values, (x, y), cell, stated)
 
 
 def _corner_shift(

@@ -177,13 +177,13 @@ def checked(check: Callable[..., object], *limits: float, default: Any = MISSING
 
 @dataclass(frozen=True)
 class Checked:
-    """Dataclass whose fields by `checked` are validated in their order; None may stay where it is the default."""
+    """Dataclass whose fields by `checked` hold what their validators return; None may stay where it is the default."""
 
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
             if "check" in one.metadata and not (value is None and one.default is None):
-                one.metadata["check"](one.name, value)
+                object.__setattr__(self, one.name, one.metadata["check"](one.name, value))
 
 
 def usable_memory() -> float:

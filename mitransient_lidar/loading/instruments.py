@@ -29,7 +29,7 @@ from mitransient_lidar.loading.document import (
 )
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
 
-#: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
+#: Parameters of a scene that fit its own lidar: the limits of the time axis, and the resolution of the sea.
 _TIME_AXIS = ("time_start_ns", "bin_count")
 _SEA = ("refined_size", "cell_size", "shortest_wave")
 
@@ -105,8 +105,8 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     """Replace laser and receiver of a scene by those of an instrument.
 
     The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
-    its other emitters. Place of the record and resolution of the sea, which fit the scene's own lidar, return to their
-    defaults, and parameters that nothing uses any longer are removed.
+    its other emitters. Limits of the time axis and resolution of the sea, which fit the scene's own lidar, return to
+    their defaults, and parameters that nothing uses any longer are removed.
 
     Raises
     ------

@@ -65,7 +65,7 @@ class LoadedScene:
     ) -> dict[str, Any]:
         """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_source`.
 
-        ``record_end`` is what the last light of a record of automatic length comes from. `used` are the values that
+        ``record_end`` is what the last light of a time axis of automatic length comes from. `used` are the values that
         were chosen for automatic parameters of the integrator.
         """
         again = {} if self.source is None else self.source.attributes()
@@ -82,8 +82,8 @@ class LoadedScene:
     def tell_axis(self, axis: TimeAxis, end: str) -> None:
         """Log time bins, and what ends them, where the film leaves their start or number to the scene."""
         if self.sensor.film().axis is None:
-            text = f"record: {axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
-            logger.info("%s%s", text, f"; it ends {end}" if end else "")
+            text = f"{axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
+            logger.info("time axis: %s%s", text, f"; it ends {end}" if end else "")
 
 
 @alone_with_scene

@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from mitransient_lidar.physics.sea.realization import facet_slope_variance, heights_of, wave_coefficients, wave_numbers
+from mitransient_lidar.physics.sea.realization import (
+    Motion,
+    facet_slope_variance,
+    heights_of,
+    wave_coefficients,
+    wave_numbers,
+)
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState
 
@@ -20,9 +26,9 @@ def directional(spectrum, kx, ky):
     return np.where(k > 0, spectrum.omnidirectional(k) * angular / safe, 0)
 
 
-def realise(*options, **others):
-    """Return the elevations [m] of waves of `wave_coefficients`, which has the same parameters."""
-    return heights_of(wave_coefficients(*options, **others))
+def realise(spectrum, period, cells, seed, time=0.0, **motion):
+    """Return the elevations [m] of waves of `wave_coefficients`, at a time [s], with other fields of `Motion`."""
+    return heights_of(wave_coefficients(spectrum, period, cells, seed, Motion(time, **motion)))
 
 
 def mesh_slope_variance(spectrum, period, cells, axis=None):

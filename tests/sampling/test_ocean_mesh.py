@@ -222,7 +222,7 @@ def test_height_maps_become_surfaces(tmp_path):
 def test_swell_and_wake_lie_on_the_sea():
     flat = {"wind_speed": 0.0, "refined_size": 32.0, "cell_size": 0.5, "size": 200.0}
     swell = surface(swell_height=0.8, swell_wavelength=20.0, period=512.0, **flat)[1]
-    grid = swell.sea.waves.heights
+    grid = swell.sea.waves.parts[0].heights
     assert 4 * grid.std() == pytest.approx(0.8, rel=0.15)  # one sea of a narrow spectrum
     wake = surface(spectrum="flat", wake_speed=5.0, wake_length=20.0, refined_size=32.0, cell_size=0.5, size=200.0)[1]
     vertices, _ = buffers(wake)
@@ -239,7 +239,7 @@ def test_time_moves_the_sea_downwind():
     seas = [
         surface(time=time, wind_speed=3.0, refined_size=32.0, size=32.0, cell_size=0.25)[1].sea for time in (0.0, 0.5)
     ]
-    first, later = (sea.waves.heights for sea in seas)
+    first, later = (sea.waves.parts[0].heights for sea in seas)
     correlation = [np.sum(later * np.roll(first, shift, axis=1)) for shift in range(-16, 17)]
     moved = 0.25 * (np.argmax(correlation) - 16)
     assert 1.0 < moved < 2.2

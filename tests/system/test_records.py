@@ -179,14 +179,14 @@ def test_the_command_states_the_record(tmp_path):
     assert done.exit_code == 0
     line = " ".join(done.stderr.split())
     assert "bins of 4 ns; it ends after the echo of shape 'bottom'" in line
-    assert "record: 27" in line
+    assert "time axis: 27" in line
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("params", "sentence"),
     [
-        ({"bin_width_ns": 1e-5}, "bin_width_ns = 1e-05 divides the record from 139"),
+        ({"bin_width_ns": 1e-5}, "bin_width_ns = 1e-05 divides the time axis from 139"),
         ({"bin_count": "some"}, "bin_count = 'some' must be a number"),
         ({"time_start_ns": "early"}, "time_start_ns = 'early' must be a number"),
         ({"bin_count": 5}, "bin_count = 5 bins of 1 ns end the record at 1390 ns: it must end after the surface echo"),

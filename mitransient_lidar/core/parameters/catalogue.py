@@ -25,8 +25,8 @@ _UNIT_OF_END = {
     **{f"_{end}": "m" for end in ("x", "y", "height", "length", "width", "left", "middle", "right")},
 }
 
-#: Plugins whose parameters are no quantities that are measured: of the record, and of estimators.
-_OF_RECORDS = (lidar.TIME_GATED_FILM, *filter(lambda each: isinstance(each, Plugin), vars(integrators).values()))
+#: Plugins whose parameters are no quantities that are measured: of the time axis and gates, and of estimators.
+_NOT_MEASURED = (lidar.TIME_GATED_FILM, *filter(lambda each: isinstance(each, Plugin), vars(integrators).values()))
 
 
 def declared(name: str, plugin: str | None = None) -> list[Parameter]:
@@ -64,5 +64,5 @@ def is_quantity(name: str) -> bool:
     """Return whether a parameter may be one of what is measured: not of bins, gates, estimators or random numbers."""
     found = declared(name)
     return not found or any(
-        each.kind != "integer" and not any(each in one.parameters for one in _OF_RECORDS) for each in found
+        each.kind != "integer" and not any(each in one.parameters for one in _NOT_MEASURED) for each in found
     )

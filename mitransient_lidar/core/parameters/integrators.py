@@ -34,7 +34,7 @@ LIDAR_MERGING = plugin(
         "and more noise", by_id=True),
     number("point_spacing", 0.0, "m", 0, 1e4,
         "Distance between points along a path; 0: a fourteenth of the distance to the bottom or to the depth that the "
-        "record allows, a tenth from 4096 pixels on"),
+        "time axis allows, a tenth from 4096 pixels on"),
 )
 
 LIDAR_VOLPATH = plugin(

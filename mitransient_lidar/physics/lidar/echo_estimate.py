@@ -89,6 +89,8 @@ class EchoEstimate:
         depths = np.asarray(thickness * (np.arange(steps) + rng.random()), dtype=np.float64)
         theta, _ = self._rays(*beam.T)
         cosine = np.cos(snell(theta, self.system.refractive_index))[:, None]
+        none = np.zeros(self.column.count)
+        absorbing = WaterColumn(self.column.layer_tops, self.column.absorption, none, none)
         ripples = [self._ripples(len(beam), rng)[:, None] for _ in range(2)]
 
         def arrivals(depth: FloatArray, returned: FloatArray) -> Arrivals:
@@ -101,7 +103,7 @@ class EchoEstimate:
             slant = depth / np.cos(snell(to_lit, self.system.refractive_index))
             time = 2e9 / C0 * (self.system.height / np.cos(to_lit) + self.system.group_index * slant) + delay
             gain = self.system.water_gain(depth, theta[:, None])
-            lost = np.exp(-2 * self._absorbed(depth) / cosine)
+            lost = np.exp(-2 * absorbing.cumulative(depth) / cosine)
             seen = lit + up
             if self.enhancement is not None:
                 kept = kept * self.enhancement(depth, np.abs(shifts[0] + shifts[1]))
@@ -132,12 +134,6 @@ class EchoEstimate:
         sin, cos = np.sin(self.system.off_nadir), np.cos(self.system.off_nadir)
         down, forward = cos - angle_x * sin, sin + angle_x * cos
         return np.arctan2(np.hypot(forward, angle_y), down), np.arctan2(angle_y, forward)
-
-    def _absorbed(self, depth: FloatArray) -> FloatArray:
-        """Return the optical depth of absorption along the vertical."""
-        none = np.zeros(self.column.count)
-        absorbing = WaterColumn(self.column.layer_tops, self.column.absorption, none, none)
-        return np.asarray(absorbing.cumulative(depth))
 
     def _ripples(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return deflections by slopes where light enters or leaves the water [rad], as complex numbers.

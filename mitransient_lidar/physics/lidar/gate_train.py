@@ -6,7 +6,8 @@ energy int P(t) G_k(t) dt of the received power P of every pulse, where G_k(t) =
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from os import PathLike
 from typing import NamedTuple
 
@@ -17,7 +18,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.headings import UNITLESS, Column
 from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.validation import (
+    Checked,
     FloatArray,
+    checked,
     finite,
     in_range,
     integer,
@@ -30,7 +33,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
 
 #: Points of a table of weights per shortest time scale, and largest number of points.
-_POINTS, _LONGEST_TABLE = 128, 2**18
+_POINTS, _MOST_POINTS = 128, 2**17
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
@@ -82,15 +85,13 @@ class GateShape:
             10-90 % times of the edges [ns], at least 0; the gate must reach 1 between them:
             rise_ns + fall_ns at most 1.18 width_ns.
         """
-        width = positive("width_ns", width_ns)
-        rise, fall = non_negative("rise_ns", rise_ns), non_negative("fall_ns", fall_ns)
-        longest = 2 * width / _EDGE_PER_RISE
-        if rise + fall > longest * (1 + _ROUNDING):
+        longest = 2 * width_ns / _EDGE_PER_RISE
+        if rise_ns + fall_ns > longest * (1 + _ROUNDING):
             raise UserError(
-                f"rise_ns = {rise:g} and fall_ns = {fall:g} must add up to at most {longest:g} ns for a gate of "
-                f"width_ns = {width:g} to open fully"
+                f"rise_ns = {rise_ns:g} and fall_ns = {fall_ns:g} must add up to at most {longest:g} ns for a gate of "
+                f"width_ns = {width_ns:g} to open fully"
             )
-        return cls(width, rise, fall, np.zeros(0), np.zeros(0))
+        return cls(width_ns, rise_ns, fall_ns, np.zeros(0), np.zeros(0))
 
     @classmethod
     def sampled(cls, times_ns: npt.ArrayLike, transmission: npt.ArrayLike) -> GateShape:
@@ -154,21 +155,11 @@ class ResponseTable(NamedTuple):
 
     start_ns: float  #: Arrival time of the first value [ns].
     step_ns: float  #: Time between values [ns].
-    values: FloatArray  #: Weights, shape (N,), 0 to 1; 0 at both ends.
-
-    @property
-    def end_ns(self) -> float:
-        """Arrival time of the last value [ns]."""
-        return self.start_ns + (self.values.size - 1) * self.step_ns
-
-    def at(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Weights at arrival times [ns], linear between the values and 0 outside."""
-        times = self.start_ns + self.step_ns * np.arange(self.values.size)
-        return np.asarray(np.interp(np.asarray(time_ns, dtype=np.float64), times, self.values, left=0.0, right=0.0))
+    values: FloatArray  #: Weights, shape (N,), 0 to 1, linear between them; 0 at both ends.
 
 
 @dataclass(frozen=True)
-class GateTrain:
+class GateTrain(Checked):
     """Gates of one shape at equal time steps.
 
     Times count from the moment when the pulse's peak leaves the transmitter. Build a train of a measured gate with
@@ -192,43 +183,34 @@ class GateTrain:
         Measured gate instead of raised-cosine edges; `width_ns`, `rise_ns` and `fall_ns` must equal its own values.
     """
 
-    start_ns: float
-    width_ns: float
-    step_ns: float
-    count: int
-    rise_ns: float = 0.0
-    fall_ns: float = 0.0
-    pulses: int = 1
+    start_ns: float = checked(finite)
+    width_ns: float = checked(positive)
+    step_ns: float = checked(positive)
+    count: int = checked(integer, 1, 100_000)
+    rise_ns: float = checked(non_negative, default=0.0)
+    fall_ns: float = checked(non_negative, default=0.0)
+    pulses: int = checked(integer, 1, 10**9, default=1)
     profile: GateShape | None = None
-    shape: GateShape = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        shape = self.profile
-        if shape is None:
-            shape = GateShape.edges(self.width_ns, self.rise_ns, self.fall_ns)
-        elif (self.width_ns, self.rise_ns, self.fall_ns) != (shape.width_ns, shape.rise_ns, shape.fall_ns):
+        super().__post_init__()
+        shape = self.shape
+        if (self.width_ns, self.rise_ns, self.fall_ns) != (shape.width_ns, shape.rise_ns, shape.fall_ns):
             raise UserError(
                 f"width_ns = {self.width_ns:g}, rise_ns = {self.rise_ns:g} and fall_ns = {self.fall_ns:g} must be "
                 f"those of the profile, {shape.width_ns:g}, {shape.rise_ns:g} and {shape.fall_ns:g}"
             )
-        checked = {
-            "start_ns": finite("start_ns", self.start_ns),
-            "width_ns": shape.width_ns,
-            "step_ns": positive("step_ns", self.step_ns),
-            "count": integer("count", self.count, 1, 100_000),
-            "rise_ns": shape.rise_ns,
-            "fall_ns": shape.fall_ns,
-            "pulses": integer("pulses", self.pulses, 1, 10**9),
-            "shape": shape,
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
 
     @classmethod
     def measured(cls, profile: GateShape, start_ns: float, step_ns: float, count: int, pulses: int = 1) -> GateTrain:
         """Train of measured gates (`GateShape.sampled` or `GateShape.from_file`); parameters as in the class."""
         width, rise, fall = profile.width_ns, profile.rise_ns, profile.fall_ns
         return cls(start_ns, width, step_ns, count, rise, fall, pulses, profile)
+
+    @cached_property
+    def shape(self) -> GateShape:
+        """Shape of the first gate, half open at t = 0."""
+        return self.profile or GateShape.edges(self.width_ns, self.rise_ns, self.fall_ns)
 
     @property
     def starts_ns(self) -> FloatArray:
@@ -246,7 +228,7 @@ class GateTrain:
         return np.asarray(self.starts_ns[:, None] + np.array(self.shape.span_ns))
 
     def gate_bins(self, gate: int, time_start_ns: float, bin_width_ns: float, bin_count: int) -> tuple[int, FloatArray]:
-        """Mean transmission of a gate in the bins of a record that it overlaps.
+        """Mean transmission of a gate in the bins of a time axis that it overlaps.
 
         Parameters
         ----------
@@ -262,7 +244,7 @@ class GateTrain:
         first : int
             First bin that the gate overlaps.
         weights : ndarray, shape (M,)
-            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the record.
+            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the axis.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
         bins = integer("bin_count", bin_count, 1, 10**9)
@@ -272,13 +254,13 @@ class GateTrain:
         edges = start - opens + width * np.arange(low, max(low, high) + 1)
         return low, np.asarray(np.clip(np.diff(self.shape.open_time(edges)) / width, 0, 1))
 
-    def response_weights(
-        self, pulse: Pulse, response_time_ns: float = 0.0, step_ns: float | None = None
-    ) -> ResponseTable:
+    def response_weights(self, pulse: Pulse, response_time_ns: float = 0.0) -> ResponseTable:
         """Weight of an ideal echo in the first gate against its arrival time.
 
         Pulse and receiver response spread an echo at t with the unit-area kernel h(tau). The first gate transmits
-        W(t) = int h(tau) G_0(t + tau) dtau of it, gate k W(t - k step_ns), for one pulse.
+        W(t) = int h(tau) G_0(t + tau) dtau of it, gate k W(t - k step_ns), for one pulse. Values are 1/128 of the
+        shortest of pulse, edges and width apart, with which linear interpolation is accurate to 1e-5, or more where
+        they would be more than 2^17.
 
         Parameters
         ----------
@@ -286,14 +268,6 @@ class GateTrain:
             Transmitted pulse.
         response_time_ns : float
             Time constant of the receiver's single-pole response [ns], at least 0.
-        step_ns : float, optional
-            Time between the values of the table [ns], greater than 0. By default 1/128 of the shortest of pulse, edges
-            and width, with which linear interpolation is accurate to 1e-5.
-
-        Raises
-        ------
-        UserError
-            If the step needs more than 2^18 values.
         """
         from scipy.signal import fftconvolve
 
@@ -301,17 +275,10 @@ class GateTrain:
         gaussian = pulse.shape == "gaussian"
         pulse_length = 14 * pulse.fwhm_ns / FWHM_PER_SIGMA if gaussian else float(np.ptp(pulse.times_ns))
         longest = closes - opens + pulse_length + 30 * non_negative("response_time_ns", response_time_ns)
-        if step_ns is None:
-            # Features of a sampled pulse may be shorter than its width.
-            shortest = pulse.fwhm_ns if gaussian else float(np.diff(pulse.times_ns).min())
-            times = (shortest, self.width_ns, self.rise_ns or shortest, self.fall_ns or shortest)
-            step = max(min(times) / _POINTS, 2 * longest / _LONGEST_TABLE)
-        else:
-            step = positive("step_ns", step_ns)
-        if longest / step > _LONGEST_TABLE:
-            raise UserError(
-                f"step_ns = {step:g} needs {longest / step:.0f} values but at most {_LONGEST_TABLE} are allowed"
-            )
+        # Features of a sampled pulse may be shorter than its width.
+        shortest = pulse.fwhm_ns if gaussian else float(np.diff(pulse.times_ns).min())
+        times = (shortest, self.width_ns, self.rise_ns or shortest, self.fall_ns or shortest)
+        step = max(min(times) / _POINTS, longest / _MOST_POINTS)
         lag, kernel = pulse.kernel(step, response_time_ns)
         cells = int(np.ceil((closes - opens) / step)) + 3
         # Mean transmission over cells of one step, with one cell of margin at each end.

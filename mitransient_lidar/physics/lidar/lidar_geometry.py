@@ -16,10 +16,11 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 
 
-def _below_horizon(name: str, value: float) -> None:
-    """Reject an angle from the vertical outside [0, pi/2) rad."""
+def _below_horizon(name: str, value: float) -> float:
+    """Return an angle from the vertical; reject one outside [0, pi/2) rad."""
     if not 0 <= value < np.pi / 2:
         raise UserError(f"{name} = {value:g} must be at least 0 and below pi/2")
+    return value
 
 
 @dataclass(frozen=True)

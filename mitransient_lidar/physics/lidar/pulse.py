@@ -1,4 +1,4 @@
-"""Shape of the transmitted pulse, and its convolution with the receiver's response over the bins of a record."""
+"""Shape of the transmitted pulse, and its convolution with the receiver's response over the bins of a time axis."""
 
 from __future__ import annotations
 
@@ -210,41 +210,41 @@ def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, Floa
     Returns
     -------
     ndarray, shape (..., time)
-        Mean power in each bin [W]. Energy that the kernel moves past either end of the record is lost.
+        Mean power in each bin [W]. Energy that the kernel moves past either end of the time axis is lost.
     """
     seconds = positive("bin_width_ns", bin_width_ns) * 1e-9
-    record = np.asarray(energy, dtype=np.float64)
-    if record.ndim == 0 or record.shape[-1] == 0:
-        raise UserError(f"energy of shape {record.shape} must have a time axis")
+    histogram = np.asarray(energy, dtype=np.float64)
+    if histogram.ndim == 0 or histogram.shape[-1] == 0:
+        raise UserError(f"energy of shape {histogram.shape} must have a time axis")
     first, weights = kernel
-    count = record.shape[-1]
+    count = histogram.shape[-1]
     lags = first + np.arange(weights.size)
     reached = np.abs(lags) < count
     lags, weights = lags[reached], weights[reached]
-    # One convolution of all records, with zeros between them.
-    padded = np.zeros((record.size // count, count + max(lags.size - 1, 0)))
-    padded[:, :count] = record.reshape(-1, count)
+    # One convolution of all histograms, with zeros between them.
+    padded = np.zeros((histogram.size // count, count + max(lags.size - 1, 0)))
+    padded[:, :count] = histogram.reshape(-1, count)
     power = np.zeros((len(padded), count))
     if lags.size and len(padded):
         found = _convolved(padded, weights / seconds)
         start, end = max(lags[0], 0), min(count + lags[-1], count)
         power[:, start:end] = found[:, start - lags[0] : end - lags[0]]
-    return power.reshape(record.shape)
+    return power.reshape(histogram.shape)
 
 
 def _convolved(padded: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the convolution of records that end in as many zeros as there are weights, but one."""
+    """Return the convolution of histograms that end in as many zeros as there are weights, but one."""
     if weights.size <= _LONGEST_DIRECT:
         return np.convolve(padded.ravel(), weights)[: padded.size].reshape(padded.shape)
     length = 1 << (padded.shape[1] - 1).bit_length()
     spectrum, found = np.fft.rfft(weights, length), np.empty_like(padded)
-    for row, record in zip(found, padded, strict=True):
-        unknown = np.isnan(record)
-        row[:] = np.fft.irfft(np.fft.rfft(np.where(unknown, 0, record), length) * spectrum, length)[: record.size]
+    for row, histogram in zip(found, padded, strict=True):
+        unknown = np.isnan(histogram)
+        row[:] = np.fft.irfft(np.fft.rfft(np.where(unknown, 0, histogram), length) * spectrum, length)[: histogram.size]
         # Rounding, of the largest power, must neither make power negative nor light bins that no energy reaches.
-        if not np.any(record < 0):
+        if not np.any(histogram < 0):
             np.maximum(row, 0, out=row)
-        row[~_reached(record != 0, weights.size)] = 0
+        row[~_reached(histogram != 0, weights.size)] = 0
         row[_reached(unknown, weights.size)] = np.nan
     return found
 

@@ -1,4 +1,4 @@
-"""Time bins of a record."""
+"""Time axis of waveforms: equal bins, whose start and number may follow from the light."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from mitransient_lidar.core.validation import FloatArray
 #: Largest number of bins.
 MOST_BINS = 1_000_000
 
-#: Longest record of automatic length [ns], which light travels 3000 km.
+#: Longest time axis of automatic length [ns], in which light travels 3000 km.
 LONGEST_NS = 1e7
 
-#: Parts of a fitted record, at least, between the readable times at which it may start and end.
+#: Parts of a fitted time axis, at least, between the readable times at which it may start and end.
 _PARTS = 20
 
 
@@ -39,33 +39,33 @@ class TimeAxis:
         start_ns: float | None = None,
         bin_count: int | None = None,
     ) -> TimeAxis:
-        """Return the bins of a record of times from `first_ns` to `last_ns` [ns].
+        """Return the bins of times from `first_ns` to `last_ns` [ns].
 
         Start and number of bins, unless they are given, are multiples of 1, 2 or 5 times a power of ten of bins: at
-        most a twentieth of the record.
+        most a twentieth of these times.
 
         Raises
         ------
         UserError
-            If the record has more than 1 000 000 bins, or its length is automatic and more than 10 ms.
+            If there are more than 1 000 000 bins, or its length is automatic and more than 10 ms.
         """
         begin = first_ns if start_ns is None else start_ns
         bins = max(last_ns - min(begin, first_ns), 0.0) / bin_width_ns
         steps = (factor * 10**power for power in itertools.count() for factor in (1, 2, 5))
-        # The largest step of at most a twentieth of the record.
+        # The largest step of at most a twentieth of the times.
         step = max([1, *itertools.takewhile(lambda each: each * _PARTS <= bins, steps)])
         if start_ns is None:
             start_ns = step * math.floor(first_ns / (step * bin_width_ns)) * bin_width_ns
         if bin_count is None:
             if last_ns - start_ns > LONGEST_NS:
                 raise UserError(
-                    f"the record from {start_ns:g} to {last_ns:g} ns is longer than {LONGEST_NS:g} ns, the most of an "
-                    "automatic one: give time_start_ns and bin_count"
+                    f"the time axis from {start_ns:g} to {last_ns:g} ns is longer than {LONGEST_NS:g} ns, the most of "
+                    "an automatic one: give time_start_ns and bin_count"
                 )
             bin_count = step * max(math.ceil((last_ns - start_ns) / (step * bin_width_ns) - 1e-9), 1)
         if bin_count > MOST_BINS:
             raise UserError(
-                f"bin_width_ns = {bin_width_ns:g} divides the record from {start_ns:g} to {last_ns:g} ns into "
+                f"bin_width_ns = {bin_width_ns:g} divides the time axis from {start_ns:g} to {last_ns:g} ns into "
                 f"{bin_count} bins: it must be at least {(last_ns - start_ns) / MOST_BINS:.2g}, for at most {MOST_BINS}"
             )
         return cls(start_ns, bin_width_ns, bin_count)

@@ -7,11 +7,12 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import Array, Variable, check_size, read_netcdf
+from mitransient_lidar.core.array_files import check_size, read_netcdf
 from mitransient_lidar.core.coordinate_systems import map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Grid, Stated, stated_by, undeclared_no_data, without_no_data
@@ -44,6 +45,9 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 #: Names of heights in NetCDF files, and units that are none.
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
+
+#: Attributes of a grid mapping.
+_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
 
 
 def length_unit(name: str, unit: str) -> float:
@@ -96,9 +100,10 @@ def heights_in_metres(
     metres = _height_unit(path, stated, unit)
     values = without_no_data(values, None if no_data is None else finite("map_no_data", no_data))
     if suspect := undeclared_no_data(values, metres):
+        value, times, reason = suspect
         raise UserError(
-            f"{path} has {suspect.times} of {values.size} heights of {suspect.value:.9g}, {suspect.reason}, which it"
-            f" does not declare to be no data: map_no_data = {suspect.value:.9g} of a seabed must say so if they are."
+            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
+            f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
         )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"
     return -metres * values if is_down else metres * values
@@ -171,7 +176,7 @@ def described(stated: Stated, values: str | None, unit: str | None, holes: int) 
     )
 
 
-def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
+def read_netcdf_heights(path: Path) -> Grid:
     """Read heights or depths from a NetCDF-4 file.
 
     The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are
@@ -179,23 +184,14 @@ def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
     ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions of other names count as
     (y, x). Read are ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid mapping.
 
-    Returns
-    -------
-    values : ndarray, shape (rows, columns)
-        Values as in the file, NaN where they are missing.
-    positions : dict
-        Positions ``x`` and ``y``, as far as the file has them, as in the file.
-    stated : Stated
-        What the file states of both.
-
     Raises
     ------
     UserError
         If it has no such variable or several, or positions in degrees.
     """
-    variables = read_netcdf(path)
-    data = {name: variable for name, variable in variables.items() if not variable.is_coordinate}
-    flat = [name for name, variable in data.items() if variable.values.ndim == 2]
+    dataset = read_netcdf(path)
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    flat = [str(name) for name, variable in dataset.data_vars.items() if variable.ndim == 2]
     names = [name for name in _NETCDF_NAMES if name in flat] or flat
     if len(names) != 1:
         found = f" ({', '.join(names)})" if names else ""
@@ -203,48 +199,37 @@ def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
             f"{path} has {len(names)} variables that may be the heights{found}: it must have one called"
             f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions."
         )
-    heights = data[names[0]]
+    heights = variables[names[0]]
     x, y = _axis(variables, "x"), _axis(variables, "y")
     positions = {axis: variables[name] for axis, name in (("x", x), ("y", y)) if name in variables}
-    for name in (*heights.dims, x, y):
-        units = variables[name].units if name in variables else ""
+    for name in (*map(str, heights.dims), x, y):
+        units = str(variables[name].attrs["units"]) if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
             raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
-    stated = stated_by(None if (mapping := _mapping(variables)) is None else map_system(path, mapping))
-    of_axes = {variable.units for variable in positions.values()}
+    mapping = next((one.attrs for one in variables.values() if not _GRID_MAPPING.isdisjoint(one.attrs)), None)
+    stated = stated_by(None if mapping is None else map_system(path, mapping))
+    of_axes = {str(variable.attrs["units"]) for variable in positions.values()}
     if len(of_axes) > 1:
         raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")
     unit = "".join(of_axes - set(_NO_UNIT))
     stated = stated._replace(
-        unit=stated.unit if heights.units in _NO_UNIT else heights.units,
-        is_down=_is_down(names[0], heights.attributes, stated.is_down),
+        unit=stated.unit if heights.attrs["units"] in _NO_UNIT else str(heights.attrs["units"]),
+        is_down=_is_down(names[0], heights.attrs, stated.is_down),
         position_unit=unit or stated.position_unit,
     )
     values = heights.values.T if heights.dims == (x, y) else heights.values
     if values.dtype.kind == "f":
         for attribute in ("_FillValue", "missing_value"):
-            number = heights.attributes.get(attribute)
+            number = heights.attrs.get(attribute)
             values = without_no_data(values, None if number is None else float(number))
-    return values, {name: variable.values for name, variable in positions.items()}, stated
+    return Grid(values, {name: variable.values for name, variable in positions.items()}, stated)
 
 
-def _axis(variables: Mapping[str, Variable], axis: str) -> str:
+def _axis(variables: Mapping[str, Any], axis: str) -> str:
     """Return the name of the positions along x or y."""
     standard = f"projection_{axis}_coordinate"
-    found = [name for name, one in variables.items() if one.attributes.get("standard_name") == standard]
+    found = [name for name, one in variables.items() if one.attrs.get("standard_name") == standard]
     return found[0] if axis not in variables and len(found) == 1 else axis
-
-
-def _mapping(variables: Mapping[str, Variable]) -> dict[str, object] | str | None:
-    """Return the attributes of a grid mapping, or its WKT, if there is one."""
-    for variable in variables.values():
-        attributes = variable.attributes
-        for name in ("crs_wkt", "spatial_ref"):
-            if attributes.get(name):
-                return str(attributes[name])
-        if "grid_mapping_name" in attributes:
-            return {name: value for name, value in attributes.items() if name not in ("dtype", "source")}
-    return None
 
 
 def _is_down(name: str, attributes: Mapping[str, object], default: bool | None) -> bool | None:
@@ -296,7 +281,7 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     return points, Stated(z.unit, True if z.column is _DEPTH else None, x.unit)
 
 
-def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
+def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float | None) -> Grid:
     """Return points on a grid: their own, if they have one, or else interpolated.
 
     Parameters
@@ -305,6 +290,8 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         Their file, for messages.
     points : ndarray, shape (points, 3)
         Positions and heights [m]; points with a height of NaN are left out.
+    stated : Stated
+        What the file states of them.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m].
 
@@ -319,11 +306,10 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         points = points[~np.isnan(points[:, 2])]
     if len(points) < 3:
         raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
-    # Map coordinates have up to eight digits: distances are exact about the lower corner.
     corner = points[:, :2].min(axis=0)
     places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
-    if cell is None and (grid := _own_grid(places, points[:, 2])) is not None:
-        return grid._replace(first=(float(corner[0]), float(corner[1])))
+    if cell is None and (own := _own_grid(places, points[:, 2])) is not None:
+        return Grid.of_cells(own[0], (float(corner[0]), float(corner[1])), own[1], stated)
     if len(points) > _MOST_SCATTERED:
         raise UserError(
             f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
@@ -345,11 +331,12 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
         for one, count in zip(extent, (columns, rows), strict=True)
     )
     values = LinearNDInterpolator(triangles, points[:, 2])(*np.meshgrid(x, y))
-    return Grid(np.asarray(values), (float(corner[0] + x[0]), float(corner[1] + y[0])), (size, size))
+    first = float(corner[0] + x[0]), float(corner[1] + y[0])
+    return Grid.of_cells(np.asarray(values), first, (size, size), stated)
 
 
-def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
-    """Return the even grid that places from its corner are on, shape (n, 2), and None if there is none."""
+def _own_grid(places: FloatArray, heights: FloatArray) -> tuple[FloatArray, tuple[float, float]] | None:
+    """Return values and cells of the even grid that places from its corner are on, shape (n, 2); None without one."""
     index, cells = [], []
     for axis in range(2):
         gaps = np.diff(np.unique(places[:, axis]))
@@ -370,4 +357,4 @@ def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
         return None
     values = np.full((rows, columns), np.nan)
     values[index[1], index[0]] = heights
-    return Grid(values, (0.0, 0.0), (cells[0], cells[1]))
+    return values, (cells[0], cells[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.array_files import Array, read_exr, read_npy, read_npz, readable_suffix
 from mitransient_lidar.core.coordinate_systems import MapSystem
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.grids import Grid, Stated, read_ascii_grid, read_bag, read_geotiff
+from mitransient_lidar.core.grids import Grid, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
 from mitransient_lidar.physics.sea.height_files import (
@@ -28,9 +29,6 @@ from mitransient_lidar.physics.sea.height_files import (
 )
 
 logger = logging.getLogger(__name__)
-
-_Contents = tuple[Array, dict[str, Array], Stated]
-"""Heights, positions by the names x and y as far as the file has them, and what it states of both."""
 
 #: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
 _FARTHEST = 1e4
@@ -149,36 +147,27 @@ def read_height_map(
     path = Path(path)
     if holes not in ("refuse", "fill"):
         raise UserError(f"map_holes = {holes!r} must be refuse or fill")
-    kind = readable_suffix(path, (*_READERS, *_GRID_READERS, *_POINTS), "height map")
+    kind = readable_suffix(path, (*_READERS, *_POINTS), "height map")
     if cell is not None and kind not in _POINTS:
         raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points.")
     given = values, unit, no_data
-    centre = None
-    if kind not in _READERS:
+    if kind in _POINTS:
         if size is not None:
-            raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
-        grid = _points(path, cell, given) if kind in _POINTS else _grid(path, _GRID_READERS[kind](path), given)
-        heights, stated = _checked_heights(path, grid.values), grid.stated
-        x, y = ((np.arange(n) - (n - 1) / 2) * cell for n, cell in zip(heights.shape[::-1], grid.cell, strict=True))
-        # Map coordinates have up to eight digits: the shift is added to exact positions about the centre.
-        centre = grid.first[0] - float(x[0]), grid.first[1] - float(y[0])
+            raise _superfluous_size(path, size)
+        grid = _points(path, cell, given)
     else:
-        contents, positions, stated = _READERS[kind](path)
-        heights = heights_in_metres(path, _checked_heights(path, contents), stated, *given)
-        x, y = _positions(path, positions, heights.shape, size)
-        if positions:
-            check_positions(path, stated, x, y, min(float(x[1] - x[0]), float(y[1] - y[0])))
-            x, y = position_unit(path, stated) * x, position_unit(path, stated) * y
-        elif origin is not None:
+        grid = _in_metres(path, _READERS[kind](path), size, given)
+        if origin is not None and size is not None:
             raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
-    heights, filled = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
-    terrain = _moved(path, HeightMap(heights, x, y, None, filled, stated.system), centre, origin)
+    x, y = grid.positions["x"], grid.positions["y"]
+    heights, filled = _without_holes(path, grid.values, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
+    terrain = _moved(path, HeightMap(heights, x, y, None, filled, grid.stated.system), grid.centre, origin)
     place = "" if terrain.origin is None else "; x = y = 0 is its point ({:.10g}, {:.10g})".format(*terrain.origin)
     logger.info(
         "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m%s%s; %s",
         *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), place),
         ", the centre" if place and origin is None else "",
-        described(stated, values, unit, 0 if filled is None else int(filled.sum())),
+        described(grid.stated, values, unit, 0 if filled is None else int(filled.sum())),
     )
     return terrain
 
@@ -191,45 +180,34 @@ def _points(path: Path, cell: float | None, given: _Given) -> Grid:
         check_positions(path, stated, points[:, 0], points[:, 1], spacing)
     points[:, 2] = heights_in_metres(path, points[:, 2], stated, *given)
     points[:, :2] *= position_unit(path, stated)
-    return grid_of_points(path, points, cell)._replace(stated=stated)
+    return grid_of_points(path, points, stated, cell)
 
 
-def _grid(path: Path, grid: Grid, given: _Given) -> Grid:
-    """Return a grid with heights and positions in metres."""
-    x, y = [
-        np.array([first, first + (count - 1) * cell])
-        for first, count, cell in zip(grid.first, grid.values.shape[::-1], grid.cell, strict=True)
-    ]
-    check_positions(path, grid.stated, x, y, min(grid.cell))
-    metres, heights = position_unit(path, grid.stated), heights_in_metres(path, grid.values, grid.stated, *given)
-    first, cell = ((metres * pair[0], metres * pair[1]) for pair in (grid.first, grid.cell))
-    return Grid(heights, first, cell, grid.stated)
-
-
-def _checked_heights(path: Path, values: Array) -> FloatArray:
-    """Return real numbers in two dimensions."""
-    heights = _numbers(path, "heights", values)
+def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Grid:
+    """Return a grid with heights and positions in metres; without own ones, those of a size about the origin."""
+    heights, stated = _numbers(path, "heights", grid.values), grid.stated
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns.")
-    return heights
+    heights = heights_in_metres(path, heights, stated, *given)
+    counts = {"x": heights.shape[1], "y": heights.shape[0]}
+    if len(grid.positions) == 1:
+        raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none.")
+    if not grid.positions:
+        if size is None:
+            raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres.")
+        cell = positive("size", size) / (counts["x"] - 1)
+        return Grid(heights, {name: (np.arange(n) - (n - 1) / 2) * cell for name, n in counts.items()}, stated)
+    if size is not None:
+        raise _superfluous_size(path, size)
+    x, y = (_even_positions(path, name, grid.positions[name], count) for name, count in counts.items())
+    at_x, at_y = grid.centre or (0.0, 0.0)
+    check_positions(path, stated, at_x + x, at_y + y, min(float(x[1] - x[0]), float(y[1] - y[0])))
+    unit = position_unit(path, stated)
+    return Grid(heights, {"x": unit * x, "y": unit * y}, stated, grid.centre and (unit * at_x, unit * at_y))
 
 
-def _positions(
-    path: Path, positions: dict[str, Array], shape: tuple[int, ...], size: float | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return x of the columns and y of the rows [m], from the file or of a map of a size about the origin."""
-    rows, columns = shape
-    if len(positions) == 1:
-        raise UserError(f"{path} has positions {next(iter(positions))} only: it must have both x and y, or none.")
-    if positions:
-        if size is not None:
-            raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
-        return _even_positions(path, "x", positions["x"], columns), _even_positions(path, "y", positions["y"], rows)
-    if size is None:
-        raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres.")
-    cell = positive("size", size) / (columns - 1)
-    x, y = (np.asarray((np.arange(n) - (n - 1) / 2) * cell, dtype=np.float64) for n in (columns, rows))
-    return x, y
+def _superfluous_size(path: Path, size: float) -> UserError:
+    return UserError(f"size = {size} must not be given: {path} has positions of its own.")
 
 
 def _without_holes(
@@ -324,29 +302,33 @@ def _numbers(path: Path, name: str, values: Array) -> FloatArray:
     return values.astype(np.float64)
 
 
-def _read_npy(path: Path) -> _Contents:
-    return read_npy(path), {}, Stated()
-
-
-def _read_npz(path: Path) -> _Contents:
+def _read_npz(path: Path) -> Grid:
     arrays = read_npz(path, ("heights", "x", "y"))
     if "heights" not in arrays:
         raise UserError(f"{path} must have an array heights, and may have x and y.")
-    return arrays.pop("heights"), arrays, Stated()
+    return Grid(arrays.pop("heights"), arrays)
 
 
-def _read_exr(path: Path) -> _Contents:
+def _read_exr(path: Path) -> Grid:
     images = read_exr(path)
     names = list(images) if len(images) == 1 else [name for name in "YRZ" if name in images]
     if not names:
         channels = ", ".join(sorted(images))
         raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
-    return images[names[0]][::-1], {}, Stated()
+    return Grid(images[names[0]][::-1], {})
 
 
-_READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": read_netcdf_heights}
-_GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff, ".bag": read_bag}
+_READERS: dict[str, Callable[[Path], Grid]] = {
+    ".npy": lambda path: Grid(read_npy(path), {}),
+    ".npz": _read_npz,
+    ".exr": _read_exr,
+    ".nc": read_netcdf_heights,
+    ".asc": read_ascii_grid,
+    ".tif": read_geotiff,
+    ".tiff": read_geotiff,
+    ".bag": read_bag,
+}
 _POINTS = (".xyz", ".csv", ".txt")
 
 #: Suffixes of maps that lie about their centre, in coordinates of their own, where no origin is given.
-IN_MAP_COORDINATES = (*_GRID_READERS, *_POINTS)
+IN_MAP_COORDINATES = (".asc", ".tif", ".tiff", ".bag", *_POINTS)

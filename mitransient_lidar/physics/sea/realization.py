@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, positive
+from mitransient_lidar.core.validation import FloatArray, IntArray, positive
 from mitransient_lidar.physics.sea.wave_spectrum import (
     GRAVITY,
     SLOWEST_WAVENUMBER,
@@ -23,6 +24,18 @@ _MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024
 
 #: Largest ratio of the periods of neighbouring grids, odd.
 _MOST_TILES = 31
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What moves waves."""
+
+    time: float = 0.0  #: Time [s].
+    depth: float = math.inf  #: Depth of the water [m], positive or infinite; it slows long waves.
+    current: tuple[float, float] = (0.0, 0.0)  #: Velocity (x, y) of the water [m/s], added to that of all waves.
+
+
+_STILL = Motion()
 
 
 def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
@@ -45,7 +58,8 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
     Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with
     T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension of the Elfouhaily spectrum's slowest wave.
     """
-    _check_depth(depth)
+    if not depth > 0:
+        raise UserError(f"depth = {depth:g} must be greater than 0")
     wavenumber = np.asarray(k, dtype=np.float64)
     square = wavenumber * (GRAVITY + GRAVITY / SLOWEST_WAVENUMBER**2 * wavenumber**2)
     if not math.isinf(depth):
@@ -58,9 +72,7 @@ def wave_coefficients(
     period: float,
     cells: int,
     seed: int,
-    time: float = 0.0,
-    depth: float = math.inf,
-    current: tuple[float, float] = (0.0, 0.0),
+    motion: Motion = _STILL,
 ) -> npt.NDArray[np.complex128]:
     """Realise a periodic square patch of sea surface as a Gaussian random field; see `heights_of`.
 
@@ -75,12 +87,8 @@ def wave_coefficients(
     seed : int
         Any integer. A wave depends only on its wavenumber and the seed: with the same period, a coarser realisation
         equals the finer one without its short waves.
-    time : float
-        Time [s]; equal seeds are the same sea at different times.
-    depth : float
-        Depth of the water [m], positive or infinite; it slows long waves.
-    current : tuple of float
-        Velocity (x, y) of the water [m/s], added to that of all waves.
+    motion : Motion
+        Time, depth and current; equal seeds are the same sea at different times.
 
     Returns
     -------
@@ -91,17 +99,13 @@ def wave_coefficients(
     Raises
     ------
     UserError
-        If `period` or `depth` is not positive, `cells` not even and positive, or `time` or `current` not finite.
+        If `period` is not positive, or `cells` not even and positive.
     """
     ix, iy, dk = wave_numbers(period, cells)
-    finite("time", time)
-    _check_depth(depth)
-    velocity = finite_array("current", current)
-    if velocity.shape != (2,):
-        raise UserError(f"current of shape {velocity.shape} must be two velocities, along x and y")
+    time = motion.time
     if time != 0:
-        drift = dk * (velocity[0] * ix + velocity[1] * iy[:, None]) * time
-        advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), depth) * time
+        drift = dk * (motion.current[0] * ix + motion.current[1] * iy[:, None]) * time
+        advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), motion.depth) * time
     coefficients = np.zeros((iy.size, ix.size), dtype=np.complex128)
     for number, waves in enumerate(spectrum.systems):
         square, phase = _noise(seed, number, ix, iy)
@@ -168,12 +172,6 @@ def facet_slope_variance(
     return variances_along(np.array([[x, xy], [xy, y]]) * (2 * cells / period) ** 2, axis)
 
 
-def _check_depth(depth: float) -> None:
-    """Reject a depth that is not above 0; infinity is allowed."""
-    if not depth > 0:
-        raise UserError(f"depth = {depth:g} must be greater than 0")
-
-
 def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     """Return numbers of wavelengths over a period along x and y, and their unit.
 
@@ -222,30 +220,16 @@ def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     return x ^ (x >> np.uint64(31))
 
 
-@dataclass(frozen=True)
-class Motion:
-    """What moves waves; see `wave_coefficients`."""
-
-    time: float  #: Time [s].
-    depth: float  #: Depth of the water [m].
-    current: tuple[float, float]  #: Velocity (x, y) of the water [m/s].
-
-
 @dataclass(frozen=True, eq=False)
-class PeriodicHeights:
+class HeightGrid:
     """Elevations of waves on one grid that is as fine as the facets."""
 
     heights: FloatArray  #: Elevation [m], shape (cells, cells), as from `heights_of`.
     cell_size: float  #: Spacing of the grid [m].
 
-    @property
-    def cells(self) -> int:
-        """Number of cells of the grid per period."""
-        return len(self.heights)
-
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
-        count = self.cells
+        count = len(self.heights)
         i, j = ((np.rint(np.asarray(lines) / self.cell_size).astype(int) + count // 2) % count for lines in (x, y))
         return np.asarray(self.heights[np.ix_(j, i)])
 
@@ -270,30 +254,20 @@ class Band:
 
 
 @dataclass(frozen=True, eq=False)
-class NestedHeights:
-    """Elevations of waves whose period is too long for one grid of the facets' cells.
+class PeriodicHeights:
+    """Elevations of waves: on one grid, or of a period that is too long for one grid of the facets' cells.
 
     The longest waves are those of a coarse grid over the period. Each band of shorter ones has a period that is an odd
     fraction of the last, so that the wavenumbers of all bands fill the plane without gap or overlap.
     """
 
-    bands: tuple[Band, ...]  #: Waves by decreasing period, at least one band.
-    short_waves: PeriodicHeights | None  #: The waves of the shortest period, unless they are the last band.
-
-    @property
-    def cells(self) -> int:
-        """Number of cells per period of the grid that holds the longest waves."""
-        return _LONG_WAVE_CELLS
-
-    @property
-    def cell_size(self) -> float:
-        """Spacing of the grid that holds the longest waves [m]."""
-        return self.bands[0].period / _LONG_WAVE_CELLS
+    parts: tuple[Band | HeightGrid, ...]  #: Waves by decreasing period, of which the last may be on a grid.
+    cells: int  #: Number of cells per period of the grid that holds the longest waves.
+    cell_size: float  #: Spacing of that grid [m].
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `PeriodicHeights.sample`."""
-        parts = [band.sample(x, y) for band in self.bands]
-        return sum(parts if self.short_waves is None else [*parts, self.short_waves.sample(x, y)], np.zeros(()))
+        """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`."""
+        return functools.reduce(np.add, (part.sample(x, y) for part in self.parts))
 
 
 def realise_heights(
@@ -304,7 +278,7 @@ def realise_heights(
     motion: Motion,
     axis: float,
     shortest_wave: float = 0.0,
-) -> tuple[PeriodicHeights | NestedHeights, float, tuple[float, float]]:
+) -> tuple[PeriodicHeights, float, tuple[float, float]]:
     """Realise a sea for facets of a given size.
 
     Parameters
@@ -328,7 +302,6 @@ def realise_heights(
         Elevations, the side of the cells [m], and the expected slope variances [1] of the facets along and across the
         axis.
     """
-    details = motion.time, motion.depth, motion.current
 
     def grid_of_waves(part: float) -> int:
         """Return the cells per period of the coarsest grid that holds all waves."""
@@ -347,8 +320,7 @@ def realise_heights(
     cells = even_cells(cell, periods[-1])
     cell = periods[-1] / cells
 
-    bands: list[Band] = []
-    short_waves = None
+    parts: list[Band | HeightGrid] = []
     resolved = np.zeros(2)
     for number, (part, inner) in enumerate(zip(periods, limits, strict=True)):
         is_last = number == len(periods) - 1
@@ -363,33 +335,25 @@ def realise_heights(
         is_missing = (furthest > outer) | (furthest <= inner) & (number > 0)
         is_missing |= np.hypot(iy[:, None], ix) * shortest_wave > part
         # Each band has other random numbers: plugins allow seeds up to 2^53.
-        coefficients = wave_coefficients(spectrum, part, count, seed + number * 2**54, *details)
+        coefficients = wave_coefficients(spectrum, part, count, seed + number * 2**54, motion)
         coefficients[is_missing] = 0
         variance = spectrum.mode_variances(ix, iy, dk)
         variance[is_missing] = 0
         resolved += facet_slope_variance(variance, ix, iy, part, part / cell, axis)
         if is_last and cells <= _MOST_CELLS:
-            short_waves = PeriodicHeights(heights_of(coefficients, cells), cell)
+            parts.append(HeightGrid(heights_of(coefficients, cells), cell))
         else:
             rows = np.roll(np.arange(count), count // 2)[count // 2 - outer : count // 2 + outer + 1]
-            bands.append(Band(coefficients[rows, : outer + 1], part))
-    found = float(resolved[0]), float(resolved[1])
-    if short_waves is not None and not bands:
-        return short_waves, cell, found
-    return NestedHeights(tuple(bands), short_waves), cell, found
+            parts.append(Band(coefficients[rows, : outer + 1], part))
+    longest = cells if isinstance(parts[0], HeightGrid) else _LONG_WAVE_CELLS
+    spacing = cell if isinstance(parts[0], HeightGrid) else period / _LONG_WAVE_CELLS
+    return PeriodicHeights(tuple(parts), longest, spacing), cell, (float(resolved[0]), float(resolved[1]))
 
 
 def even_cells(cell: float, period: float) -> int:
     """Return an even number of cells per period, not longer than `cell` [m], that is fast to transform."""
     half = max(2, math.ceil(0.5 * period / cell - 1e-9))
-    while not _is_product_of_small_primes(half):
+    # Transforms are fast if its prime factors are 2, 3 and 5: if it divides a high power of 30.
+    while pow(30, 64, half):
         half += 1
     return 2 * half
-
-
-def _is_product_of_small_primes(number: int) -> bool:
-    """Return whether a number has no prime factors but 2, 3 and 5, so that Fourier transforms of its size are fast."""
-    for factor in (2, 3, 5):
-        while number % factor == 0:
-            number //= factor
-    return number == 1

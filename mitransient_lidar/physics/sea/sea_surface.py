@@ -17,7 +17,7 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -70,7 +70,7 @@ class SeaSurface:
     spectrum: str  #: Name of the source of the waves.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
-    waves: PeriodicHeights | NestedHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
     cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
     centre: tuple[float, float]  #: Position of the patch [m].
     refined_size: float  #: Side of the patch [m].
@@ -84,7 +84,7 @@ class SeaSurface:
     #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
-    waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
+    waves_at: Callable[[float], PeriodicHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
 
     @classmethod
@@ -120,14 +120,16 @@ class SeaSurface:
         series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
-        waves: PeriodicHeights | NestedHeights | HeightMap | None = None
-        waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
+        waves: PeriodicHeights | HeightMap | None = None
+        waves_at: Callable[[float], PeriodicHeights] | None = None
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
         if is_placeholder:
             cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
-            period = period or _period(state)
+            longest = max(2 * math.pi / component.peak_wavenumber for component in state.components)
+            automatic = _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP)
+            period = period or min(_LONGEST_PERIOD, automatic)
             if cell <= period / _FEWEST_CELLS or read("cell_size") != AUTO:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
@@ -285,7 +287,7 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
 
 def _waves_at(
     given: tuple[SeaState, float, float, int], motion: Motion, rest: tuple[float, float], time: float
-) -> PeriodicHeights | NestedHeights:
+) -> PeriodicHeights:
     """Return the waves of `realise_heights`, whose parameters are given, at a time [s]."""
     return realise_heights(*given, replace(motion, time=time), *rest)[0]
 
@@ -332,12 +334,6 @@ def _matched(
             more = variances_along(swell.slope_covariance(), wind_direction)
             along, across = along + more[0], across + more[1]
     return SeaState(tuple(components)), (along, across)
-
-
-def _period(state: SeaState) -> float:
-    """Return the default period of the sea [m]."""
-    longest = max(2 * math.pi / component.peak_wavenumber for component in state.components)
-    return min(_LONGEST_PERIOD, _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP))
 
 
 def _check_number_of_cells(refined_size: float, cell: float) -> None:

@@ -313,10 +313,10 @@ def _read_text(path: Path, wavelength_nm: float | None) -> tuple[_Columns, list[
 
 def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, list[str]]:
     """Return the variables by name, and the index of each row along the dimension."""
-    variables = read_netcdf(path)
+    variables = read_netcdf(path).variables
     dimension = "depth" if any(item.dims == ("depth",) for item in variables.values()) else "z"
-    profiles = {name: item for name, item in variables.items() if item.dims == (dimension,)}
-    names = [f"{name} [{item.units}]" if item.units else name for name, item in profiles.items()]
+    profiles = {str(name): item for name, item in variables.items() if item.dims == (dimension,)}
+    names = [f"{name} [{units}]" if (units := item.attrs["units"]) else name for name, item in profiles.items()]
     headings = read_headings(path, names, _COLUMNS, _OTHER_QUANTITIES, wavelength_nm)
     columns: _Columns = {}
     for (name, item), heading in zip(profiles.items(), headings, strict=True):
@@ -324,7 +324,7 @@ def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, lis
             if item.values.dtype.kind not in "iuf":
                 raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers.")
             column, values = heading.column.name, item.values.astype(np.float64) * heading.factor
-            if (direction := str(item.attributes.get("positive", "")).lower()) in ("up", "down"):
+            if (direction := str(item.attrs.get("positive", "")).lower()) in ("up", "down"):
                 column, values = "depth", values if direction == "down" else -values
             columns[column] = values
     _check_names(path, list(columns))
@@ -354,8 +354,9 @@ def _checked(path: Path, columns: _Columns) -> _Columns:
             _require(z >= 0, "z = {:g} must not be negative, unless all z are heights of at most 0", z)
         columns["depth"] = np.abs(z)
     if suspect := undeclared_no_data(columns["depth"], numbers=NO_DATA[1:]):
-        text = f"{suspect.times} depths of {suspect.value:g} m, {suspect.reason}, must not stand for missing values"
-        _require(columns["depth"] != suspect.value, text, columns["depth"])
+        value, times, reason = suspect
+        text = f"{times} depths of {value:g} m, {reason}, must not stand for missing values"
+        _require(columns["depth"] != value, text, columns["depth"])
     for name, values in columns.items():
         _require(np.isfinite(values), name + " = {:g} must be finite", values)
         _require(values >= 0, name + " = {:g} must not be negative", values)

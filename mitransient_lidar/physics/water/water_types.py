@@ -210,22 +210,13 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
     return InherentProperties(_absorption_for(kw + factor * c**exponent, lambda _: scattered), *scattered)
 
 
-def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | None = None) -> InherentProperties:
+def from_kd(kd: float) -> InherentProperties:
     """Water given by its diffuse attenuation at 532 nm.
 
     Parameters
     ----------
     kd : float
         Diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
-    albedo : float, optional
-        Single-scattering albedo b/c, 0 to 0.98. Default: interpolated between Jerlov types.
-    backscatter_ratio : float, optional
-        bb/b, 0.001 to 0.1. Default: interpolated between Jerlov types.
-
-    Raises
-    ------
-    UserError
-        If the values together give less absorption or backscattering than those of pure water.
 
     Notes
     -----
@@ -240,12 +231,7 @@ def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | N
     def typical(values: list[float]) -> float:
         return float(np.interp(np.log(wanted), np.log(table), values))
 
-    omega = typical([w.albedo for w in waters]) if albedo is None else in_range("albedo", albedo, 0, 0.98)
-    if backscatter_ratio is None:
-        ratio = typical([w.backscatter_ratio for w in waters])
-    else:
-        ratio = in_range("backscatter_ratio", backscatter_ratio, 0.001, 0.1)
-
+    omega, ratio = typical([w.albedo for w in waters]), typical([w.backscatter_ratio for w in waters])
     per_absorption = omega / (1 - omega)
     molecules = pure_seawater().scattering
 
@@ -253,24 +239,18 @@ def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | N
         return a * per_absorption, ratio * per_absorption * a, molecules
 
     a = _absorption_for(wanted, scattered)
-    _check_absorption(a, f"kd = {wanted:g} with albedo = {omega:g} and backscatter_ratio = {ratio:g}")
     return InherentProperties(a, *scattered(a))
 
 
-def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RATIO) -> InherentProperties:
+def from_secchi(depth: float) -> InherentProperties:
     """Water given by its Secchi depth, at which a white disk disappears, at 532 nm.
+
+    The particles have the bb/b of Petzold's average particle, 0.0183.
 
     Parameters
     ----------
     depth : float
         Secchi depth z [m], 0.5 to 25.
-    backscatter_ratio : float
-        bb/b of the particles, 0.001 to 0.04.
-
-    Raises
-    ------
-    UserError
-        If the values together give less absorption than that of pure water.
 
     Notes
     -----
@@ -281,16 +261,14 @@ def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RAT
     assumed to see deepest at 532 nm.
     """
     z = in_range("depth", depth, *_SECCHI_RANGE)
-    ratio = in_range("backscatter_ratio", backscatter_ratio, 0.001, 0.04)
     kd = 1.7 / z
     c = 8.7 / z - kd
     water = pure_seawater()
 
     def scattered(a: float) -> Scattered:
-        return c - a, water.backscattering + ratio * (c - a - water.scattering), water.scattering
+        return c - a, water.backscattering + PETZOLD_BACKSCATTER_RATIO * (c - a - water.scattering), water.scattering
 
     a = _absorption_for(kd, scattered)
-    _check_absorption(a, f"depth = {z:g} with backscatter_ratio = {ratio:g}")
     return InherentProperties(a, *scattered(a))
 
 
@@ -355,15 +333,6 @@ def _case1_terms(lam: float) -> tuple[float, float, float]:
     wavelengths, factors, exponents = read_columns("case1_waters.csv")
     factor, exponent = (float(np.interp(lam, wavelengths, values)) for values in (factors, exponents))
     return water.absorption + water.backscattering, factor, exponent
-
-
-def _check_absorption(absorption: float, given: str) -> None:
-    """Reject an absorption below that of pure water."""
-    least = water_absorption(532)
-    if absorption < least:
-        raise UserError(
-            f"{given} must give at least the absorption of pure water, {least:g} 1/m, but gives {absorption:g}"
-        )
 
 
 def _diffuse_attenuation(absorption: float, scattering: float, backscattering: float, water_scattering: float) -> float:

@@ -19,8 +19,9 @@ def test_bag_has_its_first_row_in_the_south(tmp_path, corners):
     path = write_bag(tmp_path / "a.bag", HEIGHTS, (500000.0, 5999999.25), (2.0, 1.5), **changes)
     grid = read_bag(path)
     np.testing.assert_array_equal(grid.values, np.where(HEIGHTS == 1e6, np.nan, HEIGHTS))
-    assert grid.first == (500000.0, 5999999.25)
-    assert grid.cell == (2.0, 1.5)
+    assert grid.centre == (500002.0, 6000000.0)
+    np.testing.assert_array_equal(grid.positions["x"], [-2.0, 0.0, 2.0])
+    np.testing.assert_array_equal(grid.positions["y"], [-0.75, 0.75])
 
 
 @pytest.mark.parametrize(

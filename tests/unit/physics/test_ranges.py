@@ -159,8 +159,8 @@ RANGES = [
     ),
     (jerlov, {"water_type": "II"}, {"wavelength_nm": 450}),
     (chlorophyll, {"concentration": 1}, {"concentration": 0, "wavelength_nm": 390}),
-    (from_kd, {"kd": 0.1}, {"kd": 0.04, "albedo": 1, "backscatter_ratio": 0.5}),
-    (from_secchi, {"depth": 5}, {"depth": 30, "backscatter_ratio": 0.1}),
+    (from_kd, {"kd": 0.1}, {"kd": 0.04}),
+    (from_secchi, {"depth": 5}, {"depth": 30}),
 ]
 
 

@@ -157,9 +157,9 @@ def test_too_many_solids_for_components_are_refused_before_a_renderer_is_prepare
             render(tmp_path / "many.xml", components=True, passes=2, **more)
 
 
-def test_an_automatic_record_has_a_longest_length():
+def test_an_automatic_time_axis_has_a_longest_length():
     assert TimeAxis.covering(0, 1e7, 1e3).end_ns >= 1e7
-    with pytest.raises(UserError, match=r"the record from 0 to 1\.1e\+07 ns is longer than 1e\+07 ns, the most of an"):
+    with pytest.raises(UserError, match=r"the time axis from 0 to 1\.1e\+07 ns is longer than 1e\+07 ns, the most"):
         TimeAxis.covering(0, 1.1e7, 1e3)
     assert TimeAxis.covering(0, 1.1e7, 1e3, None, 11_000).bin_count == 11_000
 

@@ -211,5 +211,3 @@ def test_grids_without_a_middle_are_refused():
     for cells in (15, 0):
         with pytest.raises(UserError, match=f"cells = {cells} must be an even integer of at least 2"):
             realise(ElfouhailySpectrum(5), 10, cells, 1)
-    with pytest.raises(UserError, match=r"current of shape \(\) must be two velocities"):
-        realise(ElfouhailySpectrum(5), 10, 16, 1, current=1)

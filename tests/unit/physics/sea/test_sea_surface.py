@@ -11,7 +11,7 @@ from significance import assert_equal
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.realization import Motion, NestedHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import Band, Motion, realise_heights
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
@@ -67,7 +67,7 @@ def test_finer_cells_show_the_same_waves():
     coarse, fine, finest = (
         realise_heights(spectrum, 64.0, cell, 4, still, 0.0, 1.0)[0] for cell in (0.25, 0.0625, 0.015625)
     )
-    assert isinstance(finest, NestedHeights)
+    assert isinstance(finest.parts[0], Band)
     lines = 0.25 * np.arange(-20, 20)
     expected = coarse.sample(lines, lines)
     assert expected.std() > 0.03

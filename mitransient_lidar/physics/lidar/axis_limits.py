@@ -1,4 +1,4 @@
-"""Times of the first and the last light of a lidar, between which a record without given limits lies."""
+"""Times of the first and the last light of a lidar: the limits of a time axis that are not given."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.water.layers import WaterColumn
 
-#: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
+#: Level to which light falls in the column before the time axis ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 
 #: Time for light that is scattered several times after the last echo: the lesser of a multiple of the time that this
 #: echo spends in the water, for shallow water, and of a time [ns] and a share of it. Chosen with renders of longer
-#: records: less than 1e-4 of the energy arrives later.
+#: time axes: less than 1e-4 of the energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
 #: Largest distance from the beam at which the time of the way from it is added for the view [m].
@@ -123,7 +123,7 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class RecordLimits:
+class AxisLimits:
     """First and last arrival of light over all pixels, for an ideal pulse."""
 
     first_ns: float
@@ -147,7 +147,7 @@ class LidarView:
     reach
         Horizontal distance to the end of the scene [m], where light towards the horizon ends.
     column
-        Least depth to which water without a bottom is recorded [m], such as that of bubbles; None without water.
+        Least depth of the last light of water without a bottom [m], such as that of bubbles; None without water.
     """
 
     view: Cone
@@ -158,7 +158,7 @@ class LidarView:
     reach: float
     column: float | None
 
-    def limits(self, solids: Sequence[Solid], direct: bool = False) -> RecordLimits:
+    def limits(self, solids: Sequence[Solid], direct: bool = False) -> AxisLimits:
         """Find the first and the last arrival of light; of the last, `direct` echoes of surface and solids only.
 
         Notes
@@ -200,7 +200,7 @@ class LidarView:
             text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
             lasts.append((sum(self._latest(-depth)), text))
         last, end = max(lasts)
-        return RecordLimits(min(firsts), last, surface, end)
+        return AxisLimits(min(firsts), last, surface, end)
 
     @cached_property
     def _at_sea(self) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Limits of records that fit by themselves, against closed forms of single paths."""
+"""Limits of time axes that fit by themselves, against closed forms of single paths."""
 
 import math
 
@@ -8,9 +8,9 @@ from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 
@@ -92,7 +92,7 @@ def test_a_receiver_beside_the_laser():
     for one, height in ((view, 200.0), (beam, 150.0)):
         theta, phi = refracted_path(float(np.hypot(*(far - one.pose.origin[:2]))), height, 10.0, N)
         lengths.append(float(height / np.cos(theta) + GROUP * 10.0 / np.cos(phi)))
-    # That point lies above the bottom of the far edge; the record may be longer, not shorter.
+    # That point lies above the bottom of the far edge; the axis may be longer, not shorter.
     assert NS * sum(lengths) - 0.5 < found.last_ns < NS * sum(lengths) + 25
 
 
@@ -128,7 +128,7 @@ def test_a_solid_out_of_view_does_not_count():
     assert scene.limits([plane(8.0), Solid("hole", hole)]) == alone
 
 
-def test_a_target_without_a_bottom_does_not_end_the_record():
+def test_a_target_without_a_bottom_does_not_end_the_axis():
     target = np.array([[[-1.0, -1, -5], [1, -1, -5], [1, 1, -5]]])
     scene = lidar(cone(0.0), cone(0.0, 25.0), water(0.2))
     depth = 0.5 * math.log(1e6) / 0.2
@@ -208,5 +208,5 @@ def test_a_given_number_wins():
 
 
 def test_too_many_bins():
-    with pytest.raises(UserError, match=r"bin_width_ns = 1e-05 divides the record .* at least 0\.00016, for at most"):
+    with pytest.raises(UserError, match=r"bin_width_ns = 1e-05 divides the time axis .* at least 0\.00016, for"):
         TimeAxis.covering(1396.2, 1552.0, 1e-5)
