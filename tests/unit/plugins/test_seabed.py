@@ -5,6 +5,7 @@ import numpy as np
 import pyproj
 import pytest
 import xarray as xr
+from kernel_arrays import array
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -17,7 +18,7 @@ def load(**parameters):
 def look_down(shape, x, y):
     """Return heights [m], reflectances and normals under points (x, y), as rays find them."""
     scene = mi.load_dict({"type": "scene", "shape": shape})
-    x, y = (mi.Float(np.atleast_1d(values).astype(np.float32)) for values in (x, y))
+    x, y = (array(values) for values in (x, y))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 50.0), mi.Vector3f(0, 0, -1)))
     reflectance = si.bsdf().eval_diffuse_reflectance(si)
     return np.array(si.p)[2], np.array(reflectance)[0], np.array(si.n).T
