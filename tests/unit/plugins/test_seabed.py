@@ -210,5 +210,5 @@ def test_maps_with_coordinate_systems_are_read_again_and_again(tmp_path):
         )
         (tmp_path / f"{name}.prj").write_text(pyproj.CRS(32633).to_wkt("WKT1_ESRI"))
     beds = {name: {"type": "seabed", "filename": str(tmp_path / f"{name}.asc")} for name in ("one", "other")}
-    for _ in range(20):
+    for _ in range(8):
         assert len(mi.load_dict({"type": "scene", **beds}).shapes()) == 2
