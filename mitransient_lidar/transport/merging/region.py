@@ -103,7 +103,7 @@ class Region:
             length += dr.select(at_sea, dr.select(si.is_valid(), si.t, dr.inf), 0)
             at_sea &= si.is_valid() & scene.is_surface(si.shape)
             ray = si.spawn_ray(ray.d)
-        return float(dr.mean(dr.minimum(length, _longest_way(scene)))[0])
+        return float(dr.mean(dr.minimum(length, opaque(_longest_way(scene))))[0])
 
     def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
         """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""
