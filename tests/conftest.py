@@ -6,16 +6,12 @@ import os
 # processes.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-# Before Mitsuba: the package sets the path of LLVM for Dr.Jit.
+# Before Mitsuba: the package sets the path of LLVM for Dr.Jit. The process that distributes the tests needs no Mitsuba.
 import mitransient_lidar  # noqa: F401, I001
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-
-from mitransient_lidar.loading.variants import SUPPORTED_VARIANTS
 
 #: Comparisons of each worker of pytest-xdist.
 _comparisons = {}
@@ -51,6 +47,10 @@ def pytest_sessionfinish(session):
 @pytest.fixture(autouse=True, scope="session")
 def variant():
     """Run in the variant that the package has chosen, and leave it set: in another one there are no plugins."""
+    import mitsuba as mi
+
+    from mitransient_lidar.loading.variants import SUPPORTED_VARIANTS
+
     chosen = mi.variant()
     assert chosen in SUPPORTED_VARIANTS
     yield chosen
@@ -60,6 +60,8 @@ def variant():
 @pytest.fixture(autouse=True)
 def clean_drjit():
     """Leave Dr.Jit's flags as they were, whatever a test sets."""
+    import drjit as dr
+
     flags = {flag: dr.flag(flag) for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls)}
     yield
     for flag, value in flags.items():
@@ -68,6 +70,8 @@ def clean_drjit():
 
 def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None, bottom=8.0, rho=0.1, extra=None):
     """Return a loaded scene: the table system over a flat, almost smooth sea, with changes by group."""
+    import mitsuba as mi
+
     scene = {
         "type": "scene",
         "integrator": {"type": "lidar_volpath", "paths_per_pass": 2**16, **(integrator or {})},

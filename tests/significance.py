@@ -6,7 +6,7 @@ The run of all tests counts them and fails when they add up to more than `SUITE_
 """
 
 import numpy as np
-from scipy.stats import binom, chi2, t
+import scipy
 
 #: Chance that any test of the suite fails though nothing is wrong.
 SUITE_FALSE_ALARM = 1e-3
@@ -29,7 +29,7 @@ def largest_z(passes, values=1):
     with one number for each value.
     """
     _count()
-    return t.isf(0.5 * FALSE_ALARM / values, np.asarray(passes) - 1)
+    return scipy.stats.t.isf(0.5 * FALSE_ALARM / values, np.asarray(passes) - 1)
 
 
 def largest_error(passes, error):
@@ -38,26 +38,26 @@ def largest_error(passes, error):
     For normal samples: 2.3 times the error for 8 passes, 1.9 for 16, 1.6 for 32.
     """
     _count()
-    return error * float(chi2.isf(FALSE_ALARM, passes - 1) / (passes - 1)) ** 0.5
+    return error * float(scipy.stats.chi2.isf(FALSE_ALARM, passes - 1) / (passes - 1)) ** 0.5
 
 
 def largest_chi2(freedom):
     """Return the limit of a sum of squares of `freedom` standard normal numbers."""
     _count()
-    return float(chi2.isf(FALSE_ALARM, freedom))
+    return float(scipy.stats.chi2.isf(FALSE_ALARM, freedom))
 
 
 def variance_limits(freedom, values=1):
     """Return the limits of the ratio of a variance with this freedom to the true one, for each of some values."""
     _count()
     tail = 0.5 * FALSE_ALARM / values
-    return chi2.isf([1 - tail, tail], freedom) / freedom
+    return scipy.stats.chi2.isf([1 - tail, tail], freedom) / freedom
 
 
 def largest_count(trials, chance):
     """Return the limit of the number of `trials` that have a property, each with at most this chance."""
     _count()
-    return int(binom.isf(FALSE_ALARM, trials, chance))
+    return int(scipy.stats.binom.isf(FALSE_ALARM, trials, chance))
 
 
 def mean_and_error(samples):

@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+from mitransient_lidar.transport.opaque import aligned_ray
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
@@ -177,8 +178,8 @@ def _surface_points(scene: LidarScene, solid: mi.Shape) -> FloatArray:
     if solid.class_name() not in _SAMPLED:
         box = solid.bbox()
         origins, directions = box_rays(np.array(box.min), np.array(box.max), _TICKS)
-        ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
-        hit = scene_of_shapes([solid], scene.groups).ray_intersect(ray)
+        rays = aligned_ray(origins, directions, np.full(len(origins), np.inf))
+        hit = scene_of_shapes([solid], scene.groups).ray_intersect(rays)
         points: FloatArray = np.array(hit.p, dtype=np.float64).T[np.array(hit.is_valid())]
         return points
     ticks = np.linspace(0, 1, _TICKS + 1)

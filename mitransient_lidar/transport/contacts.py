@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.transport.opaque import aligned_ray
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.solids import BEFORE, box_rays, scene_of_shapes
 
@@ -158,9 +159,7 @@ def _contacts_apart(pairs: Sequence[_Pair], largers: mi.Scene, others: mi.Scene)
     if len(owners) == 0:
         return {}
     origins, directions, ends = (np.concatenate(arrays) for arrays in zip(*rays, strict=True))
-    ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
-    ray.maxt = mi.Float(ends)
-    si = others.ray_intersect(ray)
+    si = others.ray_intersect(aligned_ray(origins, directions, ends))
     dr.eval(si)
     tolerance = _tolerance(dr.max(dr.abs(si.p)))
     back = mi.Ray3f(dr.fma(2 * tolerance, si.n, si.p), -si.n)
@@ -201,10 +200,9 @@ def _have_bodies(
     starts = points - 2 * tolerance[:, None] * normals
     along = np.abs(normals) > _LEVEL
     ends = (np.where(normals < 0, high, low) - starts) / np.where(along, -normals, 1.0)
-    ray = mi.Ray3f(mi.Point3f(starts.T), mi.Vector3f(-normals.T))
     # A flat shape ends before the ray begins.
-    ray.maxt = mi.Float(np.maximum(np.where(along, ends, np.inf).min(axis=1) + tolerance, tolerance))
-    return np.array(scene.ray_test(ray))
+    ends = np.maximum(np.where(along, ends, np.inf).min(axis=1) + tolerance, tolerance)
+    return np.array(scene.ray_test(aligned_ray(starts, -normals, ends)))
 
 
 def _separation(contact: _Contact, surfaces: Sequence[mi.Shape], bottoms: Sequence[mi.Shape]) -> _Separation | None:
@@ -229,9 +227,8 @@ def _refuse_visible(contacts: Sequence[_Contact], shapes: Sequence[mi.Shape], gr
         return
     points, normals = (np.array([getattr(one, name) for one in contacts]) for name in ("point", "normal"))
     starts = points + 2 * _tolerance(np.abs(points).max(axis=1))[:, None] * normals
-    ray = mi.Ray3f(mi.Point3f(starts.T), mi.Vector3f(normals.T))
-    ray.maxt = mi.Float(4 * _step(points))
-    covered = np.array(scene_of_shapes(shapes, groups).ray_test(ray))
+    rays = aligned_ray(starts, normals, 4 * _step(points))
+    covered = np.array(scene_of_shapes(shapes, groups).ray_test(rays))
     for number in np.flatnonzero(~covered):
         raise _refusal(contacts[int(number)], "it is not defined which one is seen")
 

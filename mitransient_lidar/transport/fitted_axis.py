@@ -18,7 +18,7 @@ from mitransient_lidar.physics.lidar.system_attenuation import system_attenuatio
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.opaque import opaque, opaque_point
 from mitransient_lidar.transport.plugin_types import GatedFilm, OwnPlugin, Transmitter
 from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
@@ -109,8 +109,8 @@ def total_reflection_ns(view: Rays, beam: Rays) -> float:
     lidar = [opaque_point(rays.pose.origin) for rays in (beam, view)]
     for rays in (view, beam):
         si = rays.first
-        beyond = rays.on_sea & (scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1)
-        time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
+        beyond = rays.on_sea & (opaque(scene.refractive_index**2) * (1 - dr.square(si.wi.z)) > 1)
+        time_ns = opaque(1e9 / C0 * scene.group_index) * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
         if dr.count(beyond)[0] > _REFLECTED * len(rays.directions):
             found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
     return min(found)

@@ -35,6 +35,17 @@ def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
     return mi.Point3f(*(opaque(value) for value in values))
 
 
+def aligned_ray(origins: NDArray[np.float64], directions: NDArray[np.float64], ends: NDArray[np.float64]) -> mi.Ray3f:
+    """Return rays from origins (n, 3) [m] in directions (n, 3) up to lengths (n,) [m].
+
+    Their coordinates are arrays of their own: parts of one array would make its size a part of kernels.
+    """
+    origin, direction = ([aligned(mi.Float, one) for one in values.T] for values in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
+    ray.maxt = aligned(mi.Float, ends)
+    return ray
+
+
 def shape_number(shape: mi.Shape) -> int:
     """Return the number of a shape, above 0, as kernels know it."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
-from mitransient_lidar.transport.opaque import aligned, shape_number
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
@@ -222,11 +222,11 @@ class Probe:
         # Relative to the reference length, as all lengths here.
         length = laser.distance(first.p) + receiver.distance(first.p)
         solid = on_sea & below.is_valid() & ~scene.is_surface(below.shape)
-        water = 2 * below.t * scene.group_index
+        water = 2 * below.t * opaque(scene.group_index)
         if scene.submerged:
             # What rays meet first is the sea's or a solid's echo.
-            places = [mi.Point3f(each.pose.origin.tolist()) for each in (transmitter, scene.receiver)]
-            length += (scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
+            places = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
+            length += opaque(scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
             below, solid, water = first, first.is_valid() & ~on_sea, mi.Float(0)
         # At once: each array that is read alone would trace all rays again.
         dr.eval(start, beam, first, below, on_sea, solid, length, water)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.opaque import aligned, changed
+from mitransient_lidar.transport.opaque import aligned, changed, opaque_index
 
 #: An array of Dr.Jit with one entry a shot, or an object that holds such arrays.
 Tree = TypeVar("Tree")
@@ -119,7 +119,9 @@ def stratified_point(index: mi.UInt32, count: int | mi.UInt64, rng: mi.PCG32) ->
     The strata are equal pieces of a Z-order curve (Morton 1966): neighbours in number are neighbours in the square, so
     that rays of a packet and their memory accesses stay together.
     """
-    along = mi.UInt32(((mi.UInt64(index) << 32) | mi.UInt64(rng.next_uint32())) // count)
+    # Dr.Jit compiles another kernel for every number by which it divides.
+    strata = dr.opaque(mi.UInt64, count) if isinstance(count, int) else count
+    along = mi.UInt32(((mi.UInt64(index) << 32) | mi.UInt64(rng.next_uint32())) // strata)
     rest = rng.next_uint32()
     # 16 bits of each coordinate from the curve and 8 random ones fill a float32 below 1 exactly.
     x = (_even_bits(along) << 8) | (rest & 0xFF)
@@ -131,7 +133,7 @@ def interleaved_point(index: mi.UInt32, count: int, sets: int, rng: mi.PCG32) ->
     """Return stratified points of `sets` sets, to which the lanes number `index` of `count` belong in turn."""
     if count % sets == 0:
         return stratified_point(index // sets, count // sets, rng)
-    return stratified_point(index // sets, mi.UInt64((count + sets - 1 - index % sets) // sets), rng)
+    return stratified_point(index // sets, mi.UInt64((opaque_index(count + sets - 1) - index % sets) // sets), rng)
 
 
 def unit_points(count: int, index: mi.UInt32 | None = None) -> mi.Point2f:

@@ -297,15 +297,15 @@ def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 def test_passes_share_their_kernels(lidar_scene, integrator):
-    """A number that differs between passes and is part of a kernel would compile it again in every pass."""
+    """A number of a pass, its seed or that of its paths, that is part of a kernel would compile it again."""
     scene = lidar_scene(integrator={"type": integrator, "paths_per_pass": 2**12}, water={"scattering": 0.2})
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     renderer.render_pass(0)
     found = []
-    for seed in (1, 2):
+    for seed, paths in ((1, 2**12), (2, 2**11)):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            renderer.render_pass(seed)
+            renderer.render_pass(seed, paths=paths)
             found.append([kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT])
     assert found[0] == found[1]
     assert len(found[0]) > 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import significance
 from frequencies import assert_counts
+from kernel_arrays import array
 from scipy.spatial import cKDTree
 from significance import largest_z
 
@@ -44,7 +45,7 @@ def area_by_cells(field, gx_edges, gy_edges, fine=40):
     x = (gx_edges[:-1, None] + np.diff(gx_edges)[:, None] * sub).ravel()
     y = (gy_edges[:-1, None] + np.diff(gy_edges)[:, None] * sub).ravel()
     angle_x, angle_y = np.meshgrid(x, y, indexing="ij")
-    inside = np.array(field.contains(mi.Float(angle_x.ravel()), mi.Float(angle_y.ravel()))).reshape(len(x), len(y))
+    inside = np.array(field.contains(array(angle_x.ravel()), array(angle_y.ravel()))).reshape(len(x), len(y))
     cells = inside.reshape(len(gx_edges) - 1, fine, len(gy_edges) - 1, fine).mean(axis=(1, 3))
     return cells * np.diff(gx_edges)[:, None] * np.diff(gy_edges)[None, :]
 
@@ -165,8 +166,8 @@ def test_the_lookup_finds_what_the_fields_themselves_say(symbolic):
     fields = many_fields()
     lookup = FovLookup(fields)
     rng = np.random.default_rng(5)
-    angle_x, angle_y = (mi.Float(rng.uniform(-20, 20, 2**14) * MRAD) for _ in range(2))
-    u = mi.Float(rng.uniform(0, 1, 2**14))
+    angle_x, angle_y = (array(rng.uniform(-20, 20, 2**14) * MRAD) for _ in range(2))
+    u = array(rng.uniform(0, 1, 2**14))
     flags = dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls
     with dr.scoped_set_flag(flags[0], symbolic), dr.scoped_set_flag(flags[1], symbolic):
         chosen, count = (np.array(a) for a in lookup.find(angle_x, angle_y, u))
@@ -228,7 +229,7 @@ def test_hexagons_fill_the_same_share_of_their_circle_whatever_their_number(layo
     angle_x, angle_y = (np.array(g, dtype=np.float64) for g in pixels.sample(random_points()))
     assert 14.9 * MRAD < np.hypot(angle_x, angle_y).max() <= 15.0001 * MRAD
     centres = pixels.centres()
-    pixel, count = pixels.pixel_at(*(mi.Float(g) for g in centres.T), mi.Float(0))
+    pixel, count = pixels.pixel_at(*(array(g) for g in centres.T), mi.Float(0))
     np.testing.assert_array_equal(np.array(pixel), np.arange(pixels.count))
     assert np.all(np.array(count) == 1)
     # Rows from far to near, and in a row from left (+angle_y) to right.
@@ -249,7 +250,7 @@ def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
     if shape == "circle":
         inside &= np.hypot(angle_x, angle_y) <= 15 * MRAD
     number = (x.astype(int)[:, None] * columns + y.astype(int)).ravel()
-    pixel, count = pixels.pixel_at(mi.Float(angle_x.ravel()), mi.Float(angle_y.ravel()), mi.Float(0))
+    pixel, count = pixels.pixel_at(array(angle_x.ravel()), array(angle_y.ravel()), mi.Float(0))
     pixel, count = np.array(pixel), np.array(count).reshape(inside.shape) > 0
     assert np.mean(inside != count) < 1e-4
     assert np.all((pixel == number)[inside.ravel()])
@@ -290,7 +291,7 @@ def test_a_map_has_a_pixel_for_each_label():
     assert counts[~lit].sum() <= 1e-5 * COUNT
     assert_counts(counts[lit], expected[lit])
     assert_counts(np.bincount(pixel, count), COUNT * np.array([2, 2, 3]) / 7)
-    outside = pixels.pixel_at(mi.Float(0.0151, -0.0151, 0.0, 0.0), mi.Float(0.0, 0.0, 0.0151, -0.0151), mi.Float(0))
+    outside = pixels.pixel_at(array([0.0151, -0.0151, 0.0, 0.0]), array([0.0, 0.0, 0.0151, -0.0151]), mi.Float(0))
     assert np.all(np.array(outside[1]) == 0)
 
 

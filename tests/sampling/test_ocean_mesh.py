@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from kernel_arrays import array, vector
 from significance import assert_equal, assert_same
 
 from mitransient_lidar.loading.scenes import open_scene
@@ -69,10 +70,10 @@ def test_rays_find_no_hole_and_facets_are_flat():
     # Random points, and points on vertices and on edges of the grid.
     points = np.concatenate([rng.uniform(-15.9, 15.9, (100_000, 2)), rng.integers(-15, 15, (2000, 2))])
     points = np.concatenate([points, np.stack([rng.integers(-15, 15, 2000), rng.uniform(-15, 15, 2000)], axis=1)])
-    origin = mi.Point3f(*(mi.Float(p) for p in points.T), 50.0)
+    origin = mi.Point3f(*(array(p) for p in points.T), 50.0)
     for height, down in ((50.0, -1.0), (-50.0, 1.0)):
         origin.z = height
-        si = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, down)))
+        si = scene.ray_intersect(mi.Ray3f(origin, vector((0, 0, down))))
         assert np.all(np.array(si.is_valid()))
         np.testing.assert_allclose(np.array(si.sh_frame.n), np.array(si.n), atol=1e-6)
         assert np.all(np.array(si.n.z) > 0)
@@ -83,7 +84,7 @@ def test_rays_find_no_hole_and_facets_are_flat():
 def test_ripples_lie_along_the_wind(direction):
     """The roughness axis u is the texture's: without coordinates it is arbitrary from facet to facet."""
     scene, _ = surface(wind_direction_deg=direction, **PATCH)
-    x, y = (mi.Float(p) for p in np.random.default_rng(2).uniform(-15, 15, (2, 1000)))
+    x, y = (array(p) for p in np.random.default_rng(2).uniform(-15, 15, (2, 1000)))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 50), mi.Vector3f(0, 0, -1)))
     along = np.array(si.sh_frame.s)
     angle = np.degrees(np.arctan2(along[1], along[0]))
@@ -182,9 +183,9 @@ def test_far_rays_meet_the_sea_from_above_and_below():
     for height, down in ((20.0, -1.0), (-20.0, 1.0)):
         for slant in (0.0, 0.5, 5.0):  # up to 79 degrees off nadir
             start = points - slant * abs(height) * np.array([1.0, 0.0])
-            origin = mi.Point3f(*(mi.Float(p) for p in start.T), height)
+            origin = mi.Point3f(*(array(p) for p in start.T), array(height))
             direction = np.array([slant, 0, down]) / np.hypot(slant, 1)
-            si = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(direction.tolist())))
+            si = scene.ray_intersect(mi.Ray3f(origin, vector(direction)))
             met = np.array(si.is_valid())
             # One ray in 300 000 slips between two triangles.
             assert met[np.abs(points[:, 0]) < 380].mean() > 1 - 5e-5
@@ -215,7 +216,7 @@ def test_height_maps_become_surfaces(tmp_path):
     assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
     assert shape.sea.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
     x = np.random.default_rng(1).uniform(-28, 28, 1000)
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(array(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
     np.testing.assert_allclose(np.array(si.p.z), 0.1 * np.clip(x, -10, 10), atol=0.03)
 
 
@@ -314,7 +315,7 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
         parameters = mi.traverse(shape)
         names = ("vertex_positions", "vertex_texcoords", "faces", "bsdf.alpha_u.value", "bsdf.alpha_v.value")
-        rays = mi.Ray3f(mi.Point3f(mi.Float(np.linspace(-3, 12, 31)), 0.3, 20.0), mi.Vector3f(0, 0, -1))
+        rays = mi.Ray3f(mi.Point3f(array(np.linspace(-3, 12, 31)), 0.3, 20.0), mi.Vector3f(0, 0, -1))
         parts.append([*(np.array(parameters[name]) for name in names), np.array(loaded.ray_intersect(rays).t)])
         assert shape.sea.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):

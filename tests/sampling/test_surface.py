@@ -163,7 +163,7 @@ def test_ripples_of_a_series_return_its_light(deg, azimuth_deg):
     scene, shape = surface(**STEEP)
     up, across = cox_munk(10.0)
     series = GramCharlierSeries.of_clean_sea(10.0)
-    nodes = np.linspace(-1.6, 1.6, 1601)
+    nodes = np.linspace(-1.6, 1.6, 401)
     rises = np.meshgrid(nodes, nodes)
 
     def density(x, y):

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from kernel_arrays import vector
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import norm
 from significance import assert_distribution, largest_z
@@ -33,7 +34,7 @@ def random_points(seed):
 def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
     """At z = 0, and in a crest above it: the line to the laser, refracted where the point is."""
     lobe = lobe_at(angle)
-    laser = lobe.direction_from(mi.Point3f(*point))
+    laser = lobe.direction_from(mi.Point3f(vector(point)))
     line = KernelPose.from_angles(200.0, angle).origin - np.array([point[0], point[1], 0.0])
     line /= np.linalg.norm(line)
     np.testing.assert_allclose(np.array(laser.in_air).ravel(), line, atol=2e-6)
@@ -46,7 +47,7 @@ def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
 def test_density_integrates_to_the_lit_share(angle, variance):
     """Facets that turn away from the laser make no direction: what they lack is the share of samples of density 0."""
     lobe = lobe_at(angle, variance)
-    laser = lobe.direction_from(mi.Point3f(0.0, 0.0, -4.0))
+    laser = lobe.direction_from(mi.Point3f(vector((0.0, 0.0, -4.0))))
     lit = np.array(lobe.sample(laser, random_points(8))[1]) > 0
     # Slope of a facet along the azimuth of the laser, of variance s^2 / 2, beyond which it sees the laser's back.
     in_air = np.array(laser.in_air, dtype=np.float64).ravel()
@@ -57,7 +58,7 @@ def test_density_integrates_to_the_lit_share(angle, variance):
     phi = (np.arange(2000) + 0.5) / 2000 * 2 * np.pi
     z, phi = (a.ravel() for a in np.meshgrid(cosine, phi))
     r = np.sqrt(1 - z * z)
-    direction = mi.Vector3f(mi.Float(r * np.cos(phi)), mi.Float(r * np.sin(phi)), mi.Float(z))
+    direction = vector((r * np.cos(phi), r * np.sin(phi), z))
     density = np.array(lobe.pdf(laser, direction), dtype=np.float64)
     assert np.all(np.isfinite(density))
     assert np.all(density >= 0)
@@ -68,7 +69,7 @@ def test_density_integrates_to_the_lit_share(angle, variance):
 def test_sampled_directions_are_those_of_snells_law_at_their_facet(angle):
     """n (w x m) = i x m for the facet m that is drawn, and w points up through it."""
     lobe = lobe_at(angle, 0.03)
-    laser = lobe.direction_from(mi.Point3f(0.0, 0.0, -4.0))
+    laser = lobe.direction_from(mi.Point3f(vector((0.0, 0.0, -4.0))))
     direction, pdf = (np.array(a, dtype=np.float64) for a in lobe.sample(laser, random_points(9)))
     in_air = np.array(laser.in_air, dtype=np.float64).ravel()
     lit = pdf > 0
@@ -117,8 +118,8 @@ def test_ripples_turn_with_the_wind(wind, wi):
     values = []
     for degrees in (0.0, wind):
         si, bsdf = ripples(spectrum="flat", wind_speed=10.0, wind_direction_deg=degrees)
-        si.wi = si.to_local(mi.Vector3f(turned(unit(wi), degrees).tolist()))
-        out = si.to_local(mi.Vector3f(*(mi.Float(c) for c in turned(wo, degrees))))
+        si.wi = si.to_local(vector(turned(unit(wi), degrees)))
+        out = si.to_local(vector(turned(wo, degrees)))
         values.append(np.array(bsdf.eval(context, si, out)).ravel()[-wo.shape[1] :])
     assert np.mean(values[0] > 1e-3) > 0.02
     np.testing.assert_allclose(values[1], values[0], rtol=2e-3, atol=1e-5)
@@ -127,7 +128,7 @@ def test_ripples_turn_with_the_wind(wind, wi):
 @pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], [0.2, -0.15, -0.95]])
 def test_ripples_sample_their_density_and_keep_the_energy(wi):
     si, bsdf = ripples(spectrum="flat", wind_speed=10.0, wind_direction_deg=30.0)
-    si.wi = si.to_local(mi.Vector3f(unit(wi).tolist()))
+    si.wi = si.to_local(vector(unit(wi)))
     context = mi.BSDFContext()
 
     def sample(u):

@@ -11,7 +11,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_vector
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
 from mitransient_lidar.transport.rng import Lanes, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
@@ -96,14 +96,14 @@ class Region:
         """Return the mean distance in the water along the axis to a solid, or to the depth of the record's end [m]."""
         down = refract_level(scene.transmitter.pose.axis, scene.refractive_index)
         # From the mean sea level: below the deepest trough, which lies anywhere, may be below a shallow bottom here.
-        ray = mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), mi.Vector3f(down.tolist()))
+        ray = mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), opaque_vector(down))
         length, at_sea = dr.zeros(mi.Float, PROBE_RAYS), dr.full(mi.Bool, True, PROBE_RAYS)
         for _ in range(_MOST_CROSSINGS):
             si = scene.ray_intersect(ray, at_sea)
             length += dr.select(at_sea, dr.select(si.is_valid(), si.t, dr.inf), 0)
             at_sea &= si.is_valid() & scene.is_surface(si.shape)
             ray = si.spawn_ray(ray.d)
-        return float(dr.mean(dr.minimum(length, _longest_way(scene)))[0])
+        return float(dr.mean(dr.minimum(length, opaque(_longest_way(scene))))[0])
 
     def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
         """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""

@@ -155,7 +155,7 @@ def test_a_flipped_bit_gives_the_same_result_or_is_refused(tmp_path):
     results.save(light(values, scene="table1"), whole)
     data, same = whole.read_bytes(), results.open(whole)
     refused = 0
-    for place in range(8, len(data), 3):
+    for place in range(8, len(data), 7):
         part.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
         try:
             read = results.open(part)
@@ -163,7 +163,7 @@ def test_a_flipped_bit_gives_the_same_result_or_is_refused(tmp_path):
             refused += 1
             continue
         assert read.identical(same)
-    assert refused > len(data) / 6
+    assert refused > len(data) / 14
 
 
 def test_unwritable_path_is_an_os_error(tmp_path):

@@ -3,9 +3,11 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from kernel_arrays import array, vector
 
 from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.path import PathPoint
 from mitransient_lidar.transport.path_classes import PathClasses
 
@@ -17,10 +19,11 @@ def test_numbers_and_flags_are_stored_without_loss():
     # A sign that a comparison finds would lose the flags of 0 and of NaN, which must stay NaN to be reported.
     place, index = dr.arange(mi.UInt32, len(NUMBERS)), np.arange(len(NUMBERS), dtype=np.uint32) << 28
     for flag in (False, True):
+        opaque_flag = dr.opaque(mi.Bool, flag)
         for sums in range(4):  # Packets of one, two and four numbers.
             store = PackedStore(len(NUMBERS), {"number|flag": "Float", "index": "UInt32", "sums": sums})
-            given = [mi.Float(np.roll(NUMBERS, k)) for k in range(sums)]
-            values = {"number": mi.Float(NUMBERS), "flag": mi.Bool(flag), "index": mi.UInt32(index), "sums": given}
+            given = [array(np.roll(NUMBERS, k)) for k in range(sums)]
+            values = {"number": array(NUMBERS), "flag": opaque_flag, "index": aligned(mi.UInt32, index), "sums": given}
             store.write(values, place, mi.Bool(True))
             found = store.read(place)
             np.testing.assert_array_equal(np.array(found["number"]), np.abs(NUMBERS))
@@ -35,9 +38,9 @@ def test_photons_are_stored_without_loss():
     direction = random.normal(size=(3, count))
     direction /= np.linalg.norm(direction, axis=0)
     numbers = random.exponential(size=(6, count)) * (random.random((6, count)) < 0.7)
-    throughput, summed, inverse_density, length, position, change = map(mi.Float, np.float32(numbers))
+    throughput, summed, inverse_density, length, position, change = map(array, numbers)
     point = PathPoint(
-        direction=mi.Vector3f(np.float32(direction)),
+        direction=vector(direction),
         length=length,
         throughput=throughput,
         lost=mi.Bool(random.random(count) < 0.5),

@@ -150,7 +150,7 @@ def test_a_column_that_waves_focus_does_not_delay_the_surface():
 
 def focused_shots(sigma, deepest, heights, rise):
     """Records of 100 columns that single shots focus by other factors at other depths, with noise."""
-    fine, blur = np.arange(-40, 120, 0.01), np.exp(-0.5 * (np.arange(-20, 20, 0.01) / sigma) ** 2)
+    fine, blur = np.arange(-40, 120, 0.05), np.exp(-0.5 * (np.arange(-20, 20, 0.05) / sigma) ** 2)
     rng = np.random.default_rng(4)
     signals = []
     for depth, height in zip(rng.uniform(0.3, deepest, 100), rng.uniform(*heights, 100), strict=True):

@@ -254,11 +254,11 @@ def test_swell_at_dense_waves_has_its_slopes(period, cell_integrals):
 def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     """A direction counted clockwise, or along taken for across, changes the slopes by a fifth and more."""
     spectrum = SPECTRA[kind]
-    k = np.geomspace(2e-3, 8000, 12000)
+    k = np.geomspace(2e-3, 8000, 4000)
     if kind not in ("elfouhaily", "pierson_moskowitz", "jonswap", "matched"):
-        k = k[k < 400][::2]
+        k = k[k < 400]
     k = k[:, None]
-    count = 256 if kind not in ("elfouhaily", "matched") else 8
+    count = 128 if kind not in ("elfouhaily", "matched") else 8
     phi = (np.arange(count) + 0.5) * 2 * np.pi / count
     kx, ky = k * np.cos(phi), k * np.sin(phi)
     ring = directional(spectrum, kx, ky) * k**2 * 2 * np.pi
