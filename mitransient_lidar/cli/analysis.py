@@ -13,7 +13,7 @@ from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, re
 from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.tables import write_csv
+from mitransient_lidar.core.tables.written import write_csv
 
 _REFUSED = 1  # exit code of a fit that is refused
 

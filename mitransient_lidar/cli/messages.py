@@ -14,7 +14,7 @@ import typer
 
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
-from mitransient_lidar.core.tables import aligned_lines
+from mitransient_lidar.core.tables.written import aligned_lines
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.tables import aligned_lines
+from mitransient_lidar.core.tables.written import aligned_lines
 
 _HEADING = "Scenes and system"
 

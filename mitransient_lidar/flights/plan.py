@@ -14,12 +14,12 @@ from typing import Annotated, Any
 import numpy as np
 
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
-from mitransient_lidar.core.coordinate_systems import MapSystem, map_system
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.formats.toml_files import parse_toml
+from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system
 from mitransient_lidar.core.options import Option, positive_option
 from mitransient_lidar.core.plans import Plan, one_of
-from mitransient_lidar.core.toml_files import parse_toml
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.dom import minidom
 
-from mitransient_lidar.core.documents import check_xml
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
+from mitransient_lidar.core.formats.documents import check_xml
 from mitransient_lidar.core.validation import shown
 
 #: Most files that a scene and its parts include.

@@ -16,9 +16,9 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from mitransient_lidar.core.array_files import damaged_file
 from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import open_file
+from mitransient_lidar.core.formats.array_files import damaged_file
 from mitransient_lidar.core.validation import FloatArray
 
 #: Plugins that read PLY files, and those that read grids.

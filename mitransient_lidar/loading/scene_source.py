@@ -36,9 +36,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import check_regular, is_file_name, is_there, open_file
+from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, PLUGINS
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders

@@ -30,10 +30,10 @@ import numpy.typing as npt
 import OpenEXR
 import xarray as xr
 
-from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result
-from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
+from mitransient_lidar.core.formats.array_files import check_exr, damaged_file, largest_result
+from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.results.attributes import attribute, shown
 

@@ -12,9 +12,9 @@ from typing import Union
 
 import xarray as xr
 
-from mitransient_lidar.core.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path, open_file, replacing
+from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, netcdf, sum_errors
 from mitransient_lidar.results.dataset import LIGHT, check_axes

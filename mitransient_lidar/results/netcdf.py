@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.array_files import check_hdf5, check_size, damaged_file, largest_result
-from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file
+from mitransient_lidar.core.formats.array_files import check_hdf5, check_size, damaged_file, largest_result
+from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.results.attributes import attribute, shown

@@ -14,8 +14,8 @@ import pytest
 from same_bits import assert_same_bits
 
 import mitransient_lidar
-from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.formats.array_files import read_exr
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.waveforms import plot_waveforms
 from mitransient_lidar.results import save

@@ -11,7 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.bottom_errors import REASONS, ReflectanceFlag
 from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
-from mitransient_lidar.core.tables import table_lines
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 
 _MOST_SHOTS = 200  # of a table

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.tables import aligned_lines, write_csv
+from mitransient_lidar.core.tables.written import aligned_lines, write_csv
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import UNITLESS, Column
-from mitransient_lidar.core.text_tables import read_time_samples
+from mitransient_lidar.core.tables.headings import UNITLESS, Column
+from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import (
     Checked,
     FloatArray,
@@ -122,7 +122,7 @@ class GateShape:
     def from_file(cls, path: str | PathLike[str]) -> GateShape:
         """Read a measured gate, times and transmissions as for `sampled`, from a text file.
 
-        The columns are those of `core.text_tables.read_time_samples`; a transmission may be in %.
+        The columns are those of `core.tables.text_tables.read_time_samples`; a transmission may be in %.
         """
         return cls.sampled(*read_time_samples(path, _TRANSMISSION))
 

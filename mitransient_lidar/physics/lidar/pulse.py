@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import Column
-from mitransient_lidar.core.text_tables import read_time_samples
+from mitransient_lidar.core.tables.headings import Column
+from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral, locate, node_integrals
 
@@ -92,7 +92,7 @@ class Pulse:
         Parameters
         ----------
         path : path-like
-            File for `core.text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
+            File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
             be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0,
             down to -0.1 of the largest one, are noise and set to 0 with a warning in the log.
 

@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.formats.toml_files import check_keys, parse_toml, required
 from mitransient_lidar.core.options import Option, positive_option
 from mitransient_lidar.core.plans import Plan, one_of
-from mitransient_lidar.core.text_tables import read_time_samples
-from mitransient_lidar.core.toml_files import check_keys, parse_toml, required
+from mitransient_lidar.core.tables.headings import Column
+from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import Column
-from mitransient_lidar.core.text_tables import read_two_columns
+from mitransient_lidar.core.tables.headings import Column
+from mitransient_lidar.core.tables.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_interpolation
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -38,7 +38,7 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     Parameters
     ----------
     path : path-like
-        Text file of two columns, as `core.text_tables.read_table` reads it: scattering angle in degrees, or in rad if
+        Text file of two columns, as `text_tables.read_table` reads it: scattering angle in degrees, or in rad if
         its heading says so, increasing within 0 to 180 degrees, at least 10 of any spacing, the last 170 or more; and
         value, positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 

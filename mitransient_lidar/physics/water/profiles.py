@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import read_netcdf, readable_suffix
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
-from mitransient_lidar.core.grids import NO_DATA, undeclared_no_data
-from mitransient_lidar.core.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
-from mitransient_lidar.core.text_tables import complete_rows, read_table
+from mitransient_lidar.core.formats.array_files import read_netcdf, readable_suffix
+from mitransient_lidar.core.maps.grids import NO_DATA, undeclared_no_data
+from mitransient_lidar.core.tables.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
+from mitransient_lidar.core.tables.text_tables import complete_rows, read_table
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
@@ -261,7 +261,7 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     Parameters
     ----------
     path : path
-        ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `core.text_tables.read_table` reads, or ``.nc``, NetCDF-4
+        ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `text_tables.read_table` reads, or ``.nc``, NetCDF-4
         with variables over the dimension ``depth`` or ``z``, whose attributes ``units`` and ``positive`` are read.
         Names of columns, in any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
 

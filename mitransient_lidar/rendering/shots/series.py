@@ -15,12 +15,12 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
-from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
-from mitransient_lidar.core.tables import table_lines
-from mitransient_lidar.core.text_tables import read_two_columns
+from mitransient_lidar.core.tables.headings import Column
+from mitransient_lidar.core.tables.text_tables import read_two_columns
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone

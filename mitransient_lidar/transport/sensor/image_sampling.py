@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitransient_lidar.core.array_files import check_size, damaged_file, read_exr, read_npy, readable_suffix
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file
+from mitransient_lidar.core.formats.array_files import check_size, damaged_file, read_exr, read_npy, readable_suffix
 from mitransient_lidar.transport.opaque import aligned
 
 

@@ -8,8 +8,8 @@ import OpenEXR
 import pytest
 import xarray as xr
 
-from mitransient_lidar.core.array_files import read_exr, read_netcdf, read_npy, read_npz, readable_suffix
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.formats.array_files import read_exr, read_netcdf, read_npy, read_npz, readable_suffix
 
 VALUES = np.arange(12.0).reshape(3, 4)
 

@@ -5,7 +5,15 @@ import time
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import METRES, PER_METRE, TIME, UNITLESS, Column, parse_heading, read_headings
+from mitransient_lidar.core.tables.headings import (
+    METRES,
+    PER_METRE,
+    TIME,
+    UNITLESS,
+    Column,
+    parse_heading,
+    read_headings,
+)
 
 DEPTH, Z = Column("depth", (), METRES), Column("z", (), METRES)
 A, C = Column("a", (), PER_METRE, spectral=True), Column("c", ("beam attenuation",), PER_METRE, spectral=True)

@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 import pytest
 
-from mitransient_lidar.core.array_files import check_hdf5, read_netcdf, read_npy
 from mitransient_lidar.core.errors import LINES, UserError, printable
 from mitransient_lidar.core.files import (
     check_encodable,
@@ -19,6 +18,7 @@ from mitransient_lidar.core.files import (
     open_log,
     read_text,
 )
+from mitransient_lidar.core.formats.array_files import check_hdf5, read_netcdf, read_npy
 
 #: What stands in the place of a file, by the words of the sentence.
 OTHERS = ("a named pipe", "a device", "a socket", "Is a directory", "No such file", "Too many levels", "NUL")

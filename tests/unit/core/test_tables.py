@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from mitransient_lidar.core.tables import aligned_lines, table_lines, write_csv
+from mitransient_lidar.core.tables.written import aligned_lines, table_lines, write_csv
 
 
 def test_cells_stand_below_their_headings():

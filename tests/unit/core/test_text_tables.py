@@ -5,10 +5,10 @@ import logging
 import numpy as np
 import pytest
 
-from mitransient_lidar.core import text_tables
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import TIME, Column
-from mitransient_lidar.core.text_tables import read_table, read_time_samples
+from mitransient_lidar.core.tables import text_tables
+from mitransient_lidar.core.tables.headings import TIME, Column
+from mitransient_lidar.core.tables.text_tables import read_table, read_time_samples
 
 POWER = Column("power", ("p", "v", "mv"))
 TIMES, VALUES = [0.0, 0.5, 2.0], [0.0, 3e-1, 1.0]

@@ -12,8 +12,8 @@ from few_paths import few_paths
 
 from mitransient_lidar import results
 from mitransient_lidar.core import validation
-from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.formats.array_files import read_exr
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import exr
 

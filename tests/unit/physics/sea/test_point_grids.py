@@ -6,8 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from mitransient_lidar.core import long_tables
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.tables import long_tables
 from mitransient_lidar.physics.sea.height_files import read_points
 from mitransient_lidar.physics.sea.height_maps import read_height_map
 

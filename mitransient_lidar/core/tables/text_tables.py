@@ -15,7 +15,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.headings import (
+from mitransient_lidar.core.tables.headings import (
     TIME,
     Column,
     Heading,

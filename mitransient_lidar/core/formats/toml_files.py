@@ -6,8 +6,8 @@ import tomllib
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from mitransient_lidar.core.documents import check_nesting, too_deep
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.formats.documents import check_nesting, too_deep
 from mitransient_lidar.core.validation import shown
 
 

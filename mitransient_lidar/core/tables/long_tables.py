@@ -12,8 +12,8 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file
-from mitransient_lidar.core.headings import Column, Heading
-from mitransient_lidar.core.text_tables import MISSING, find_rows, is_number_or_missing, split_line
+from mitransient_lidar.core.tables.headings import Column, Heading
+from mitransient_lidar.core.tables.text_tables import MISSING, find_rows, is_number_or_missing, split_line
 from mitransient_lidar.core.validation import FloatArray
 
 #: Largest table [bytes], and most rows in it.

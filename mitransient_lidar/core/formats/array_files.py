@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.files import check_regular, open_file
+from mitransient_lidar.core.formats.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.validation import usable_memory
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import LARGEST_ARRAY, Array, check_hdf5, check_size, damaged_file
-from mitransient_lidar.core.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text
+from mitransient_lidar.core.formats.array_files import LARGEST_ARRAY, Array, check_hdf5, check_size, damaged_file
+from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 
 #: Value of cells of an ASCII grid without a height, if the header does not name another, and of BAG cells.

@@ -1,0 +1,1 @@
+"""Maps: grids of heights, and coordinate systems."""

@@ -1,0 +1,1 @@
+"""Tables of numbers as instruments, surveys and spreadsheets write them: headings, units and rows."""
