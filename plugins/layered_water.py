@@ -23,7 +23,7 @@ from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
-from mitransient_lidar.transport.nested_objects import create_object
+from mitransient_lidar.transport.shapes.nested_objects import create_object
 
 #: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))

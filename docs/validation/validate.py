@@ -39,7 +39,7 @@ from mitransient_lidar.physics.sea.double_passage import slope_spread, slope_str
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum  # noqa: E402
 from mitransient_lidar.physics.water.layers import WaterColumn  # noqa: E402
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters  # noqa: E402
-from mitransient_lidar.transport.path_classes import PathClasses  # noqa: E402
+from mitransient_lidar.transport.paths.path_classes import PathClasses  # noqa: E402
 
 #: Number of random scenes in the table.
 RANDOM_SCENES = 6

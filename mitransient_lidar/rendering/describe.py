@@ -15,11 +15,11 @@ from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.transport.opaque import aligned_ray
+from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
-from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
+from mitransient_lidar.transport.shapes.solids import box_rays, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256

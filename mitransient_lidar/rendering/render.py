@@ -111,7 +111,7 @@ def render(
         ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
         of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; ``<id>_reflectance`` of diffuse
         solids, such as ``bottom_reflectance``; ``divergence_mrad`` of Gaussian beams; and ``ripple_variance``, the
-        slope variance of the sea's ripples, without the change of `transport.ripple_focusing`. Derivatives by other
+        slope variance of the sea's ripples, without that of `ripple_focusing`. Derivatives by other
         numbers of the scene, such as ``bottom_depth`` or ``off_nadir_deg``, are central differences on common random
         numbers, which take two more renders each (`differences.Differences`).
     batches
@@ -205,7 +205,7 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
-    from mitransient_lidar.transport.path_classes import check_solids
+    from mitransient_lidar.transport.paths.path_classes import check_solids
 
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))

@@ -102,8 +102,8 @@ def estimate(
     """
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+    from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.probe import Probe
-    from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     lidar = find_lidar_scene(session.scene, session.sensor)
@@ -172,7 +172,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import OwnPlugin
-    from mitransient_lidar.transport.solids import scene_of_shapes
+    from mitransient_lidar.transport.shapes.solids import scene_of_shapes
 
     column = lidar.required_water.column
     if not lidar.bottoms:

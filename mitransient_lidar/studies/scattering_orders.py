@@ -15,7 +15,7 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import label
-from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
+from mitransient_lidar.transport.paths.path_classes import MOST_ORDERS, PathClasses
 
 _REVERSALS = ("one", "several")
 

@@ -13,10 +13,10 @@ import mitsuba as mi
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.opaque import changed
-from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
 from mitransient_lidar.transport.probe import Probe
-from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import Receiver

@@ -13,8 +13,8 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases
+from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
-from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 
 #: Relative step of the numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
 _STEP = 1e-4

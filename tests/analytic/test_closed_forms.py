@@ -20,7 +20,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_average_particle
-from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.paths.path_classes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 #: Case of the quick tier, and those that differ from it in the water alone.

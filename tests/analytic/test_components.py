@@ -13,7 +13,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.plots.waveforms import plot_components
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.paths.path_classes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 ORIGINS = ["surface", "water", "target", "bottom"]

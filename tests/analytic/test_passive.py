@@ -11,7 +11,7 @@ from significance import largest_error, largest_z
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering import passive
-from mitransient_lidar.transport.path import ConnectedPath
+from mitransient_lidar.transport.paths.path import ConnectedPath
 from mitransient_lidar.transport.rng import pass_streams
 
 N = 1.34

@@ -13,8 +13,8 @@ from significance import assert_distribution, largest_chi2
 
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
+from mitransient_lidar.transport.paths.refracted_connection import RefractedLaserSampler
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):

@@ -12,8 +12,8 @@ from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import norm
 from significance import assert_distribution, largest_z
 
+from mitransient_lidar.transport.paths.refracted_connection import RefractedLaserSampler
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 COUNT = 2**20
 

@@ -17,7 +17,7 @@ from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.rendering import accuracy
 from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT
-from mitransient_lidar.transport.path import Path as LightPath
+from mitransient_lidar.transport.paths.path import Path as LightPath
 
 SMALL = {"type": "lidar_volpath", "paths_per_pass": 2**14}
 

@@ -27,7 +27,7 @@ from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
-from mitransient_lidar.transport.solids import scene_of_shapes
+from mitransient_lidar.transport.shapes.solids import scene_of_shapes
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer

@@ -76,7 +76,7 @@ class ShotScene:
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shots.batches import check_size
-        from mitransient_lidar.transport.path_classes import check_solids
+        from mitransient_lidar.transport.paths.path_classes import check_solids
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         variants.leave_the_gpu("shots are rendered")

@@ -11,16 +11,16 @@ import mitsuba as mi
 from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.daylight.sampling import FovSampler
 from mitransient_lidar.transport.daylight.scene import DaylightScene
-from mitransient_lidar.transport.path import ConnectedPath
-from mitransient_lidar.transport.perturbations import Sums
-from mitransient_lidar.transport.refracted_connection import (
+from mitransient_lidar.transport.paths.path import ConnectedPath
+from mitransient_lidar.transport.paths.refracted_connection import (
     EmitterDirection,
     RefractedSunSampler,
     connect_sun,
     level_transmittance,
 )
+from mitransient_lidar.transport.paths.volpath import BYTES_PER_PATH, PathLight, PathTracer, VolpathOptions
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.volpath import BYTES_PER_PATH, PathLight, PathTracer, VolpathOptions
 
 #: Number of the random streams within a pass.
 _STREAM = 4

@@ -10,10 +10,10 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.merging.patches import SolidPatch
 from mitransient_lidar.transport.opaque import opaque_index
-from mitransient_lidar.transport.path import PathPoint
-from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.paths.path import PathPoint
+from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.random_walk import RandomWalkPath
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 
 #: Number of photons that are kept of full buckets, of cells and of patches: more take time and reduce the variance

@@ -10,9 +10,9 @@ from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
+from mitransient_lidar.transport.paths.snell import refract
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.snell import refract
 
 HALF = 15.0  # mrad
 SECTOR = {"type": "pixel_fov", "shape": "sector", "field_of_view_mrad": 30.0, "inner_mrad": 12.0}

@@ -11,7 +11,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
-    from mitransient_lidar.transport.path import PathPoint
+    from mitransient_lidar.transport.paths.path import PathPoint
 
 #: Bits of a label for the pixel, and for the number of scattering events; the others are for reversals.
 _PIXEL_BITS, _ORDER_BITS = 20, 6

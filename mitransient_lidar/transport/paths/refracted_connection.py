@@ -11,9 +11,9 @@ import numpy as np
 
 from mitransient_lidar.transport.medium.index_layers import coinciding
 from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.paths.snell import refract
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
-from mitransient_lidar.transport.snell import refract
 
 #: Newton steps towards Snell's law: four leave less than 1e-4 rad even 5 m above and 40 m below the sea at 80 degrees.
 _NEWTON_STEPS = 4

@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.path import Path, PathStep, Vertex
+from mitransient_lidar.transport.paths.path import Path, PathStep, Vertex
+from mitransient_lidar.transport.paths.snell import refract_level
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.snell import refract_level
 
 #: Smallest distance to the destination [m], against division by zero where paths start there.
 _SMALLEST_DISTANCE = 1e-9

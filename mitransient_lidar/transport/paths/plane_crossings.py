@@ -16,7 +16,7 @@ from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.opaque import aligned, opaque
-from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
+from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
 

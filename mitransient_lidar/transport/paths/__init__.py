@@ -1,0 +1,1 @@
+"""Paths of light, from the laser and from the receiver."""

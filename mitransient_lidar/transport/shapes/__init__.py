@@ -1,0 +1,1 @@
+"""Solids: which shapes light meets, apart where they touch."""
