@@ -10,8 +10,8 @@ import mitsuba as mi
 from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.shapes.nested_objects import create_object
 
 _TERMS = ("c21", "c03", "c40", "c22", "c04")
 

@@ -9,7 +9,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
-from mitransient_lidar.transport.passes import PassRenderer
+from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitransient_lidar.core.parameters.integrators import LIDAR_VOLPATH
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
-from mitransient_lidar.transport.passes import PassRenderer
+from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

@@ -15,8 +15,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
+from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
-from mitransient_lidar.transport.shapes.nested_objects import create_object
 
 #: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` knows the lidar.
 WAITS = "_waits"

@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
-from mitransient_lidar.transport.shapes.nested_objects import create_object
+from mitransient_lidar.transport.medium.nested_objects import create_object
 
 #: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
 _STEEPEST_RIPPLE = 0.3

@@ -9,8 +9,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEDIMENT
 from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.shapes.nested_objects import create_object
 
 #: Parameters of particles.
 _PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")

@@ -11,7 +11,7 @@ from mitransient_lidar.core.parameters.lidar import TIME_GATED_FILM
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
-from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")

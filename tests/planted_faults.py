@@ -73,7 +73,7 @@ _FIGURES = f"{_UNIT}/plots/test_figures.py"
 FAULTS = (
     # Radiance is connected to the laser through the surface without the square of the refractive index.
     Fault(
-        *("radiance_without_index_squared", f"{_T}/refracted_connection.py"),
+        *("radiance_without_index_squared", f"{_T}/paths/refracted_connection.py"),
         "si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction)",
         "si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(direction)",
     ),
@@ -87,17 +87,19 @@ FAULTS = (
     ),
     Fault(
         "phase_index_times_water_leg",
-        f"{_T}/volpath.py",
+        f"{_T}/paths/volpath.py",
         "to_surface * opaque(scene.group",
         "to_surface * opaque(scene.refractive",
     ),
     # All photons enter the water.
     Fault(
-        *("no_fresnel_at_entry", f"{_T}/random_walk.py"),
+        *("no_fresnel_at_entry", f"{_T}/paths/random_walk.py"),
         "sample(step.context, si, pick, u, vertex.on_surface)",
         "sample(step.context, si, dr.select(vertex.at_sea & step.adjoint, 1, pick), u, vertex.on_surface)",
     ),
-    Fault("one_bin_late", f"{_T}/histogram.py", "minimum(mi.UInt32(position),", "minimum(mi.UInt32(position) + 1,"),
+    Fault(
+        "one_bin_late", f"{_T}/paths/histogram.py", "minimum(mi.UInt32(position),", "minimum(mi.UInt32(position) + 1,"
+    ),
     # The last part of a segment that crosses edges has the coefficient of the layer where it starts.
     Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.coefficient(end)", "downward * here"),
     # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
@@ -130,25 +132,25 @@ FAULTS = (
     ),
     Fault(
         "index_without_square_in_layers",
-        f"{_T}/path.py",
+        f"{_T}/paths/path.py",
         "& passes, ratio * ratio, 1)",
         "& passes, ratio, 1)",
         near="tests/analytic/test_strata.py",
     ),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),
-        "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)\n",
+        "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), received, shots, paths)\n",
         "",
         near="tests/analytic/test_agreement.py",
     ),
-    Fault("connections_absorb_3_percent_more", f"{_T}/volpath.py", "dr.exp(-crossed)", "dr.exp(-1.03 * crossed)"),
+    Fault("connections_absorb_3_percent_more", f"{_T}/paths/volpath.py", "dr.exp(-crossed)", "dr.exp(-1.03 * crossed)"),
     # Beckmann's alpha is the square root of twice the slope variance.
     Fault("ripples_without_root_2", "plugins/ocean_surface.py", "np.sqrt(2 * variance)", "np.sqrt(variance)"),
     # The ripples have the slope variance along the wind across it.
     Fault("ripples_across_the_wind", "plugins/ocean_surface.py", "return along, across", "return across, along"),
     # The weights of the two connections of the reference do not sum to one.
     Fault(
-        *("balance_without_transmittance", f"{_T}/volpath.py"),
+        *("balance_without_transmittance", f"{_T}/paths/volpath.py"),
         "transmittance / (transmittance + path.emitter_ratio)",
         "1 / (1 + path.emitter_ratio)",
         near="tests/analytic/test_estimator.py",
@@ -186,7 +188,7 @@ FAULTS = (
     # Light that survives a reflection by a solid is weakened by its reflectance, too.
     Fault(
         "roulette_without_compensation",
-        f"{_T}/random_walk.py",
+        f"{_T}/paths/random_walk.py",
         "factor / survival, bs",
         "factor, bs",
         near="tests/analytic/test_agreement.py",

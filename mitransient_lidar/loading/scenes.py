@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
-    from mitransient_lidar.transport.passes import LidarIntegrator
+    from mitransient_lidar.transport.paths.passes import LidarIntegrator
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -168,7 +168,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     """
     import mitsuba as mi
 
-    from mitransient_lidar.transport.passes import LidarIntegrator
+    from mitransient_lidar.transport.paths.passes import LidarIntegrator
 
     own = scene.integrator()
     if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):

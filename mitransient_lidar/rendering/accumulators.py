@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.rendering.derivatives import Parameter
     from mitransient_lidar.rendering.differences import Differences
-    from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
+    from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,7 @@ class PassAccumulator:
             return
         pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
         if kept == "direct":
-            from mitransient_lidar.transport.histogram import GateWeights
+            from mitransient_lidar.transport.paths.histogram import GateWeights
 
             self.gate_weights = GateWeights(train, train.response_weights(pulse, response), scene.reference_length)
         else:
@@ -290,7 +290,7 @@ def choose_accumulator(
     UserError
         If a histogram without gates or a single gate exceeds the memory, or gates by depth have no surface.
     """
-    from mitransient_lidar.transport.histogram import TransientHistogram
+    from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
     each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory

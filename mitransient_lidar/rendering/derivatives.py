@@ -15,13 +15,13 @@ from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.core.parameters.water import COEFFICIENTS
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.parameters import parameter_of, value_of
+from mitransient_lidar.transport.paths.water_changes import coefficient_derivative, mean_cosine_derivative
 from mitransient_lidar.transport.perturbations import Perturbation
-from mitransient_lidar.transport.water_changes import coefficient_derivative, mean_cosine_derivative
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.paths.passes import PassRenderer
     from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 

@@ -19,7 +19,7 @@ from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
-from mitransient_lidar.transport.shapes.solids import box_rays, scene_of_shapes
+from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256

@@ -18,7 +18,7 @@ from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.accuracy import LightStatistics, PassStatistics, received_power
 
 if TYPE_CHECKING:
-    from mitransient_lidar.transport.passes import LidarIntegrator, PassRenderer
+    from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 
 #: Shift of an echo by a step of a depth, over the pulse's full width at half maximum; of the edges of layers, which
 #: change the record little, the step is longer by a factor.

@@ -10,8 +10,8 @@ import mitsuba as mi
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
-from mitransient_lidar.transport.histogram import GateWeights
-from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
+from mitransient_lidar.transport.paths.histogram import GateWeights
+from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from mitransient_lidar.transport.opaque import shape_number
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
-from mitransient_lidar.transport.shapes.solids import box_of, met_numbers
+from mitransient_lidar.transport.solids import box_of, met_numbers
 
 logger = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCal
 from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
-    from mitransient_lidar.transport.paths.plane_crossings import PlaneCrossings
+    from mitransient_lidar.transport.plane_crossings import PlaneCrossings
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ def beam_spread(
     """
     wanted = np.unique(depths)
     session = open_scene(scene, params, instrument)
-    from mitransient_lidar.transport.paths.plane_crossings import CrossingTracer
+    from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     lidar = find_lidar_scene(session.scene, session.sensor)

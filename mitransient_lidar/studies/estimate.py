@@ -172,7 +172,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import OwnPlugin
-    from mitransient_lidar.transport.shapes.solids import scene_of_shapes
+    from mitransient_lidar.transport.solids import scene_of_shapes
 
     column = lidar.required_water.column
     if not lidar.bottoms:

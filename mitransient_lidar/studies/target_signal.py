@@ -22,7 +22,7 @@ from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.transport.shapes.solids import shape_groups
+from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 _HALF_GATE = 1.0

@@ -23,7 +23,7 @@ from mitransient_lidar.transport.plugin_types import GatedFilm, OwnPlugin, Trans
 from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.shapes.solids import box_of
+from mitransient_lidar.transport.solids import box_of
 
 #: Share of the rays of beam or view that the sea must reflect totally for the record to end there.
 _REFLECTED = 0.1

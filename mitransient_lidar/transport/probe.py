@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
+from mitransient_lidar.transport.medium.snell import refract
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
-from mitransient_lidar.transport.paths.snell import refract
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.shapes.solids import box_of, met_numbers, scene_of_shapes
+from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
 
 #: Rays of a view and of a beam; those of a Gaussian beam reach 4.2 standard deviations.
 PROBE_RAYS = 4096

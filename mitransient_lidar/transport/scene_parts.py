@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
@@ -29,8 +30,7 @@ from mitransient_lidar.transport.plugin_types import (
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.shapes.contacts import separate_contacts
-from mitransient_lidar.transport.shapes.solids import children, shape_groups, without_unseen
+from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from significance import largest_z
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
 BIN_NS = 0.25
 #: A pencil beam from 200 m: across 0.1 mrad the arrival at 20 degrees changes by 0.05 ns, evenly about the mean.

@@ -20,8 +20,8 @@ from mitransient_lidar.studies.beam_spread import beam_spread
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
-from mitransient_lidar.transport.paths.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
+from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

@@ -15,7 +15,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.results import gate_stack
-from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.paths.histogram import TransientHistogram
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Bytes of the histogram of four pixels and 300 bins, with its means and errors.

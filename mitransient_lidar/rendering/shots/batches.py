@@ -27,10 +27,10 @@ from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
-from mitransient_lidar.transport.shapes.solids import scene_of_shapes
+from mitransient_lidar.transport.solids import scene_of_shapes
 
 if TYPE_CHECKING:
-    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.paths.passes import PassRenderer
 
 #: Paths of all shots in a launch, and time bins of all their pixels.
 _PATHS, _BINS = 2**17, 2**24

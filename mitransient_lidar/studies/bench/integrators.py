@@ -18,7 +18,7 @@ from mitransient_lidar.studies.bench.processes import Tasks, answer, peak_mb, ru
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.paths.passes import PassRenderer
 
 #: Coefficients of turbid water [1/m].
 TURBID = {"attenuation": "1.5", "scattering": "1.2", "backscattering": "0.024"}

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.medium.snell import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque
-from mitransient_lidar.transport.paths.snell import refract_level
 
 #: Largest number of index layers: connections are traced through each of them.
 MOST_INDEX_LAYERS = 16

@@ -16,8 +16,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
+from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
-from mitransient_lidar.transport.shapes.nested_objects import create_object
 
 
 @runtime_checkable

@@ -20,12 +20,12 @@ from mitransient_lidar.transport.merging.photon_map import PhotonBuffer
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import opaque, opaque_index
-from mitransient_lidar.transport.passes import ReceivedLight
+from mitransient_lidar.transport.paths.passes import ReceivedLight
 from mitransient_lidar.transport.paths.path import PathPoint, interaction_at
 from mitransient_lidar.transport.perturbations import joined
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.shapes.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape
 
 #: Points of the receiver's paths for each one that is connected.
 _POINTS_PER_CONNECTION = 4

@@ -12,13 +12,13 @@ from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
-from mitransient_lidar.transport.passes import ReceivedLight
+from mitransient_lidar.transport.paths.passes import ReceivedLight
 from mitransient_lidar.transport.paths.path import PathPoint, interaction_at
 from mitransient_lidar.transport.paths.random_walk import Action, RandomWalkPath
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.shapes.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape
 
 
 def merge_in_water(

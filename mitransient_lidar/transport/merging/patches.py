@@ -17,7 +17,7 @@ from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_
 from mitransient_lidar.transport.probe import PROBE_RAYS
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.shapes.solids import box_of, met_shape
+from mitransient_lidar.transport.solids import box_of, met_shape
 
 #: Logarithm to base 2 of the largest number of buckets of a shot along one side.
 MOST_SIDE_BITS = 9

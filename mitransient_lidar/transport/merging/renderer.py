@@ -17,7 +17,7 @@ from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.opaque import changed, opaque
-from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
+from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.paths.refracted_connection import connect_laser, perturbed_to_laser
@@ -25,7 +25,7 @@ from mitransient_lidar.transport.paths.volpath import VolpathOptions, trace_conn
 from mitransient_lidar.transport.rng import Shots, tiled
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS
-from mitransient_lidar.transport.shapes.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape
 
 #: Numbers of the random streams within a pass; the path tracer has number 3.
 _COMMON_STREAM, _LIGHT_STREAM, _SENSOR_STREAM = 0, 1, 2

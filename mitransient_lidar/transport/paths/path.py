@@ -14,7 +14,7 @@ from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import WaterScene
-from mitransient_lidar.transport.shapes.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape
 
 #: Surface length of paths that have not met the sea first [m].
 NO_SURFACE = 1e9

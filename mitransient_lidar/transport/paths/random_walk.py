@@ -9,9 +9,9 @@ from typing import Any, Protocol, Self
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.medium.snell import refract_level
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.paths.path import Path, PathStep, Vertex
-from mitransient_lidar.transport.paths.snell import refract_level
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene
 

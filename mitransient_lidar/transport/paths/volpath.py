@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.passes import PassRenderer, ReceivedLight
+from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.paths.path import ConnectedPath, PathStep, ScatteringEvent, Vertex
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.refracted_connection import (
@@ -33,7 +33,7 @@ from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.shapes.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape
 
 #: Asymmetry of the Henyey-Greenstein lobe towards the emitter from which guided directions are drawn: the best from 0.7
 #: to 0.95 in clear and turbid water, with the default probability.

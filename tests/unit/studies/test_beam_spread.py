@@ -12,7 +12,7 @@ from significance import largest_z
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies.light import plot_beam_spread
 from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
-from mitransient_lidar.transport.paths.plane_crossings import CrossingTracer
+from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 QUICK = {"passes": 2, "photons": 4096}

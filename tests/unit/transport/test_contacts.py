@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport import contacts
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.shapes import contacts
 
 BOTTOM = -8.0
 

@@ -10,7 +10,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
+from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 
 #: Path length of light that arrives in the first bin [m].
 FIRST = mi.Float(1390.1e-9 * C0)

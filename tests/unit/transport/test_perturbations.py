@@ -9,7 +9,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
-from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.paths.histogram import TransientHistogram
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation, Perturbations, joined
 
 TOPS = (0.0, 1.5, 4.0)

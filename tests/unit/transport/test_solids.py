@@ -7,7 +7,7 @@ import significance
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.shapes.solids import box_rays
+from mitransient_lidar.transport.solids import box_rays
 
 CHECKS = {"type": "checkerboard", "color0": 0.0, "color1": 1.0}
 MATCHED = {"int_ior": 1.34, "ext_ior": 1.34}

@@ -15,7 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import aligned_ray
 from mitransient_lidar.transport.scene import WaterScene
-from mitransient_lidar.transport.shapes.solids import BEFORE, box_rays, scene_of_shapes
+from mitransient_lidar.transport.solids import BEFORE, box_rays, scene_of_shapes
 
 #: Distance within which faces coincide, and by which they are moved apart: absolute [m] and over coordinates.
 _SAME, _APART, _ROUNDING = 2e-5, 1e-4, 2.0**-20

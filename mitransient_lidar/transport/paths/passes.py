@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.opaque import changed
+from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums

@@ -1,1 +1,0 @@
-"""Solids: which shapes light meets, apart where they touch."""
