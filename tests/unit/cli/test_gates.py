@@ -90,8 +90,8 @@ def test_gates_from_a_depth(stored):
     path, _ = stored
     assert run(path, "--start-depth", 1, "--width-ns", 4, "--step-ns", 2, "--count", 5, "--no-plot").exit_code == 0
     stack = results.open(path.with_name("scene_gates.exr"))
-    # 1 m is 2 * 1.34 / (c0 cos 14.8 deg) = 9.245 ns under the surface at 1415 ns.
-    assert float(stack["gate_start"][0]) == pytest.approx(1424.245, abs=2e-3)
+    # 1 m is 2 * 1.34 / (c0 cos 14.8 deg) = 9.245 ns below the mean sea level, which is at 1412.787 ns on the axis.
+    assert float(stack["gate_start"][0]) == pytest.approx(1422.032, abs=2e-3)
     np.testing.assert_allclose(np.diff(stack["gate_start"]), 2)
 
 

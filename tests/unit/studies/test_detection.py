@@ -15,7 +15,7 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
 from mitransient_lidar.plots.studies.targets import plot_detection
-from mitransient_lidar.studies import detection
+from mitransient_lidar.studies import cases, detection
 
 NAMES = ["red", "green", "blue", "black"]
 T = np.arange(40)
@@ -280,7 +280,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     Renders take a second each: of depths of 7 and 7.5 m only the first begins within 5 s.
     """
     asked: list[tuple[int, float, int]] = []
-    monkeypatch.setattr(detection.time, "perf_counter", lambda: float(len(asked)))
+    monkeypatch.setattr(cases.time, "perf_counter", lambda: float(len(asked)))
     random = np.random.default_rng(3)
 
     def signal(session, **options):
