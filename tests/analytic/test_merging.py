@@ -9,7 +9,7 @@ from significance import assert_equal, largest_chi2, largest_error, largest_z, m
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells
-from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
+from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.probe import Probe
@@ -267,7 +267,9 @@ def test_light_on_curved_sides_is_merged_in_full(lidar_scene):
             si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, -3), down))
             patch = patches.locate(si)
             share = patches.inverse_share(patch, si.shape, rng, si.is_valid())
-            values = np.array([patch.area / share, patches.foreshortening(si, down), si.n.z], np.float64)
+            values = np.array(
+                [patch.area / share, foreshortening(dr.abs(dr.dot(si.n, down)), patch.cosine), si.n.z], np.float64
+            )
             number = np.array(patch.tag).astype(np.uint64) << 32 | np.array(patch.bucket)
             steep = np.array((si.p.z > -4.5) & (patch.axis != 2))
             found.append((number[steep], values[:, steep]))

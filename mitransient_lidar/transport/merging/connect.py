@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.merge import receive
-from mitransient_lidar.transport.merging.patches import SolidPatches
+from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
@@ -156,13 +156,14 @@ class WaterConnections:
         si = scene.ray_intersect(ray, exists)
         active = exists & si.is_valid() & (dr.abs(si.t - distance) < tolerance)
         outgoing = si.to_local(-photon.direction)
-        bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / dr.abs(dr.dot(si.n, photon.direction))
+        cosine = dr.abs(dr.dot(si.n, photon.direction))
+        bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / cosine
         x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
         scale = self.rates.on_solids * weight
         energy = scale * point.throughput * photon.throughput * bsdf * transmittance / total
-        energy *= patches.foreshortening(si, photon.direction)
+        energy *= foreshortening(cosine, patches.cosine(si))
         active &= (bsdf > 0) & dr.isfinite(total)
         depth, perturbed = point.depth, self.scene.perturbations
         sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import WaterCells
-from mitransient_lidar.transport.merging.patches import SolidPatches
+from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.paths.passes import ReceivedLight
@@ -111,7 +111,7 @@ def merge_on_solids(
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             connected = dr.select(connectable > 0, connection, 0)
             share = typical / (connected + typical)
-            energy = weight * photon.throughput * patches.foreshortening(si, photon.direction) * bsdf * share
+            energy = weight * photon.throughput * foreshortening(cosine, patch.cosine) * bsdf * share
             lit, length = within & (bsdf > 0), path.length + photon.length
             receive(received, path, photon, 0, length, energy, lit, joined(sums, photon.sums), solid)
             return (index + 1,)

@@ -73,6 +73,8 @@ class SolidPatch:
         Direction of the projection: 0, 1 or 2 for x, y or the beam.
     faces
         Sign of the normal's component against that direction.
+    cosine
+        Size of that component.
     """
 
     bucket: mi.UInt32
@@ -83,6 +85,16 @@ class SolidPatch:
     sector: RingSector
     axis: mi.UInt32
     faces: mi.Float
+    cosine: mi.Float
+
+
+def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
+    """Return the area of a surface across light over that across the projection of its patch, from both cosines.
+
+    At least 0.02: light is stored divided by this number at its place, and merged times that of another place of the
+    patch, so that the light of curved surfaces is right.
+    """
+    return dr.maximum(light / projection, _LEAST_FORESHORTENING)
 
 
 def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) -> list[mi.Shape]:
@@ -222,6 +234,7 @@ class SolidPatches:
             | (side << 20)
             | (low_bits(shape, 9) << 23),
             area=projected / dr.abs(normal),
+            cosine=dr.abs(normal),
             corner=corner,
             height=height,
             sector=sector,
@@ -237,13 +250,9 @@ class SolidPatches:
         sector = dr.square(ring_width) * scale / self.rings.cosine
         return dr.select(axis == 2, sector, self._side * self._side) / dr.abs(normal)
 
-    def foreshortening(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
-        """Return areas of surfaces across a direction over their areas across the projection of their patch.
-
-        At least 0.02: light that grazes a surface is stored divided by this number at its place, and merged times that
-        of another place of the patch, so that the light of curved surfaces is right.
-        """
-        return dr.maximum(dr.abs(dr.dot(si.n, direction) / self._projection(si)[1]), _LEAST_FORESHORTENING)
+    def cosine(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """Return the size of the normal's component against the projection at points on solids."""
+        return dr.abs(self._projection(si)[1])
 
     def _projection(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         """Return the direction of projection at points on solids, and the normal's component against it."""

@@ -13,7 +13,7 @@ from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.layout import PATCH_PER_CELL, PHOTONS, MergingLayout, MergingOptions
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids
-from mitransient_lidar.transport.merging.patches import SolidPatches
+from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.opaque import changed, opaque
@@ -163,8 +163,9 @@ class MergingRenderer(PassRenderer):
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
             once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
             connectable = active & once & path.before_first_solid
-            even = path.throughput / patches.foreshortening(si, path.direction)
-            hits.add(path, even, si.p, patches.locate(si), active, connectable)
+            patch = patches.locate(si)
+            even = path.throughput / foreshortening(dr.abs(dr.dot(si.n, path.direction)), patch.cosine)
+            hits.add(path, even, si.p, patch, active, connectable)
 
         path = walk.run(path, rng, segments, on_solid=store, past_solids=True)
         received.rays = dr.sum(mi.Float64(path.rays))
