@@ -64,10 +64,8 @@ class Fault:
         return text.replace(self.old, self.new)
 
 
-_T, _P = "mitransient_lidar/transport", "mitransient_lidar/physics"
-_M = f"{_T}/merging"
-_A, _R, _G = (f"mitransient_lidar/{name}" for name in ("analysis", "results", "plots"))
-_UNIT = "tests/unit"
+_T, _P, _A, _R, _G = (f"mitransient_lidar/{name}" for name in ("transport", "physics", "analysis", "results", "plots"))
+_M, _UNIT = f"{_T}/merging", "tests/unit"
 _FIGURES = f"{_UNIT}/plots/test_figures.py"
 
 FAULTS = (
