@@ -13,12 +13,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.toml_files import check_keys, required, table
 from mitransient_lidar.core.options import Option, declared, documented_parameters, parts
 from mitransient_lidar.core.validation import (
-    finite,
     finite_array,
-    in_range,
     integer,
-    non_negative,
-    positive,
+    number_within,
     shown,
 )
 
@@ -153,9 +150,4 @@ def _number(name: str, value: Any, option: Option, whole: bool) -> float | int:
         assert isinstance(low, int)
         assert isinstance(high, int)
         return integer(name, value, low, high)
-    if low is None:
-        return finite(name, value)
-    if low == 0 and (option.above or high is None):
-        number = positive(name, value) if option.above else non_negative(name, value)
-        return number if high is None else in_range(name, number, low, high)
-    return in_range(name, value, low, inf if high is None else high)
+    return number_within(name, value, -inf if low is None else low, inf if high is None else high, above=option.above)

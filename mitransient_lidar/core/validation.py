@@ -75,6 +75,21 @@ def in_range(name: str, value: object, low: float, high: float) -> float:
     return number
 
 
+def number_within(
+    name: str, value: object, low: float = -math.inf, high: float = math.inf, *, above: bool = False
+) -> float:
+    """Return `value` as a float from `low`, or `above` it, to `high`; limits may be infinite."""
+    if above:
+        number = finite(name, value)
+        if not low < number <= high:
+            most = "" if high == math.inf else f" and at most {high:g}"
+            raise UserError(f"{name} = {number:g} must be greater than {low:g}{most}")
+        return number
+    if (low, high) == (0, math.inf):
+        return non_negative(name, value)
+    return finite(name, value) if low == -math.inf else in_range(name, value, low, high)
+
+
 def integer(name: str, value: Any, low: int, high: int) -> int:
     """Return `value`, an integer or a float without decimals but no text, as an integer in [`low`, `high`]."""
     if isinstance(value, np.ndarray) and value.ndim == 0:

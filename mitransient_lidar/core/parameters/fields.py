@@ -14,11 +14,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite,
-    in_range,
     integer,
-    non_negative,
     number_list,
-    positive,
+    number_within,
 )
 
 #: Text that leaves the choice of a value to the scene.
@@ -96,10 +94,7 @@ class Parameter:
 
     def number(self, value: object) -> float:
         """Return a number within the range; else raise ``UserError``."""
-        number = (positive if self.above else finite)(self.name, value)
-        if self.low == 0 and self.high == math.inf:
-            return non_negative(self.name, number)
-        return number if math.inf in (self.high, -self.low) else in_range(self.name, number, self.low, self.high)
+        return number_within(self.name, value, self.low, self.high, above=self.above)
 
     def per_layer(self, given: Any, layers: int) -> FloatArray:
         """Return one number a layer of a list of one for all or one for each; else raise ``UserError``."""

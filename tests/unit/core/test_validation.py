@@ -12,6 +12,7 @@ from mitransient_lidar.core.validation import (
     integer,
     non_negative,
     non_negative_array,
+    number_within,
     positive,
     time_samples,
 )
@@ -41,6 +42,10 @@ def test_clean_values():
         (lambda: non_negative("x", -1), "x = -1 must not be negative"),
         (lambda: in_range("x", 2, 0, 1), "x = 2 must lie between 0 and 1"),
         (lambda: in_range("x", 0.5, 1, np.inf), r"x = 0\.5 must be at least 1$"),
+        (lambda: number_within("x", 0, 0, 1, above=True), "x = 0 must be greater than 0 and at most 1$"),
+        (lambda: number_within("x", 1.5, 0, 1, above=True), r"x = 1\.5 must be greater than 0 and at most 1$"),
+        (lambda: number_within("x", 1, 1, above=True), "x = 1 must be greater than 1$"),
+        (lambda: number_within("x", -1, 0), "x = -1 must not be negative$"),
         (lambda: integer("x", 1.5, 0, 9), r"x = 1\.5 must be an integer"),
         (lambda: integer("x", np.array(2.5), 0, 9), r"x = 2\.5 must be an integer"),
         (lambda: integer("x", np.array([2.0]), 0, 9), r"x = array\(\[2.\]\) must be an integer"),
