@@ -18,8 +18,13 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
-from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.physics.receiver.receiver_files import (
+    Channel,
+    ReceiverChannels,
+    Setting,
+    instrument_receiver,
+    waveform_receiver,
+)
 from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.variables import label
 
@@ -202,7 +207,7 @@ def receiver_of_result(
     if chain is not None:
         receiver = receiver_of("chain", chain)
     else:
-        receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or receiver_named("apd")
+        receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or waveform_receiver("apd")
     if gain is None and optical_density is None:
         return receiver
     return receiver.with_settings(gain, optical_density)
@@ -404,7 +409,7 @@ def _in_range(
 def receiver_of(parameter: str, given: ReceiverChannels | ReceiverChain | str | os.PathLike[str]) -> ReceiverChannels:
     """Return a receiver from itself, its chain, a name, or a TOML file, as the named parameter."""
     try:
-        return receiver_named(given)
+        return waveform_receiver(given)
     except UserError as error:
         text = str(error)
         raise UserError(
