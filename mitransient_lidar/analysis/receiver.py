@@ -170,7 +170,7 @@ def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:
                 f"chain = {found.name!r} is a camera, but the dataset has no gates: cut them with gates first"
             )
         return found
-    return None if "waveform" in dataset else camera_of(found or "apd")
+    return None if "waveform" in dataset else _named("chain", lambda: camera_of(found or "apd"))
 
 
 class PixelChain(NamedTuple):

@@ -13,6 +13,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 
+_SATURATION = 1e-6  # largest probability of a saturated frame
+
 
 class PhotonTransfer(NamedTuple):
     """Variance of frames against their mean at levels of light, and the line through them."""
@@ -36,7 +38,7 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     Parameters
     ----------
     recorded : xarray.Dataset
-        Frames, at least 4, with ``signal``, ``saturated`` and ``dark_level``.
+        Frames, at least 4, with ``signal``, ``saturation`` and ``dark_level``.
     levels : int
         Number of levels, 2 to 1000, each with as many pixels and gates.
 
@@ -48,8 +50,12 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     number, frames = integer("levels", levels, 2, 1000), recorded.sizes.get("frame", 0)
     if frames < 4:
         raise UserError(f"the dataset has {frames} frames, but photon transfer needs at least 4")
-    used = ~recorded["saturated"].any("frame").values
-    light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *recorded["snr"].dims)
+    # Those that may saturate would lose their highest frames.
+    saturates = (
+        recorded["saturation"].max("frame") if "frame" in recorded["saturation"].dims else recorded["saturation"]
+    )
+    used = (saturates < _SATURATION).values
+    light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *saturates.dims)
     values = light.values[:, used]
     if values.shape[1] < 2 * number:
         raise UserError(
@@ -61,7 +67,10 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     of_mean = np.array([mean[one].mean() for one in order])
     of_variance = np.array([variance[one].mean() for one in order])
     error = np.array([max(variance[one].std(ddof=1), 1e-9) / np.sqrt(one.size) for one in order])
-    line, covariance = np.polyfit(of_mean, of_variance, 1, w=1 / error, cov="unscaled")
+    # An error of the mean moves a level along the line.
+    steepness = (of_variance[-1] - of_variance[0]) / max(of_mean[-1] - of_mean[0], 1e-9)
+    own = np.hypot(error, steepness * np.sqrt(of_variance / (len(second) * np.array([one.size for one in order]))))
+    line, covariance = np.polyfit(of_mean, of_variance, 1, w=1 / own, cov="unscaled")
     slope_error, dark_error = np.sqrt(np.diag(covariance))
     slope, dark = float(line[0]), float(np.sqrt(max(line[1], 0)))
     at_dark = float(dark_error) / (2 * dark) if dark > 0 else np.inf

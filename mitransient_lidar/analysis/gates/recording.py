@@ -39,8 +39,7 @@ def record_gates(
         if value == "auto":
             raise UserError(f"{name} = 'auto' needs a receiver of waveforms: give a number for a camera")
     factor, density = (float(usual if one is None else one) for one, usual in zip(settings, (1, 0), strict=True))
-    check_stack(dataset)
-    first = dataset["gate_energy"].isel(gate=0).isel(frame=0, missing_dims="ignore")
+    first = check_stack(dataset.isel(frame=0, missing_dims="ignore"))["gate_energy"].isel(gate=0)
     sky = powers_of(first, background_power, tuple(str(dim) for dim in first.dims))
     used = camera if factor == 1 else replace(camera, gain=camera.gain * factor)
     dimmed = dataset.assign({name: one * 10**-density for name, one in dataset.items() if name in _DIMMED})
