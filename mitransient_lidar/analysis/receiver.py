@@ -20,6 +20,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, inte
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import (
+    CAMERAS,
     Channel,
     ReceiverChannels,
     Setting,
@@ -170,7 +171,11 @@ def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:
                 f"chain = {found.name!r} is a camera, but the dataset has no gates: cut them with gates first"
             )
         return found
-    return None if "waveform" in dataset else _named("chain", lambda: camera_of(found or "apd"))
+    if "waveform" in dataset:
+        return None
+    if found is None:
+        raise UserError(f"the dataset has gates alone, which need a camera: {', '.join(CAMERAS)}, or a .toml file")
+    return _named("chain", lambda: camera_of(found))
 
 
 class PixelChain(NamedTuple):

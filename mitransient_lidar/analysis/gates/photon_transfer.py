@@ -51,27 +51,24 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     if frames < 4:
         raise UserError(f"the dataset has {frames} frames, but photon transfer needs at least 4")
     # Those that may saturate would lose their highest frames.
-    saturates = (
-        recorded["saturation"].max("frame") if "frame" in recorded["saturation"].dims else recorded["saturation"]
-    )
+    saturates = recorded["saturation"].max([dim for dim in recorded["saturation"].dims if dim == "frame"])
     used = (saturates < _SATURATION).values
     light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *saturates.dims)
-    values = light.values[:, used]
-    if values.shape[1] < 2 * number:
-        raise UserError(
-            f"levels = {number} needs {2 * number} pixels and gates that are not saturated, not {values.shape[1]}"
-        )
-    first, second = values[: frames // 2], values[frames // 2 :]
+    if (count := int(used.sum())) < 2 * number:
+        raise UserError(f"levels = {number} needs {2 * number} pixels and gates that do not saturate, not {count}")
+    first, second = np.split(light.values[:, used], [frames // 2])
     order = np.array_split(np.argsort(first.mean(axis=0)), number)
     mean, variance = second.mean(axis=0), second.var(axis=0, ddof=1)
-    of_mean = np.array([mean[one].mean() for one in order])
-    of_variance = np.array([variance[one].mean() for one in order])
-    error = np.array([max(variance[one].std(ddof=1), 1e-9) / np.sqrt(one.size) for one in order])
+    level, spread, error, size = np.array(
+        [(mean[one].mean(), variance[one].mean(), variance[one].std(ddof=1) / one.size**0.5, one.size) for one in order]
+    ).T
     # An error of the mean moves a level along the line.
-    steepness = (of_variance[-1] - of_variance[0]) / max(of_mean[-1] - of_mean[0], 1e-9)
-    own = np.hypot(error, steepness * np.sqrt(of_variance / (len(second) * np.array([one.size for one in order]))))
-    line, covariance = np.polyfit(of_mean, of_variance, 1, w=1 / own, cov="unscaled")
+    slope = (spread[-1] - spread[0]) / max(level[-1] - level[0], 1e-9)
+    weights = 1 / np.maximum(np.hypot(error, slope * np.sqrt(spread / (len(second) * size))), 1e-9)
+    line, covariance = np.polyfit(level, spread, 1, w=weights, cov="unscaled")
     slope_error, dark_error = np.sqrt(np.diag(covariance))
-    slope, dark = float(line[0]), float(np.sqrt(max(line[1], 0)))
-    at_dark = float(dark_error) / (2 * dark) if dark > 0 else np.inf
-    return PhotonTransfer(of_mean, of_variance, error, 1 / slope, float(slope_error) / slope**2, dark, at_dark)
+    dark = float(np.sqrt(max(line[1], 0)))
+    inverse, its_error = 1 / float(line[0]), float(slope_error / line[0] ** 2)
+    return PhotonTransfer(
+        level, spread, error, inverse, its_error, dark, float(dark_error) / (2 * dark) if dark else np.inf
+    )

@@ -191,7 +191,7 @@ def test_files_are_refused_in_a_sentence(text: str, message: str, tmp_path) -> N
 
 
 def test_each_kind_of_receiver_names_the_other() -> None:
-    with pytest.raises(UserError, match=r"'iccd' is a camera, which needs gates, .* pmt"):
+    with pytest.raises(UserError, match=r"'iccd' is a camera, which records gates: .* pmt"):
         waveform_receiver("iccd")
     with pytest.raises(UserError, match="'pmt' is one of waveforms, but gates need a camera: iccd"):
         camera("pmt")
