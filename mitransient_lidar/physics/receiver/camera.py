@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Values = npt.ArrayLike
 
-_TAIL = 1e-9  # of a kernel, left out at its ends
+_TAIL = 1e-6  # of a kernel, left out at its ends
 _LEAST_SKEWNESS = 1e-3  # of a clipped distribution, against cancellation
 _FAR = 12.0  # deviations from a limit beyond which nothing is clipped
 _OFFSET = 4.0  # least offset in deviations of the read-out
