@@ -76,7 +76,8 @@ def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: 
         dataset[name].transpose(*own, *dims).values.reshape(seas, *shape)
         for name in ("gate_energy", "gate_energy_stderr")
     )
-    opened, pattern = _open_ns(dataset), camera.pattern(shape[:-1])
+    gate, pattern = _shape(dataset), camera.pattern(shape[:-1])
+    opened = float(gate.open_time(gate.span_ns[1]))
     known: dict[str, Any] = {"background": sky, "pulses": int(dataset.attrs.get("pulses", 1)), "pattern": pattern}
     dark = camera.expected(np.zeros((*shape[:-1], 1)), opened, **{**known, "background": 0.0}).mean
     signal = np.empty((number, *shape), np.uint16 if camera.bits <= 16 else np.uint32)
@@ -124,17 +125,13 @@ def describe_frames(recorded: xr.Dataset) -> list[str]:
     ]
 
 
-def _open_ns(dataset: xr.Dataset) -> float:
-    """Return the integral of the transmission of each gate [ns]."""
-    shape = _shape(dataset.attrs)
-    return float(dataset["gate_width"][0]) if shape is None else float(shape.open_time(np.inf))
-
-
-def _shape(attributes: Mapping[Any, Any]) -> GateShape | None:
-    """Return the measured shape of the gates, or None for edges, whose integral is the width."""
-    if "gate_profile" not in attributes:
-        return None
-    return GateShape.sampled(attributes["gate_profile_ns"], attributes["gate_profile"])
+def _shape(dataset: xr.Dataset) -> GateShape:
+    """Return the shape of the gates of a stack."""
+    attributes = dataset.attrs
+    if "gate_profile" in attributes:
+        return GateShape.sampled(attributes["gate_profile_ns"], attributes["gate_profile"])
+    edges = (float(attributes.get(name, 0)) for name in ("gate_rise_ns", "gate_fall_ns"))
+    return GateShape.edges(float(dataset["gate_width"][0]), *edges)
 
 
 def _jittered(dataset: xr.Dataset, camera: Camera, energy: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -143,11 +140,11 @@ def _jittered(dataset: xr.Dataset, camera: Camera, energy: FloatArray) -> tuple[
     if jitter == 0:
         return energy, None
     step = float(attributes.get("gate_step_ns", np.inf))
-    edges = float(attributes.get("gate_rise_ns", 0)), float(attributes.get("gate_fall_ns", 0))
-    longest = max(float(attributes.get("pulse_fwhm_ns", 0)), *edges)
+    shape = _shape(dataset)
+    longest = max(float(attributes.get("pulse_fwhm_ns", 0)), shape.rise_ns, shape.fall_ns)
     if "waveform" in dataset and "frame" not in dataset.dims:
-        apart, width, start = jitter, float(dataset["gate_width"][0]), float(dataset["gate_start"][0])
-        train = GateTrain(start, width, step, energy.shape[-1], *edges, int(attributes["pulses"]), _shape(attributes))
+        apart, start, pulses = jitter, float(dataset["gate_start"][0]), int(attributes.get("pulses", 1))
+        train = GateTrain.measured(shape, start, step, energy.shape[-1], pulses)
         before, after = (
             cut_gates(dataset.drop_dims("gate"), replace(train, start_ns=start + shift))["gate_energy"].values
             for shift in (-jitter, jitter)

@@ -122,7 +122,8 @@ def test_gates_too_far_apart_for_their_jitter_are_said(caplog):
 
 def test_a_measured_gate_is_open_for_the_integral_of_its_transmission():
     shape = GateShape.sampled([0, 2, 8, 10], [0, 0.8, 0.8, 0])
-    gates = cut_gates(waveforms(1e-13), GateTrain.measured(shape, 60.0, 4.0, 9, 1000))
+    train = GateTrain.measured(shape, 60.0, 4.0, 9, 1000)
+    gates = cut_gates(waveforms(1e-13), train)
     one = replace(CAMERAS["gated_cmos"], gate_jitter_ns=0.0, leakage=0.0, response_spread=0.0, optics_mtf=1.0)
     sky = xr.DataArray(np.linspace(0, 2e-9, 48).reshape(6, 8), dims=("row", "column"))
     bright, dark = (record(gates, one, background_power=power)["signal_mean"] for power in (sky, 0.0))
@@ -130,6 +131,9 @@ def test_a_measured_gate_is_open_for_the_integral_of_its_transmission():
     assert np.allclose(
         (bright - dark).transpose("row", "column", "gate"), wanted.expand_dims(gate=9, axis=-1), rtol=2e-3, atol=0.1
     )
+    both = cut_gates(waveforms(1e-9), train).assign(waveforms(1e-9)[["waveform", "waveform_stderr"]])
+    plain, shifted = (record(both, replace(one, gate_jitter_ns=each))["signal_deviation"] for each in (0.0, 2.0))
+    assert float((shifted - plain).max()) > 1 > 1e-3 > float((shifted - plain)[0, 0, 0])
 
 
 def test_a_sea_for_each_frame_gives_frames_of_their_own(flat):
