@@ -125,9 +125,9 @@ def detect_waveforms(
         Of a camera ``signal`` and ``saturated`` are over (frame, row, column, gate) or (frame, pixel, gate), for a
         stack over ``frame`` all of its first frame first, as integers [DN] with the fixed pattern of `Camera.pattern`.
         The closed forms are over the same dimensions, without frame unless the stack has it, and those of each pixel
-        with its pattern; ``signal_mean_stderr`` is by ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean
-        without light. A mean over ``frame`` averages. The coordinates are those of the gate stack. See
-        `analysis.gates.recording.record_gates` for the jitter of gates.
+        with its pattern; ``snr`` is NaN where most frames saturate, ``signal_mean_stderr`` is by
+        ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean without light. A mean over ``frame`` averages. The
+        coordinates are those of the gate stack. See `analysis.gates.recording.record_gates` for the jitter of gates.
 
     Raises
     ------

@@ -79,7 +79,9 @@ def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: 
     gate, pattern = _shape(dataset), camera.pattern(shape[:-1])
     opened = float(gate.open_time(gate.span_ns[1]))
     known: dict[str, Any] = {"background": sky, "pulses": int(dataset.attrs.get("pulses", 1)), "pattern": pattern}
-    dark = camera.expected(np.zeros((*shape[:-1], 1)), opened, **{**known, "background": 0.0}).mean
+    nothing = np.zeros((*shape[:-1], 1))
+    unlit = camera.expected(nothing, opened, **known).mean
+    dark = camera.expected(nothing, opened, **{**known, "background": 0.0}).mean
     signal = np.empty((number, *shape), np.uint16 if camera.bits <= 16 else np.uint32)
     saturated = np.empty(signal.shape, np.bool_)
     moments = np.empty((len(_MOMENTS), seas, *shape), np.float32)
@@ -92,7 +94,8 @@ def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: 
             expected = camera.expected(light[part], opened, **known)
             shifted = camera.expected(light[part] + np.nan_to_num(errors[sea][part]), opened, **known).mean
             deviation = np.sqrt(expected.variance)
-            snr = np.divide(expected.mean - dark, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+            snr = np.divide(expected.mean - unlit, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+            snr[expected.saturation > 0.5] = np.nan
             moments[:, sea][part] = expected.mean, deviation, snr, expected.saturation, shifted - expected.mean
             mine = slice(sea * frames, (sea + 1) * frames), *part
             signal[mine], saturated[mine] = camera.sample(light[part], opened, frames, (seed, sea, start), **known)
@@ -112,7 +115,7 @@ def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: 
 def describe_frames(recorded: xr.Dataset) -> list[str]:
     """Return lines on frames of `record_gates`: their number, signal-to-noise ratio, and saturation."""
     pulses, gates = recorded.attrs.get("pulses", 1), recorded["signal"].dims[1:-1]
-    mean = recorded["snr"].mean([dim for dim in recorded["snr"].dims if dim != "gate"]).values
+    mean = recorded["snr"].mean([dim for dim in recorded["snr"].dims if dim != "gate"]).fillna(0).values
     share = recorded["saturated"].mean(("frame", *gates)).values
     best, worst = int(np.argmax(mean)), int(np.argmax(share))
     return [
