@@ -242,12 +242,13 @@ def _render(
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share
-        gates, first = accumulator.gate_weights, None
+        gates, beside, first = accumulator.gate_weights, accumulator.gates_beside, None
         if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
-        received = first or fitted.render_pass(seed, gates=gates)
-        accumulator.add(received.histogram)
+        received = None if beside else first
+        received = received or fitted.render_pass(seed, gates=gates, beside=beside)
+        accumulator.add(received.histogram, received.gated)
         if differences is not None:
             differences.add_pass(seed, share)
         return received.edge_loss
