@@ -303,7 +303,7 @@ def choose_accumulator(
     each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
     channels = 1 + len(parameters)
     bins = each * (1 + len(origins)) * channels
-    train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
+    train = placed_gates(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
@@ -337,7 +337,7 @@ def choose_accumulator(
     return PassAccumulator(scene, window, train, kept="direct")
 
 
-def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
+def placed_gates(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
     """Return the gates of the scene at their times."""
     if scene.gates is None:
         return None

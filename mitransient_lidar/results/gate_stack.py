@@ -127,7 +127,7 @@ def build_gates(
     ----------
     energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
         Energy in each gate, summed over its pulses, and its standard error [J]. The pixels of an imager may be in one
-        axis, in row-major order.
+        axis, in row-major order. With the coordinate ``frame`` that dimension is first.
     train : GateTrain
         The gates.
     coords, attributes : mapping
@@ -140,13 +140,15 @@ def build_gates(
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
-    shape = tuple(pixels.sizes[dim] for dim in dims)
+    frames = ("frame",) if "frame" in pixels.sizes else ()
+    first, shape = (tuple(pixels.sizes[dim] for dim in each) for each in (frames, dims))
     variables = {}
     for name, values in (("gate_energy", energy), ("gate_energy_stderr", stderr)):
         array = np.asarray(values, np.float64)
-        if array.shape not in ((*shape, train.count), (math.prod(shape), train.count)):
-            raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
-        variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count))
+        whole = (*first, *shape, train.count)
+        if array.shape not in (whole, (*first, math.prod(shape), train.count)):
+            raise UserError(f"{name} has shape {array.shape}; it must be {whole}.")
+        variables[name] = ((*frames, *dims, "gate"), array.reshape(whole))
     axis = {
         "gate": np.arange(train.count),
         "gate_start": train.starts_ns,
@@ -187,6 +189,22 @@ def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.A
     return label(stack.assign(arrays))
 
 
+def average_frames(stack: xr.Dataset) -> xr.Dataset:
+    """Return the mean over the frames of a gate stack, whose standard errors are independent; one without frames stays.
+
+    Coordinates of the frames, such as their times, are left out.
+    """
+    if "frame" not in stack.dims:
+        return stack
+    errors = [name for name in stack.data_vars if str(name).endswith("_stderr")]
+    square = (stack[errors] ** 2).mean("frame", skipna=False, keep_attrs=True) / stack.sizes["frame"]
+    mean = stack.drop_vars(errors).mean("frame", skipna=False, keep_attrs=True)
+    root = square**0.5
+    for name in errors:
+        root[name].attrs = stack[name].attrs
+    return mean.merge(root, combine_attrs="override").assign_attrs(stack.attrs)
+
+
 def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis) -> None:
     """Raise `UserError` if a gate train ends before the surface echo or is not within the record."""
     spans = train.spans_ns
@@ -217,6 +235,8 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
     """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
+    Of several frames they are the mean, `average_frames`.
+
     Raises
     ------
     UserError
@@ -224,6 +244,7 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
         raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+    dataset = average_frames(dataset)
     energy = dataset["gate_energy"]
     pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
     if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):
