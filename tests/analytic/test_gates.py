@@ -126,7 +126,7 @@ def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene, changes):
 
 
 def test_gates_by_depth_need_an_axis_that_meets_the_sea(lidar_scene):
-    pose = {"altitude": -5.0, "off_nadir_deg": 0.0}
+    pose = {"altitude": -5.0, "off_nadir_deg": 90.0}
     scene = lidar_scene(film={"gate_start_depth": 3.0, "gate_count": 2}, tx=pose, rx=pose)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
     for one, words in ((lidar, "the axis of the receiver"), (replace(lidar, surfaces=[]), "the scene has none")):
