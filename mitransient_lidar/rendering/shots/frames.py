@@ -118,13 +118,13 @@ def render_frames(
     moving = pulse_rate_hz, gate_order, readout_s, speed, heading_deg
     seed, share = seed or 0, pass_share or 1.0
     sequence = GateSequence(plan.train.count, plan.train.pulses, frames, *moving, seed=seed)
+    _check_size(sequence, session.sensor.receiver.pixels.count, max_memory or DEFAULT_MAX_MEMORY_GB)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.scene_checks import check_scene
 
     chosen = choose_integrator(session.scene, integrator)
     renderer = _prepare(session, chosen, sequence)
     lidar = renderer.scene
-    _check_size(sequence, lidar.receiver.pixels.count, max_memory or DEFAULT_MAX_MEMORY_GB)
     session.tell_axis(lidar.axis, lidar.record_end)
     check_scene(renderer.probe)
     window = ErrorWindow.of_probe(renderer.probe)
