@@ -9,16 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import (
-    Checked,
-    FloatArray,
-    IntArray,
-    checked,
-    finite,
-    integer,
-    non_negative,
-    positive,
-)
+from mitransient_lidar.core.validation import Checked, FloatArray, IntArray, checked, finite, integer, positive
+from mitransient_lidar.core.validation import non_negative as least_zero
 
 #: Orders in which a camera takes the gates of a frame.
 ORDERS = ("in_order", "interleaved", "random")
@@ -38,33 +30,31 @@ class GateSequence(Checked):
     pulses: int = checked(integer, 1, 10**9)  #: Pulses of an image.
     frames: int = checked(integer, 1, 100_000)  #: Frames.
     pulse_rate_hz: float = checked(positive)  #: Pulses a second, greater than 0.
-    order: str = "in_order"  #: One of `ORDERS`.
-    readout_s: float = checked(non_negative, default=0.0)  #: Time without pulses for each read-out [s].
-    speed: float = checked(non_negative, default=0.0)  #: Speed of the platform [m/s].
+    gate_order: str = "in_order"  #: One of `ORDERS`.
+    readout_s: float = checked(least_zero, default=0.0)  #: Time without pulses for each read-out [s].
+    speed: float = checked(least_zero, default=0.0)  #: Speed of the platform [m/s].
     heading_deg: float = checked(finite, default=0.0)  #: Its direction, from +y (north) clockwise towards +x.
     seed: int = checked(integer, 0, 2**53, default=0)  #: Seed of random orders.
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.order not in ORDERS:
-            raise UserError(f"gate_order = {self.order!r} must be one of {', '.join(ORDERS)}")
+        if self.gate_order not in ORDERS:
+            raise UserError(f"gate_order = {self.gate_order!r} must be one of {', '.join(ORDERS)}")
 
     @cached_property
     def places(self) -> IntArray:
         """Place of each gate in its frame, shape (frame, gate)."""
         shape = self.frames, self.gates
         in_order = np.broadcast_to(np.arange(self.gates), shape)
-        return np.random.default_rng(self.seed).permuted(in_order, axis=1) if self.order == "random" else in_order
+        return np.random.default_rng(self.seed).permuted(in_order, axis=1) if self.gate_order == "random" else in_order
 
     def times(self, frame: IntArray, gate: IntArray, pulse: IntArray | int = 0) -> FloatArray:
         """Return the times of pulses [s] of an image since the first pulse of all, by their numbers in it."""
-        place, in_frame = self.places[frame, gate], self.gates * self.pulses
-        if self.order == "interleaved":
-            return np.asarray(
-                (frame * in_frame + pulse * self.gates + place) / self.pulse_rate_hz + frame * self.readout_s
-            )
-        image = frame * self.gates + place
-        return np.asarray((image * self.pulses + pulse) / self.pulse_rate_hz + image * self.readout_s)
+        readouts = frame * self.gates + self.places[frame, gate]
+        number = readouts * self.pulses + pulse
+        if self.gate_order == "interleaved":
+            readouts, number = frame, (frame * self.pulses + pulse) * self.gates + gate
+        return np.asarray(number / self.pulse_rate_hz + readouts * self.readout_s)
 
     def displacements(self, times_s: FloatArray) -> FloatArray:
         """Return how far the platform has come at times [s], along x and y [m], shape (..., 2)."""

@@ -75,31 +75,25 @@ def render_frames(
     Parameters
     ----------
     scene, params, integrator, instrument, sensor
-        As for `render.render`; a scene whose film has gates.
-    pulse_rate_hz
-        Pulses a second, greater than 0. An image, one gate of one frame, is the sum of the film's ``pulses``.
+        As for `render.render`; a scene whose film has gates. An image, one gate of one frame, is the sum of its
+        ``pulses``.
     gate_order
-        ``in_order``, ``interleaved`` or ``random``, as of `GateSequence`; the random order follows from `seed`.
-    speed, heading_deg
-        Velocity of laser and receiver, which start at their place in the scene.
+        As of `GateSequence`; the random order follows from `seed`.
     passes
         Passes of each image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the
         image's pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors are from the
         spread of the passes; those of images of many pulses are at most too large, as they hold the change of the sea.
-    max_memory
-        Memory for all frames [GB], greater than 0; 2 by default.
     progress
         Called with a `passes.Progress` after every few images.
 
     Returns
     -------
     xarray.Dataset
-        A gate stack of `results.gate_stack` with the dimension ``frame`` first, also of one frame: ``gate_energy`` and
-        ``gate_energy_stderr`` [J] over (frame, row, column, gate) or (frame, pixel, gate). ``pulse_time`` [s] over
-        (frame, gate) is the time of the first pulse of an image after that of the first one of all, which meets the
-        sea at the time of the scene. With a `speed`, ``platform_x`` and ``platform_y`` [m] over (frame, gate) are the
-        displacement at that time. Gates start at fixed times after each pulse. After Ctrl-C the dataset holds the
-        completed frames, and the attribute ``interrupted`` is 1.
+        A gate stack with the dimension ``frame`` first, also of one frame: ``gate_energy`` and ``gate_energy_stderr``
+        [J] over (frame, row, column, gate) or (frame, pixel, gate). ``pulse_time`` [s] over (frame, gate) is the time
+        of an image's first pulse after the first one of all, which meets the sea at the time of the scene. With a
+        `speed`, ``platform_x`` and ``platform_y`` [m] are the displacement at that time. Gates start at fixed times
+        after each pulse. After Ctrl-C the completed frames are returned, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -115,10 +109,11 @@ def render_frames(
     plan = session.sensor.film().gates
     if plan is None:
         raise UserError(f"scene {session.name} has no gates, of which frames consist: give its film a gate_count")
-    moving = pulse_rate_hz, gate_order, readout_s, speed, heading_deg
-    seed, share = seed or 0, pass_share or 1.0
-    sequence = GateSequence(plan.train.count, plan.train.pulses, frames, *moving, seed=seed)
-    _check_size(sequence, session.sensor.receiver.pixels.count, max_memory or DEFAULT_MAX_MEMORY_GB)
+    seed, share, limit = seed or 0, pass_share or 1.0, max_memory or DEFAULT_MAX_MEMORY_GB
+    moving: dict[str, Any] = {"pulse_rate_hz": pulse_rate_hz, "gate_order": gate_order, "readout_s": readout_s}
+    moving |= {"speed": speed, "heading_deg": heading_deg}
+    sequence = GateSequence(plan.train.count, plan.train.pulses, frames, **moving, seed=seed)
+    _check_size(sequence, session.sensor.receiver.pixels.count, limit)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.scene_checks import check_scene
 
@@ -140,31 +135,21 @@ def render_frames(
         lidar,
         chosen,
         renderer.used_values,
-        **described,
-        **{"seed": seed, "passes": passes, "pass_share": share, "max_memory_gb": max_memory or DEFAULT_MAX_MEMORY_GB},
-        **{"frames": frames, "pulse_rate_hz": pulse_rate_hz, "gate_order": gate_order, "readout_s": readout_s},
-        **{"speed": speed, "heading_deg": heading_deg, "interrupted": int(interrupted)},
+        **{**described, **moving, "frames": frames, "seed": seed, "passes": passes, "pass_share": share},
+        **{"max_memory_gb": limit, "interrupted": int(interrupted), "surface_edge_loss": lost},
         elapsed_s=time.perf_counter() - began,
-        surface_edge_loss=lost,
     )
-    pixels = lidar.receiver.pixels
-    coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
-    shape = (done, sequence.gates, pixels.count)
+    pixels, shape = lidar.receiver.pixels, (done, sequence.gates, lidar.receiver.pixels.count)
+    coords: dict[str, Any] = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
     energy, stderr = (np.moveaxis(each[: images.done].reshape(shape), 1, 2) for each in (images.mean, images.stderr))
-    stack = build_gates(
-        energy, stderr, train, coords={**coords, "frame": np.arange(done)}, attributes=results.provenance(attributes)
-    )
-    return with_lines_of_sight(_timed(stack, sequence, done), lidar)
-
-
-def _timed(stack: xr.Dataset, sequence: GateSequence, frames: int) -> xr.Dataset:
-    """Return a stack with the times of its images, and their places if the platform moves."""
-    times = sequence.times(*np.meshgrid(np.arange(frames), np.arange(sequence.gates), indexing="ij"))
-    known: dict[str, Any] = {"pulse_time": (("frame", "gate"), times)}
-    if sequence.speed > 0:
-        x, y = np.moveaxis(sequence.displacements(times), -1, 0)
-        known |= {"platform_x": (("frame", "gate"), x), "platform_y": (("frame", "gate"), y)}
-    return label(stack.assign_coords(known))
+    coords["frame"] = np.arange(done)
+    stack = build_gates(energy, stderr, train, coords=coords, attributes=results.provenance(attributes))
+    times = sequence.times(*np.indices((done, sequence.gates)))
+    known = {"pulse_time": times}
+    if speed > 0:
+        known |= dict(zip(("platform_x", "platform_y"), np.moveaxis(sequence.displacements(times), -1, 0), strict=True))
+    stack = label(stack.assign_coords({name: (("frame", "gate"), values) for name, values in known.items()}))
+    return with_lines_of_sight(stack, lidar)
 
 
 def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> PassRenderer:

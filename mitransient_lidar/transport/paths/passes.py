@@ -34,13 +34,10 @@ class ReceivedLight:
     """
 
     def __init__(
-        self,
-        histogram: TransientHistogram,
-        classes: PathClasses,
-        focusing: RippleFocusing | None = None,
-        gated: TransientHistogram | None = None,
+        self, histograms: Sequence[TransientHistogram], classes: PathClasses, focusing: RippleFocusing | None = None
     ) -> None:
-        self.histogram, self.classes, self.focusing, self.gated = histogram, classes, focusing, gated
+        self._all, self.classes, self.focusing = histograms, classes, focusing
+        self.histogram, self.gated = histograms[0], histograms[1] if len(histograms) > 1 else None
         self.clear()
 
     def clear(self) -> None:
@@ -74,11 +71,6 @@ class ReceivedLight:
         index = self.classes.index(pixel, order, reversals, solid)
         for each in self._all:
             each.add(index, length, energy, active, sums)
-
-    @property
-    def _all(self) -> list[TransientHistogram]:
-        """All histograms that receive light."""
-        return [self.histogram, *([] if self.gated is None else [self.gated])]
 
     @property
     def edge_loss(self) -> float:
@@ -169,7 +161,7 @@ class PassRenderer(ABC):
         emitted, length = scene.transmitter.energy, scene.reference_length
         kinds = (None, gates) if beside else (gates,)
         sums = [TransientHistogram(scene.axis, shape, emitted, kind, length, scene.perturbations) for kind in kinds]
-        received = ReceivedLight(sums[0], self.classes, self.focusing, *sums[1:])
+        received = ReceivedLight(sums, self.classes, self.focusing)
         with dr.suspend_grad():
             self.trace(received, shots, self.paths if paths is None else paths)
         received.evaluate()
