@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.plots.viewer import view
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.render import render
+    from mitransient_lidar.rendering.shots.frames import render_frames
     from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.studies.bounds import bounds
     from mitransient_lidar.studies.depth_bias import depth_bias
@@ -108,6 +109,7 @@ _FUNCTIONS = {
     "read_profile": ("physics.water.profiles", "read_profile"),
     "record": ("analysis.receiver", "detect_waveforms"),
     "render": ("rendering.render", "render"),
+    "render_frames": ("rendering.shots.frames", "render_frames"),
     "render_passive": ("rendering.passive", "render_passive"),
     "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
@@ -144,6 +146,7 @@ __all__ = [
     "read_profile",
     "record",
     "render",
+    "render_frames",
     "render_passive",
     "render_shots",
     "retrieve",

@@ -183,6 +183,11 @@ class OceanSurface(mi.Mesh):
         return values | (fine if np.isfinite(sea.cell_size) else {})
 
     @property
+    def time_s(self) -> float:
+        """Time of the waves [s]."""
+        return float(self._values["time"])
+
+    @property
     def footprint_size(self) -> float:
         """Side of the fine patch [m], without an automatic margin for scattered light."""
         whole = self.sea.refined_size
@@ -223,19 +228,26 @@ class SeaPatches:
     """
 
     def __init__(self, surface: OceanSurface) -> None:
-        self._surface, self._sea = surface, surface.sea
+        self._surface, self._later = surface, (np.nan, surface.sea)
         props = mi.Properties()
         props["bsdf"], props["face_normals"] = surface.bsdf(), True
         self.shape = mi.Mesh("sea_patches", 3, 1, props, has_vertex_texcoords=True)
         self.shapes: mi.Scene | None = None
 
-    def set_time(self, time_s: float) -> None:
-        """Set the time [s] of the waves of later patches."""
-        self._sea = self._surface.sea.at(time_s)
+    def _at(self, time_s: float) -> SeaSurface:
+        """Return the sea at a time [s]."""
+        if self._later[0] != time_s:
+            self._later = time_s, self._surface.sea.at(time_s)
+        return self._later[1]
 
-    def move(self, places: FloatArray) -> FloatArray:
-        """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way."""
-        mesh, positions = self._sea.patches(places, self._surface.footprint_size)
+    def move(self, places: FloatArray, times_s: FloatArray | None = None) -> FloatArray:
+        """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way.
+
+        Waves are those at times [s], shape (n,), or at the time of the surface.
+        """
+        sea = self._surface.sea
+        seas = [sea] * len(places) if times_s is None else map(self._at, times_s.tolist())
+        mesh, positions = sea.patches(places, self._surface.footprint_size, seas)
         fill_mesh(self.shape, mesh)
         if self.shapes is None:
             self.shapes = mi.load_dict({"type": "scene", "sea": self.shape}, parallel=False)

@@ -13,7 +13,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
-_GATE_START = ("gate_start_ns", "gate_start_depth")
+_GATE_START = ("gate_start_ns", "gate_start_depth", "gate_start_range")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
 
 
@@ -122,24 +122,22 @@ class TimeGatedFilm(mi.Film):
 def _gate_plan(props: DeclaredProperties) -> GatePlan | None:
     """Read the gates of the film, or None; raise UserError where parameters contradict each other."""
     read, count = props.read, props.read("gate_count")
-    given = [name for name in (*_GATE_SHAPE, *_GATE_START, "gate_step_ns", "gate_profile", "pulses") if name in props]
+    others = ("gate_step_ns", "gate_profile", "gate_jitter_ns", "pulses")
+    given = [name for name in (*_GATE_SHAPE, *_GATE_START, *others) if name in props]
     if count == 0:
         for name in given:
             props.mark_queried(name)
         return None
     starts = [name for name in _GATE_START if name in given]
     if len(starts) != 1:
-        raise UserError(f"gate_count = {count} gates need either gate_start_ns or gate_start_depth")
-    start, pulses = read(starts[0]), read("pulses")
+        raise UserError(f"gate_count = {count} gates need one of {', '.join(_GATE_START)}")
+    start, pulses, jitter = map(read, (starts[0], "pulses", "gate_jitter_ns"))
     if "gate_profile" in props:
-        profile = GateShape.from_file(str(props["gate_profile"]))
-        step = read("gate_step_ns", profile.width_ns)
-        train = GateTrain.measured(profile, 0.0, step, count, pulses)
+        shape = GateShape.from_file(str(props["gate_profile"]))
     else:
-        width, rise, fall = map(read, _GATE_SHAPE)
-        step = read("gate_step_ns", width)
-        train = GateTrain(0.0, width, step, count, rise, fall, pulses)
-    return GatePlan(train, **{"start_ns" if starts[0] == "gate_start_ns" else "start_depth": start})
+        shape = GateShape.edges(*map(read, _GATE_SHAPE))
+    train = GateTrain.measured(shape.jittered(jitter), 0.0, read("gate_step_ns", shape.width_ns), count, pulses)
+    return GatePlan(train, starts[0], start)
 
 
 register("film", TIME_GATED_FILM, TimeGatedFilm)

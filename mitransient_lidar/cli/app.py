@@ -44,6 +44,7 @@ COMMANDS: dict[str, Command] = {
 EXAMPLES = {
     "render": "table1 -D wind_speed=5 --target-error 0.05",
     "shots": "table1 --count 20 --passes 4 -o output/shots.nc",
+    "frames": "gated_mine --frames 4 --pulse-rate 100 --pass-share 0.1",
     "passive": "passive_sea --frames 10",
     "campaign": "bottoms.toml --workers 4",
     "fly": "palmer",

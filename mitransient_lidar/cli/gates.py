@@ -36,13 +36,14 @@ def _gates(
     """Cut the gates of a train, or take those that are there, and write and draw them."""
     from mitransient_lidar.analysis.gates import cut as gating
 
-    count, starts = call.arguments["count"], [call.arguments[name] for name in ("start_ns", "start_depth_m")]
+    count = call.arguments["count"]
+    starts = [call.arguments[name] for name in ("start_ns", "start_depth_m", "start_range_m")]
     given = {"--width-ns": call.arguments["width_ns"], "--step-ns": call.arguments["step_ns"]}
     given["--count"] = None if count == 1 else count
     with reporting(quiet):
         result = _open(stack)
         has_gates = "gate_energy" in result
-        is_cut = not has_gates or starts != [None, None]
+        is_cut = not has_gates or any(one is not None for one in starts)
         stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")
         files = GateFiles.of(
             output or stack.parent, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html
@@ -52,7 +53,9 @@ def _gates(
         files.check()
         if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
-                raise UserError(f"{named[0]} needs --start-ns or --start-depth, where the first gate begins.")
+                raise UserError(
+                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins."
+                )
             cut = result
         else:
             with call.named():

@@ -94,6 +94,26 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
         typer.echo(f"no {dispensable}: {error}", err=True)
 
 
+def _frames(
+    call: Call,
+    output: Folder = OUTPUT,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the mean over the frames.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Render frames, and write them; the mean over them also as a gate stack."""
+    scene = call.arguments["scene"]
+    name, _, _ = scene_of(scene, "frames")
+    target, gates = output / f"{name}_frames.nc", GateFiles.of(output, f"{name}_frames", drawings=plot)
+    check_targets(output, [target, *gates.names()], scene)
+    with DeferredInterrupt(at_once=False):
+        frames = _again(call)()
+        output.mkdir(parents=True, exist_ok=True)
+        with announced():
+            _write(frames, target)
+            gates.write(frames, None, quiet)
+    exit_if_interrupted(frames)
+
+
 def _passive(
     call: Call,
     output: Folder = OUTPUT,
@@ -222,6 +242,19 @@ COMMANDS = {
         retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
         """,
         defaults={"count": None, "seed": None},
+    ),
+    "frames": Command(
+        "Render",
+        "rendering.shots.frames:render_frames",
+        _frames,
+        """Render frames of gate images, each with its own pulses.
+
+        Each gate of each frame has pulses of its own, between which waves and platform move. Writes
+        DIR/<scene>_frames.nc, and the mean over the frames as <scene>_frames_gates.exr, _gates.png and _depth.png.
+        Ctrl-C keeps the completed frames.
+        """,
+        defaults={name: None for name in ("pulse_rate_hz", "frames", "gate_order", "readout_s", "speed", "heading_deg")}
+        | {"passes": None},
     ),
     "passive": Command(
         "Render",

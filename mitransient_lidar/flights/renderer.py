@@ -255,7 +255,7 @@ class FlightRenderer(Renderer):
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
-            batches.set_time(time_s)
+            poses = replace(poses, times_s=np.full(len(poses), time_s))
             sea = sea if sea is None else sea.at(time_s)
         pulses = inputs["pulse"].astype(np.int64)
         rendered = [

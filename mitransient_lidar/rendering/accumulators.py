@@ -129,10 +129,12 @@ class PassAccumulator:
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
         self._weights: FloatArray | None = None
+        #: Whether a pass accumulates the gates beside time bins, since the bins are longer.
+        self.gates_beside = train is not None and kept == "histograms" and train.width_ns < scene.axis.bin_width_ns
         if train is None:
             return
         pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
-        if kept == "direct":
+        if kept == "direct" or self.gates_beside:
             from mitransient_lidar.transport.paths.histogram import GateWeights
 
             self.gate_weights = GateWeights(train, train.response_weights(pulse, response), scene.reference_length)
@@ -153,8 +155,8 @@ class PassAccumulator:
         """Energy received in all passes, or in their gates [J]."""
         return float(np.nansum(self._received.mean)) * self._received.count
 
-    def add(self, histogram: TransientHistogram) -> None:
-        """Add the histogram of a pass."""
+    def add(self, histogram: TransientHistogram, gated: TransientHistogram | None = None) -> None:
+        """Add the histogram of a pass, and that of its gates if they were accumulated beside it."""
         pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
         if self._kept == "direct":
             self.gates.add(histogram.energy().reshape(pixels, -1))
@@ -170,12 +172,17 @@ class PassAccumulator:
             perturbed = perturbed.reshape(len(perturbed), pixels, classes, -1)
             if self._weights is not None:
                 self._gate_slopes.add(perturbed[: self._scores].sum(axis=2) @ self._weights)
+            elif gated is not None:
+                slopes = gated.perturbed().reshape(len(perturbed), pixels, classes, -1)
+                self._gate_slopes.add(slopes[: self._scores].sum(axis=2))
         energy, power = self._light.add(histogram.energy().reshape(pixels, classes, -1), perturbed)
         self._correlation.add(power)
         if self._batches:
             number = (self._light.whole.power.count - 1) % len(self._batches)
             self._batches[number] = self._batches[number] + power
-        if self._weights is not None:
+        if gated is not None:
+            self.gates.add(gated.energy().reshape(pixels, classes, -1).sum(axis=1))
+        elif self._weights is not None:
             self.gates.add(energy @ self._weights)
 
     def require_light(self, passes: int) -> None:
@@ -296,7 +303,7 @@ def choose_accumulator(
     each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
     channels = 1 + len(parameters)
     bins = each * (1 + len(origins)) * channels
-    train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
+    train = placed_gates(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
@@ -314,7 +321,8 @@ def choose_accumulator(
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins{of_what} takes {1e-9 * everything:.2g} GB"
     if of_what or train is None:
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; {cure}")
-    if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit:
+    is_narrow = train.width_ns < scene.axis.bin_width_ns
+    if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
         logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
         return PassAccumulator(scene, window, train, kept="gates")
     each = (per_bin + _BYTES_PER_KEPT_GATE) * pixels
@@ -329,11 +337,12 @@ def choose_accumulator(
     return PassAccumulator(scene, window, train, kept="direct")
 
 
-def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
+def placed_gates(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
     """Return the gates of the scene at their times."""
     if scene.gates is None:
         return None
     train = scene.gate_train(scene.gates)
-    echo = {} if surface_time_ns is None else {"surface_time_ns": surface_time_ns, "window_start_ns": start_ns}
+    no_echo = surface_time_ns is None or scene.submerged
+    echo = {} if no_echo else {"surface_time_ns": surface_time_ns, "window_start_ns": start_ns}
     check_train(train, echo, scene.axis)
     return train

@@ -28,7 +28,14 @@ _HELD = {
     "render": ("seed", "variant", "max_memory", "passes", "pass_share"),
     "passive": ("seed", "variant"),
     "shots": ("passes", "pass_share"),
+    "frames": ("seed", "max_memory", "passes", "pass_share"),
 }
+
+#: Attributes that only results of a command have, the last one after the others.
+_KINDS = {"shots": "series_parameters", "passive": "frame_passes", "frames": "gate_order", "render": "pass_share"}
+
+#: Options of frames that are attributes of the same name.
+_OF_FRAMES = ("frames", "pulse_rate_hz", "gate_order", "readout_s", "speed", "heading_deg")
 
 #: Options that end a render; with another end the recorded ones do not count.
 _ENDS = ("target_error", "max_time", "passes")
@@ -47,13 +54,13 @@ def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, An
 
 
 def result_kind(attributes: Mapping[str, Any]) -> str:
-    """Return the command that rendered a result: ``render``, ``shots`` or ``passive``; raise UserError for others."""
-    for kind, name in (("shots", "series_parameters"), ("passive", "frame_passes"), ("render", "pass_share")):
+    """Return the command that rendered a result, one of `_KINDS`; raise UserError for others."""
+    for kind, name in _KINDS.items():
         if name in attributes:
             return kind
     raise UserError(
-        "the dataset is not a result that can be rendered again: it must be of render, shots or passive, and of this "
-        "release or a later one"
+        "the dataset is not a result that can be rendered again: it must be of render, shots, frames or passive, "
+        "and of this release or a later one"
     )
 
 
@@ -87,6 +94,8 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
         own["integrator"] = _integrator(attributes)
     if kind == "passive":
         own |= _frame_options(attributes, given)
+    elif kind == "frames":
+        own |= {name: _held(attributes, name) for name in _OF_FRAMES}
     else:
         if kind == "render" and "batches" in attributes:
             own["batches"] = attributes["batches"]

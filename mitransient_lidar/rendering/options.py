@@ -11,6 +11,9 @@ from mitransient_lidar.core.options import Option, declared, positive_option
 #: Largest number of passes that can be asked for.
 MOST_PASSES = 10**9
 
+#: Memory for histograms, unless another one is requested [GB].
+DEFAULT_MAX_MEMORY_GB = 2.0
+
 #: Smallest share of the paths of a full pass.
 SMALLEST_SHARE = 2**-9
 

@@ -14,6 +14,7 @@ from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import (
+    DEFAULT_MAX_MEMORY_GB,
     Batches,
     Components,
     Derivatives,
@@ -39,8 +40,6 @@ logger = logging.getLogger(__name__)
 #: Default ends of a render without and with gates.
 DEFAULT_GOAL = Goal(target_error=0.03, max_time=300.0)
 DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
-
-_DEFAULT_MAX_MEMORY_GB = 2.0
 
 
 @checked
@@ -185,12 +184,14 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         option is invalid.
     """
     from mitransient_lidar.rendering.passive import render_passive
+    from mitransient_lidar.rendering.shots.frames import render_frames
     from mitransient_lidar.rendering.shots.series import render_shots
 
     functions: dict[str, Callable[..., xarray.Dataset]] = {
         "render": render,
         "passive": render_passive,
         "shots": render_shots,
+        "frames": render_frames,
     }
     kind, chosen = again.recall(result, options)
     return functions[kind](**chosen)
@@ -204,7 +205,7 @@ def _render(
 ) -> xarray.Dataset:
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
-    max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
+    max_memory = options.max_memory or DEFAULT_MAX_MEMORY_GB
     from mitransient_lidar.transport.paths.path_classes import check_solids
 
     if components:
@@ -242,12 +243,13 @@ def _render(
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share
-        gates, first = accumulator.gate_weights, None
+        gates, beside, first = accumulator.gate_weights, accumulator.gates_beside, None
         if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
-        received = first or fitted.render_pass(seed, gates=gates)
-        accumulator.add(received.histogram)
+        received = None if beside else first
+        received = received or fitted.render_pass(seed, gates=gates, beside=beside)
+        accumulator.add(received.histogram, received.gated)
         if differences is not None:
             differences.add_pass(seed, share)
         return received.edge_loss

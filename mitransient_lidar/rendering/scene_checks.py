@@ -12,7 +12,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.transport.fitted_axis import total_reflection_ns
+from mitransient_lidar.transport.fitted_axis import NEAREST_RANGE, earliest_ns, total_reflection_ns
 from mitransient_lidar.transport.opaque import shape_number
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
 from mitransient_lidar.transport.rng import unit_points
@@ -23,9 +23,6 @@ logger = logging.getLogger(__name__)
 
 #: Distance of the axes that is told, over the radii of beam and view, whichever is larger.
 _APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
-
-#: Smallest range of records of a lidar under water [m].
-_NEAREST_RANGE = 0.05
 
 #: Heights at which the distance of the axes is compared.
 _HEIGHTS = 64
@@ -79,11 +76,10 @@ def check_scene(probe: Probe) -> None:
 def _check_under_water(probe: Probe) -> None:
     """Check the record of a lidar under water: without the laser itself and total reflection, and with every echo."""
     scene, axis = probe.scene, probe.scene.axis
-    apart = float(np.linalg.norm(scene.transmitter.pose.origin - scene.receiver.pose.origin))
-    first_ns = 2e9 * scene.group_index * _NEAREST_RANGE / C0
-    if apart < _NEAREST_RANGE and axis.start_ns < first_ns:
+    first_ns = earliest_ns(scene, scene.transmitter)
+    if first_ns is not None and axis.start_ns < first_ns:
         raise UserError(
-            f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {_NEAREST_RANGE:g} m from "
+            f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {NEAREST_RANGE:g} m from "
             "the lidar: at one place, laser and receiver return without limit from less and less range"
         )
     reflected_ns = total_reflection_ns(probe.view, probe.beam)

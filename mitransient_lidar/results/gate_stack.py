@@ -22,11 +22,11 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain, range_time_ns
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates, made_from
-from mitransient_lidar.results.geometry import lidar_geometry, optional_number
+from mitransient_lidar.results.geometry import lidar_geometry, optional_number, required_number
 from mitransient_lidar.results.variables import label
 
 #: Dimensions of results with time bins alone.
@@ -44,6 +44,10 @@ def train_from_options(
         float | None,
         Option("Depth below the mean sea level on the axis [m], any number, instead of a time", flag="--start-depth"),
     ] = None,
+    start_range_m: Annotated[
+        float | None,
+        Option("Distance from the lidar along the axis [m], instead of a time", 0, flag="--start-range"),
+    ] = None,
     width_ns: Annotated[float | None, positive_option("Width of a gate between half heights", "ns")] = None,
     step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
     count: Annotated[int, Option("Number of gates", 1, 100_000)] = 1,
@@ -55,6 +59,7 @@ def train_from_options(
         str | PathLike[str] | None,
         Option("Measured gate instead of width and edges: columns time [ns], transmission", flag="--profile"),
     ] = None,
+    jitter_ns: Annotated[float, Option("Standard deviation of the gates' opening", 0, unit="ns")] = 0.0,
     pulses: Annotated[int, Option("Pulses accumulated in a gate", 1, 10**9)] = 1,
 ) -> GateTrain:
     """Build a gate train from the options of the command ``gates``.
@@ -63,9 +68,9 @@ def train_from_options(
     ----------
     attributes : mapping
         Attributes of a result, with the lidar geometry if the start is a depth.
-    start_ns, start_depth_m : float, optional
-        Half height of the first gate's rising edge, as a time [ns] or a depth below the mean sea level on the
-        receiver's axis [m]; exactly one of them.
+    start_ns, start_depth_m, start_range_m : float, optional
+        Half height of the first gate's rising edge, as a time [ns], or that of echoes from a depth below the mean sea
+        level or a range from the lidar on the receiver's axis [m]; exactly one of them.
 
     Raises
     ------
@@ -76,18 +81,28 @@ def train_from_options(
         raise UserError(
             f"rise_ns = {rise_ns:g} and fall_ns = {fall_ns:g} must be 0 with a profile, which includes its edges"
         )
-    if start_ns is not None and start_depth_m is None:
-        start = start_ns
-    elif start_depth_m is not None and start_ns is None:
+    if sum(one is not None for one in (start_ns, start_depth_m, start_range_m)) != 1:
+        raise UserError("a gate train needs one start: start_ns, start_depth_m or start_range_m")
+    if (profile_file is None) == (width_ns is None):
+        raise UserError("a gate train needs one shape: either width_ns or a profile file")
+    start = start_ns
+    if start_depth_m is not None:
         start = float(lidar_geometry(attributes, surface="level").time_of_depth(start_depth_m))
-    else:
-        raise UserError("a gate train needs one start: either start_ns or start_depth_m")
-    if profile_file is not None and width_ns is None:
-        profile = GateShape.from_file(profile_file)
-        return GateTrain.measured(profile, start, profile.width_ns if step_ns is None else step_ns, count, pulses)
-    if width_ns is not None and profile_file is None:
-        return GateTrain(start, width_ns, width_ns if step_ns is None else step_ns, count, rise_ns, fall_ns, pulses)
-    raise UserError("a gate train needs one shape: either width_ns or a profile file")
+    elif start_range_m is not None:
+        start = _time_of_range(attributes, start_range_m)
+    assert start is not None
+    shape = GateShape.edges(width_ns, rise_ns, fall_ns) if width_ns else GateShape.from_file(str(profile_file))
+    return GateTrain.measured(
+        shape.jittered(jitter_ns), start, shape.width_ns if step_ns is None else step_ns, count, pulses
+    )
+
+
+def _time_of_range(attributes: Mapping[str, Any], slant_range: float) -> float:
+    """Return when echoes arrive from a range on the axis of a lidar, over water or under it [ns]."""
+    if (optional_number(attributes, "altitude") or 0.0) < 0:
+        return range_time_ns(slant_range, 0.0, required_number(attributes, "group_index"))
+    geometry = lidar_geometry(attributes, surface="level")
+    return range_time_ns(slant_range, geometry.slant_range, geometry.group_index)
 
 
 def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
@@ -112,7 +127,7 @@ def build_gates(
     ----------
     energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
         Energy in each gate, summed over its pulses, and its standard error [J]. The pixels of an imager may be in one
-        axis, in row-major order.
+        axis, in row-major order. With the coordinate ``frame`` that dimension is first.
     train : GateTrain
         The gates.
     coords, attributes : mapping
@@ -125,13 +140,15 @@ def build_gates(
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
-    shape = tuple(pixels.sizes[dim] for dim in dims)
+    frames = ("frame",) if "frame" in pixels.sizes else ()
+    first, shape = (tuple(pixels.sizes[dim] for dim in each) for each in (frames, dims))
     variables = {}
     for name, values in (("gate_energy", energy), ("gate_energy_stderr", stderr)):
         array = np.asarray(values, np.float64)
-        if array.shape not in ((*shape, train.count), (math.prod(shape), train.count)):
-            raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
-        variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count))
+        whole = (*first, *shape, train.count)
+        if array.shape not in (whole, (*first, math.prod(shape), train.count)):
+            raise UserError(f"{name} has shape {array.shape}; it must be {whole}.")
+        variables[name] = ((*frames, *dims, "gate"), array.reshape(whole))
     axis = {
         "gate": np.arange(train.count),
         "gate_start": train.starts_ns,
@@ -146,6 +163,7 @@ def build_gates(
         "gate_rise_ns": train.rise_ns,
         "gate_fall_ns": train.fall_ns,
         "pulses": train.pulses,
+        **({"gate_jitter_ns": train.shape.jitter_ns} if train.shape.jitter_ns else {}),
     }
     if train.profile is not None:
         stack.attrs["gate_profile_ns"] = train.profile.times_ns.tolist()
@@ -171,11 +189,29 @@ def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.A
     return label(stack.assign(arrays))
 
 
+def average_frames(stack: xr.Dataset) -> xr.Dataset:
+    """Return the mean over the frames of a gate stack, whose standard errors are independent; one without frames stays.
+
+    Coordinates of the frames, such as their times, are left out.
+    """
+    if "frame" not in stack.dims:
+        return stack
+    errors = [name for name in stack.data_vars if str(name).endswith("_stderr")]
+    square = (stack[errors] ** 2).mean("frame", skipna=False, keep_attrs=True) / stack.sizes["frame"]
+    mean = stack.drop_vars(errors).mean("frame", skipna=False, keep_attrs=True)
+    root = square**0.5
+    for name in errors:
+        root[name].attrs = stack[name].attrs
+    return mean.merge(root, combine_attrs="override").assign_attrs(stack.attrs)
+
+
 def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis) -> None:
     """Raise `UserError` if a gate train ends before the surface echo or is not within the record."""
     spans = train.spans_ns
     closes = spans[-1, 1]
     surface, first_surface = (optional_number(attributes, name) for name in ("surface_time_ns", "window_start_ns"))
+    if (optional_number(attributes, "altitude") or 0.0) < 0:
+        surface = None  # the water comes first
     # Pixels near nadir receive the surface echo before the mean.
     if surface is not None and first_surface is not None:
         surface = min(surface, first_surface)
@@ -199,6 +235,8 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
     """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
+    Of several frames they are the mean, `average_frames`.
+
     Raises
     ------
     UserError
@@ -206,6 +244,7 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
         raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+    dataset = average_frames(dataset)
     energy = dataset["gate_energy"]
     pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
     if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):

@@ -21,6 +21,7 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.results.variables import described
 
 Attributes = Mapping[str, Any]
@@ -256,6 +257,13 @@ def two_way_efficiency(attributes: Attributes, given: float | None = None) -> fl
     if "two_way_efficiency" not in attributes:
         raise UserError("efficiency must be given: the dataset has no attribute two_way_efficiency")
     return required_number(attributes, "two_way_efficiency")
+
+
+def pulse_of(attributes: Attributes) -> Pulse:
+    """Return the transmitted pulse of a result: its samples, or a Gaussian of its width."""
+    if {"pulse_times_ns", "pulse_power"} <= set(attributes):
+        return Pulse.sampled(attributes["pulse_times_ns"], attributes["pulse_power"])
+    return Pulse.gaussian(required_number(attributes, "pulse_fwhm_ns"))
 
 
 def optional_number(attributes: Attributes, name: str) -> float | None:

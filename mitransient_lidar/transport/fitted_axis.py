@@ -31,6 +31,9 @@ _REFLECTED = 0.1
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
 
+#: Smallest range of records of a lidar under water with laser and receiver at one place [m].
+NEAREST_RANGE = 0.05
+
 #: Bins before the surface echo in which its detection measures the noise, and the longest extension for them [ns].
 _QUIET_BINS, _LONGEST_NS = 10, 100.0
 
@@ -49,17 +52,19 @@ def fitted_axis(
     """
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
-    latest = np.inf
+    latest, given = np.inf, film.time_start_ns
     if transmitter.pose.submerged:
-        first, last, end, latest = _light_under_water(scene, transmitter)
+        first, last, end, latest = _light_under_water(scene, transmitter, film.gates)
         start = first - lead
+        if given is None and (earliest := earliest_ns(scene, transmitter)) is not None:
+            given = np.ceil(earliest / film.bin_width_ns) * film.bin_width_ns
     else:
         first, last, end = _light_above_water(scene, transmitter, film.gates, shifts)
         start = first - lead
         if scene.surfaces:
             quiet = _quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns
             start = min(start, max(quiet, start - _LONGEST_NS))
-    axis = TimeAxis.covering(start, last + tail, film.bin_width_ns, film.time_start_ns, film.bin_count)
+    axis = TimeAxis.covering(start, last + tail, film.bin_width_ns, given, film.bin_count)
     if film.bin_count is None and axis.end_ns > latest:
         bins = max(int((latest - axis.start_ns) / axis.bin_width_ns), 1)
         return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
@@ -73,15 +78,32 @@ def _light_above_water(
     solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
     found = [_lidar_view(scene, transmitter, shift).limits(solids, gates is not None) for shift in shifts]
     last = max(found, key=lambda each: each.last_ns)
-    limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
-    if gates is not None:
-        spans = scene.gate_train(gates).spans_ns
-        end = "after the last gate" if spans[-1, 1] > limits[1] else end
-        limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
-    return *limits, end
+    return _with_gates(scene, gates, min(each.first_ns for each in found), last.last_ns, last.end)
 
 
-def _light_under_water(scene: WaterScene, transmitter: Transmitter) -> tuple[float, float, str, float]:
+def _with_gates(
+    scene: WaterScene, gates: GatePlan | None, first: float, last: float, end: str
+) -> tuple[float, float, str]:
+    """Return limits that also hold the gates."""
+    if gates is None:
+        return first, last, end
+    spans = scene.gate_train(gates).spans_ns
+    end = "after the last gate" if spans[-1, 1] > last else end
+    return min(first, spans[0, 0]), max(last, spans[-1, 1]), end
+
+
+def earliest_ns(scene: WaterScene, transmitter: Transmitter) -> float | None:
+    """Return the earliest start of a record under water [ns]; None for a laser away from the receiver.
+
+    At one place, they return without limit from less and less range.
+    """
+    apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
+    return 2e9 / C0 * scene.group_index * NEAREST_RANGE if apart < NEAREST_RANGE else None
+
+
+def _light_under_water(
+    scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None
+) -> tuple[float, float, str, float]:
     """Return the same of a lidar under water, and when the sea first reflects beam or view totally [ns].
 
     The first light is scattered at the lidar. The last one is the farthest echo of beam and view, with a quarter of its
@@ -96,7 +118,7 @@ def _light_under_water(scene: WaterScene, transmitter: Transmitter) -> tuple[flo
     apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
     echo = 2e9 / C0 * scene.group_index * (min(to_solid, visible) + apart)
     end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
-    return 0.0, 1.25 * echo + 40.0, end, total_reflection_ns(view, beam)
+    return *_with_gates(scene, gates, 0.0, 1.25 * echo + 40.0, end), total_reflection_ns(view, beam)
 
 
 def total_reflection_ns(view: Rays, beam: Rays) -> float:

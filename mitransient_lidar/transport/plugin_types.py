@@ -109,6 +109,10 @@ class SeaShape(Protocol):
     has_ripples: bool
     footprints: Sequence[Footprint] | None
 
+    @property
+    def time_s(self) -> float:
+        """Time of the waves [s]."""
+
     def fit(self, footprints: Sequence[Footprint]) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain, range_time_ns
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -38,6 +38,9 @@ _FACET_PER_WAVE = 0.25
 #: Smallest side of a bottom, over that of the largest solid.
 _BOTTOM_PER_LARGEST = 0.25
 
+
+#: Smallest cosine from the vertical of an axis under water that has depths.
+_LEVEL = 1e-3
 
 Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 
@@ -236,28 +239,32 @@ class WaterScene:
         arrays = layers.refractive_index, layers.boundaries, layers.group_index
         return LevelSea(*(tuple(map(float, each)) for each in arrays))
 
-    @property
-    def depth_per_ns(self) -> float:
-        """Depth per delay of echoes on the receiver's axis [m/ns]."""
-        down = refract_level(self.receiver.pose.axis, self.refractive_index)
-        return 0.5e-9 * C0 / self.group_index * -float(down[2])
-
     def gate_train(self, plan: GatePlan) -> GateTrain:
         """Return the gates of a plan at their times, which waves do not change.
 
         Raises
         ------
         UserError
-            If they start at a depth, and the receiver's axis does not meet the mean sea level.
+            If they start at a depth, and the receiver's axis does not meet the mean sea level, or is level under water.
         """
-        pose = self.receiver.pose
-        if plan.start_ns is None and not (self.surfaces and pose.looks_down):
-            what = "the axis of the receiver does not meet it" if self.surfaces else "the scene has none"
-            raise UserError(
-                f"gate_start_depth = {plan.start_depth:g} m counts from the mean sea level, and {what}: "
-                "give gate_start_ns"
-            )
-        return plan.placed(2e9 / C0 * pose.ground_range, self.depth_per_ns)
+        pose, start = self.receiver.pose, plan.start
+        meets_sea = bool(self.surfaces) and pose.looks_down
+        if plan.given == "gate_start_range":
+            to_sea = pose.ground_range if meets_sea else 0.0 if pose.submerged else np.inf
+            start = range_time_ns(start, to_sea, self.group_index)
+        elif plan.given == "gate_start_depth":
+            if not meets_sea and not (pose.submerged and abs(pose.axis[2]) > _LEVEL):
+                what = "the axis of the receiver does not meet it" if self.surfaces else "the scene has none"
+                raise UserError(
+                    f"gate_start_depth = {start:g} m counts from the mean sea level, and {what}: give gate_start_ns"
+                )
+            if pose.submerged:
+                begin, above, down = 0.0, start + float(pose.origin[2]), -float(pose.axis[2])
+            else:
+                begin, above = 2e9 / C0 * pose.ground_range, start
+                down = -float(refract_level(pose.axis, self.refractive_index)[2])
+            start = begin + above / (0.5e-9 * C0 / self.group_index * down)
+        return replace(plan.train, start_ns=start)
 
     def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""

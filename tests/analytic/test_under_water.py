@@ -1,7 +1,9 @@
 """Lidars under water: closed forms of bottom, column and surface, and agreement of the integrators."""
 
+from dataclasses import replace
 from itertools import pairwise
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.phase import henyey_greenstein
@@ -12,7 +14,9 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.rendering.accumulators import placed_gates
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+from mitransient_lidar.rendering.scene_checks import check_scene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 GROUP = 1.34
@@ -27,14 +31,25 @@ INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 def build(lidar_scene):
     """Builder of scenes with a lidar under water."""
 
-    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**14, bins=BINS, **options):
+    def scene(
+        altitude,
+        off_nadir_deg,
+        integrator="lidar_merging",
+        tx=None,
+        rx=None,
+        paths=2**14,
+        bins=BINS,
+        start=START,
+        film=None,
+        **options,
+    ):
         pose = {"altitude": altitude, "off_nadir_deg": off_nadir_deg}
         photons = {"photons_per_pass": paths // 2} if integrator == "lidar_merging" else {}
         return lidar_scene(
             integrator={"type": integrator, "paths_per_pass": paths, **photons},
             tx={**pose, "divergence_mrad": 4.0, **(tx or {})},
             rx={**pose, "layout": "1x1", "field_of_view_mrad": 40.0, **(rx or {})},
-            film={"time_start_ns": START, "bin_width_ns": 1.0, "bin_count": bins},
+            film={"time_start_ns": start, "bin_width_ns": 1.0, "bin_count": bins, **(film or {})},
             **options,
         )
 
@@ -53,6 +68,43 @@ def test_bottom_below_a_boat(build, passes, z_score, integrator):
     assert error < largest_error(8, 0.01)
     due = 2e9 * GROUP * distance / C0
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("angle", [90.0, 150.0, 35.0])
+def test_target_ahead_in_any_direction(build, passes, z_score, integrator, angle):
+    """A plate 5 m ahead, level, above or below a lidar at 9 m, in an automatic record: as the bottom below a boat."""
+    distance, depth, along = 5.0, 9.0, np.radians(angle)
+    ahead = np.array([np.sin(along), 0.0, -np.cos(along)])
+    place, lidar = [0, 0, -depth] + distance * ahead, [0.0, 0.0, -depth]
+    plate = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.2}}}
+    plate["to_world"] = mi.ScalarTransform4f().look_at(place.tolist(), lidar, [0, 1, 0])
+    water = {**CLEAR, "attenuation": 0.25}
+    record = {"start": "auto", "bins": "auto", "bottom": None, "extra": {"plate": plate}}
+    energy = passes(build(-depth, angle, integrator, water=water, **record), 8)[:, 0]
+    expected = SYSTEM * 0.2 / np.pi * np.exp(-2 * 0.25 * distance) / distance**2
+    z, error = z_score(energy.sum(axis=1), expected)
+    assert abs(z) < largest_z(8) + 1e-3 / error
+    assert error < largest_error(8, 0.01)
+    due = 2e9 * GROUP * distance / C0
+    assert energy[:, int(due - 1.0)].sum() > 0.99 * energy.sum()
+
+
+@pytest.mark.parametrize("angle", [0.0, 40.0, 90.0, 120.0, 180.0])
+def test_automatic_records_begin_where_they_may(build, angle):
+    """Also where the film has gates, which may lie before the surface echo; 0.45 ns is 5 cm from the lidar."""
+    gates = {"gate_count": 3, "gate_start_range": 1.0, "gate_width_ns": 5.0}
+    scene = build(-3.0, angle, start="auto", bins="auto", film=gates)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    check_scene(renderer.probe)
+    assert renderer.scene.axis.start_ns == 1.0
+    train = placed_gates(renderer.scene, None, 0.0)
+    assert train.start_ns == pytest.approx(2e9 * GROUP * 1.0 / C0, abs=1e-9)
+    if angle != 90.0:
+        # The depth of that range.
+        deeper = replace(renderer.scene.gates, given="gate_start_depth", start=3.0 + np.cos(np.radians(angle)))
+        assert renderer.scene.gate_train(deeper).start_ns == pytest.approx(train.start_ns, abs=1e-3)
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,6 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
+from mitransient_lidar.results.geometry import optional_number, pulse_of
 from mitransient_lidar.results.sum_errors import SumErrors
 
 _LOG = logging.getLogger(__name__)
@@ -34,7 +37,8 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     ``error_inflation``; linear in the logarithm of the number of bins, and beyond the last one proportional to the
     square root), and at most the sum of the errors, which is used if nothing is known. A gate with weights w is
     equivalent to (sum w)^2 / sum w^2 bins. Derivatives of a result are cut in the same way, with the correlation of the
-    waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too.
+    waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too. For gates that are narrower
+    than the bins a warning states the largest error, `GateTrain.cutting_error`; those of a film are exact.
     """
     dataset = results.dataset_of("dataset", dataset, "waveforms")
     if "waveform_stderr" not in dataset:
@@ -43,6 +47,7 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
         raise UserError(f"train = {shown(train)} must be a GateTrain, which has the gates")
     dims, time = results.record_dims(dataset, "waveform"), results.time_axis(dataset)
     check_train(train, dataset.attrs, time)
+    _warn_of_narrow_gates(train, dataset.attrs, time.bin_width_ns)
     errors = SumErrors.of(dataset)
     if errors is None:
         _LOG.info("the result has no error_inflation: the errors of the gates are upper bounds")
@@ -53,6 +58,24 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     if "waveform_derivative" not in dataset:
         return stack
     return add_gate_derivatives(stack, *_cut(dataset, "waveform_derivative", ("parameter", *dims), train, errors))
+
+
+def _warn_of_narrow_gates(train: GateTrain, attributes: Mapping[str, Any], bin_width_ns: float) -> None:
+    """Warn of gates that are narrower than the bins."""
+    if train.width_ns >= bin_width_ns:
+        return
+    response = optional_number(attributes, "response_time_ns") or 0.0
+    try:
+        error = f"{100 * train.cutting_error(pulse_of(attributes), response, bin_width_ns):.0f} %"
+    except UserError:
+        error = "an unknown part"
+    _LOG.warning(
+        "gates of %g ns are narrower than the bins of %g ns: the energy of an echo may be wrong by up to %s of the "
+        "largest in a gate; render with narrower bins, or with these gates in the film",
+        train.width_ns,
+        bin_width_ns,
+        error,
+    )
 
 
 def _cut(

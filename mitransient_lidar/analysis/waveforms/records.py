@@ -22,7 +22,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
-from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, pulse_of, required_number
 from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
@@ -120,7 +120,7 @@ class Waveforms:
         if not np.isfinite(samples).all() and (not in_blocks or np.isinf(samples).any()):
             raise UserError(f"{name} holds values that are not finite: render or record it again")
         geometry = lidar_geometry(dataset.attrs)
-        shape = pulse or _pulse(dataset.attrs)
+        shape = pulse or pulse_of(dataset.attrs)
         step = results.time_axis(dataset).bin_width_ns
         response = float(dataset.attrs.get("response_time_ns", 0.0))
         receiver = _receiver_response(dataset, step) if name == "signal" else None
@@ -223,13 +223,6 @@ class Waveforms:
         noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
         found = Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
         return replace(found, shared=self.shared)
-
-
-def _pulse(attributes: Attributes) -> Pulse:
-    """Return the transmitted pulse of a result: its samples, or a Gaussian of its width."""
-    if {"pulse_times_ns", "pulse_power"} <= set(attributes):
-        return Pulse.sampled(attributes["pulse_times_ns"], attributes["pulse_power"])
-    return Pulse.gaussian(required_number(attributes, "pulse_fwhm_ns"))
 
 
 def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:

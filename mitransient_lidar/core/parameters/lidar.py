@@ -170,6 +170,8 @@ TIME_GATED_FILM = plugin(
     number("gate_start_ns", None, "ns", -1e9, 1e9, "Half height of the first gate's rising edge"),
     number("gate_start_depth", None, "m", -1e5, 1e5,
         "Instead: depth below the mean sea level of the echoes that arrive at that time, on the receiver's axis"),
+    number("gate_start_range", None, "m", 0, 1e9,
+        "Instead: distance of these from the lidar, along the axis through air and water"),
     number("gate_width_ns", 10.0, "ns", 1e-6, 1e9, "Time between the half heights of a gate's edges"),
     number("gate_step_ns", None, "ns", 1e-6, 1e9, "Time from gate to gate", otherwise="the width"),
     number("gate_rise_ns", 0.0, "ns", 0, 1e9, "10-90 % time of a raised-cosine rising edge, 0 for a sharp one"),
@@ -177,9 +179,11 @@ TIME_GATED_FILM = plugin(
     file("gate_profile",
         "Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in other units below a "
         "heading that names them"),
+    number("gate_jitter_ns", 0.0, "ns", 0, 1e6,
+        "Standard deviation of the gate's opening from pulse to pulse; each gate is the mean over a Gaussian"),
     count("pulses", 1, 1, 10**9, "Number of pulses that each gate accumulates"),
     alternatives=(
-        (("gate_start_ns",), ("gate_start_depth",)),
+        (("gate_start_ns",), ("gate_start_depth",), ("gate_start_range",)),
         (("gate_width_ns", "gate_rise_ns", "gate_fall_ns"), ("gate_profile",)),
     ),
 )

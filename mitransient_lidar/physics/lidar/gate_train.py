@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import UNITLESS, Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
@@ -38,6 +39,12 @@ _POINTS, _MOST_POINTS = 128, 2**17
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
 
+#: Cells of a bin in which the error of cut gates is computed.
+_CELLS_OF_BIN = 33
+
+#: Samples of a jittered edge in a standard deviation, and standard deviations on each side of it.
+_JITTER_POINTS, _JITTER_REACH = 32, 6.0
+
 #: Relative tolerance of the sum of half edges against the width, for rounded decimals.
 _ROUNDING = 1e-9
 
@@ -58,6 +65,8 @@ class GateShape:
         Times from 10 to 90 % of the rising edge and from 90 to 10 % of the falling one [ns].
     times_ns, values : ndarray, shape (S,)
         Samples of a measured gate, linear between them and 0 outside; empty for a gate with raised-cosine edges.
+    jitter_ns : float
+        Standard deviation of the gate's opening [ns], which the samples include.
 
     Notes
     -----
@@ -72,6 +81,7 @@ class GateShape:
     fall_ns: float
     times_ns: FloatArray
     values: FloatArray
+    jitter_ns: float = 0.0
 
     @classmethod
     def edges(cls, width_ns: float, rise_ns: float = 0.0, fall_ns: float = 0.0) -> GateShape:
@@ -125,6 +135,29 @@ class GateShape:
         The columns are those of `core.tables.text_tables.read_time_samples`; a transmission may be in %.
         """
         return cls.sampled(*read_time_samples(path, _TRANSMISSION))
+
+    def jittered(self, jitter_ns: float) -> GateShape:
+        """Return the mean gate of pulses at whose times the gate opens early or late, the shape over a Gaussian.
+
+        Its width and edges remain those of one pulse, and its time 0 the mean of their openings.
+
+        Parameters
+        ----------
+        jitter_ns : float
+            Standard deviation of the opening [ns], at least 0.
+        """
+        if non_negative("jitter_ns", jitter_ns) == 0:
+            return self
+        from scipy.ndimage import gaussian_filter1d
+
+        opens, closes = self.span_ns
+        reach = _JITTER_REACH * jitter_ns
+        step = max(jitter_ns / _JITTER_POINTS, (closes - opens + 2 * reach) / _MOST_POINTS)
+        t = np.arange(opens - reach - step, closes + reach + 2 * step, step)
+        cells = np.diff(self.open_time(np.append(t, t[-1] + step) - 0.5 * step)) / step
+        values = np.clip(gaussian_filter1d(cells, jitter_ns / step, truncate=_JITTER_REACH, mode="constant"), 0, 1)
+        bent = np.abs(np.diff(values, 2, prepend=1, append=1)) > 1e-9
+        return replace(self, times_ns=t[bent], values=values[bent], jitter_ns=jitter_ns)
 
     @property
     def span_ns(self) -> tuple[float, float]:
@@ -203,9 +236,9 @@ class GateTrain(Checked):
 
     @classmethod
     def measured(cls, profile: GateShape, start_ns: float, step_ns: float, count: int, pulses: int = 1) -> GateTrain:
-        """Train of measured gates (`GateShape.sampled` or `GateShape.from_file`); parameters as in the class."""
+        """Train of gates of a shape, such as `GateShape.from_file`; other parameters as in the class."""
         width, rise, fall = profile.width_ns, profile.rise_ns, profile.fall_ns
-        return cls(start_ns, width, step_ns, count, rise, fall, pulses, profile)
+        return cls(start_ns, width, step_ns, count, rise, fall, pulses, profile if profile.times_ns.size else None)
 
     @cached_property
     def shape(self) -> GateShape:
@@ -301,21 +334,43 @@ class GateTrain(Checked):
         within = np.interp(axis.edges_ns[:, None] - shifts, times, integral)
         return np.asarray(np.diff(within, axis=0) * (self.pulses / axis.bin_width_ns))
 
+    def cutting_error(self, pulse: Pulse, response_time_ns: float, bin_width_ns: float) -> float:
+        """Return the largest error of an echo's energy in a gate that is cut from a waveform, over the largest energy.
+
+        A waveform moves echoes to the centres of their bins, and averages over bins, as `gate_bins` does. Echo and gate
+        may lie at any time in their bins; pulse and response time [ns] are as for `response_weights`.
+        """
+        from scipy.signal import fftconvolve
+
+        size, (opens, closes) = _CELLS_OF_BIN, self.shape.span_ns
+        cell = bin_width_ns / size
+        lag, kernel = pulse.kernel(cell, response_time_ns)
+        worst = largest = 0.0
+        for phase in range(0, size, size // 8):
+            cells = size * (int((closes - opens) / bin_width_ns) + 3)
+            gate = np.diff(self.shape.open_time(opens + cell * (np.arange(cells + 1) - phase - 1))) / cell
+            in_bins = np.repeat(gate.reshape(-1, size).mean(axis=1), size)
+            exact, cut = (fftconvolve(each, kernel[::-1]) for each in (gate, in_bins))
+            arrival = np.arange(exact.size) - (kernel.size - 1) - lag
+            centre = np.clip(arrival // size * size + size // 2 - arrival[0], 0, exact.size - 1)
+            worst = max(worst, float(np.abs(cut[centre] - exact).max()))
+            largest = max(largest, float(exact.max()))
+        return worst / largest
+
+
+def range_time_ns(slant_range: float, to_sea: float, group_index: float) -> float:
+    """Return when an echo arrives from a range on the axis [m]: in air up to the sea [m], with its index beyond."""
+    in_air = min(slant_range, to_sea)
+    return 2e9 / C0 * (in_air + group_index * (slant_range - in_air))
+
 
 @dataclass(frozen=True)
 class GatePlan:
-    """Gates of a scene: a train whose start is replaced by one given in time or in depth."""
+    """Gates of a scene: a train whose start is replaced by one given in time, in depth or in range."""
 
     train: GateTrain
-    start_ns: float | None = None  #: Time of the half height of the first gate's rising edge [ns].
-    #: Depth below the mean sea level, on the receiver's axis, of the echoes that arrive at that time [m], without
-    #: `start_ns`.
-    start_depth: float | None = None
-
-    def placed(self, level_time_ns: float, depth_per_ns: float) -> GateTrain:
-        """Return the train with its start, from the time of depth 0 [ns] and the scale of depth [m/ns]."""
-        start = self.start_ns
-        if start is None:
-            assert self.start_depth is not None
-            start = level_time_ns + self.start_depth / depth_per_ns
-        return replace(self.train, start_ns=start)
+    #: Name of the parameter of the film: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
+    given: str
+    #: Its value: time of the half height of the first gate's rising edge [ns]; or depth below the mean sea level or
+    #: range from the lidar [m], on the receiver's axis, of the echoes that arrive at that time.
+    start: float

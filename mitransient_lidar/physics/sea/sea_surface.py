@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -202,7 +202,9 @@ class SeaSurface:
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
         return triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
 
-    def patches(self, places: FloatArray, refined_size: float) -> tuple[SeaMesh, FloatArray]:
+    def patches(
+        self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
+    ) -> tuple[SeaMesh, FloatArray]:
         """Return the mesh of fine patches about places, and the position of each place in it.
 
         The patches lie side by side on a square lattice about the origin, each surrounded by cells that grow out to
@@ -214,6 +216,8 @@ class SeaSurface:
             Places (x, y) on the sea [m], shape (n, 2).
         refined_size
             Side of each fine patch [m].
+        seas
+            The sea at the time of each place.
 
         Returns
         -------
@@ -230,11 +234,11 @@ class SeaSurface:
         number = np.arange(len(places))
         positions = stride * (np.stack([number % side, number // side], axis=-1) - 0.5 * (side - 1))
         meshes = []
-        for place, position in zip(places, positions, strict=True):
+        for place, position, sea in zip(places, positions, seas, strict=True):
             # On the cells of the sea, as in `mesh`.
             x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
             lines = (x - place[0] + position[0], y - place[1] + position[1])
-            meshes.append(triangulate(self.heights_about(place, x, y), *lines, self.wind_direction))
+            meshes.append(triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction))
         return joined(meshes), positions
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:

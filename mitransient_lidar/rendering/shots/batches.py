@@ -66,6 +66,8 @@ class ShotPoses:
         Poses in the frame of each shot; None where all are those of the lidar.
     in_scene
         Poses of the receiver in the scene; None where they follow from the places.
+    times_s
+        Times at which shots meet the waves [s], shape (shots,); None for that of the scene.
     """
 
     places: FloatArray
@@ -73,6 +75,7 @@ class ShotPoses:
     receiver: KernelPose | None = None
     transmitter: KernelPose | None = None
     in_scene: Pose | None = None
+    times_s: FloatArray | None = None
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
@@ -104,7 +107,8 @@ class ShotPoses:
         receiver = None if self.receiver is None else self.receiver.part(rows)
         transmitter = None if self.transmitter is None else self.transmitter.part(rows)
         in_scene = None if self.in_scene is None else self.in_scene.part(rows)
-        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
+        times_s = None if self.times_s is None else self.times_s[rows]
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene, times_s)
 
     def repeated(self, copies: int) -> ShotPoses:
         """Return each shot several times in turn."""
@@ -270,7 +274,7 @@ class ShotBatches:
         """Return a function that returns the renderer of shots, each several times."""
         parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
         for sea in self._seas:
-            positions = sea.move(shots.places)
+            positions = sea.move(shots.places, shots.times_s)
             parts.append((sea.shapes, positions))
         places = shots.places - self._frame_origin
         parts += [] if self._fixed is None else [(self._fixed, places)]
@@ -292,11 +296,6 @@ class ShotBatches:
 
         placed = self._renderer.of_shots(scene_of(1), len(shots))
         return lambda copies: placed.repeated(scene_of(copies), copies)
-
-    def set_time(self, time_s: float) -> None:
-        """Set the time [s] at which shots meet the waves."""
-        for sea in self._seas:
-            sea.set_time(time_s)
 
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].

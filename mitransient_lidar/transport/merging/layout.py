@@ -195,7 +195,7 @@ class MergingLayout:
         if scene.submerged:
             spread = scene.transmitter.angular_spread * nearest
             width = cell_widths(options.cell_size, spread, 0.0)[0] or _CELL_PER_BEAM * spread
-            depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
+            depth = max(-float(pose.origin[2]) - nearest * float(pose.axis[2]), 0.0)
             rings = BeamRings(pose, spread, 1.0, 0.0)
             patches = SolidPatches(scene, region, rings, depth, PATCH_PER_CELL * width, **solids)
             return cls(np.zeros(3), SphericalCells(scene, thickness), patches, **points)

@@ -121,14 +121,16 @@ class BeamRings:
     ) -> None:
         self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))
+        #: -1 for an axis that rises in the water, else 1.
+        self._sense = -1.0 if pose.submerged and pose.axis[2] > 0 else 1.0
         #: Ratio of the axes of the ellipses.
-        self.cosine = opaque(max(-float(pose.axis[2]), _SMALLEST_COSINE))
+        self.cosine = opaque(max(-self._sense * float(pose.axis[2]), _SMALLEST_COSINE))
         self._aim(pose, np.zeros((1, 2)) if tilt is None else tilt)
 
     def _aim(self, pose: Pose, tilt: FloatArray) -> None:
         """Lay the axis through that of a pose."""
-        horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
-        spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
+        horizontal, down = pose.axis[:2], max(-self._sense * float(pose.axis[2]), _SMALLEST_COSINE)
+        spot = pose.origin[:2] + horizontal * (self._sense * float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
         azimuth = horizontal / sine if sine > 0 else pose.far[:2]
         self._spot = [opaque(x) for x in spot]
@@ -159,7 +161,7 @@ class BeamRings:
         index, horizontal = self._index, axes[:, :2]
         sine = np.hypot(*horizontal.T)
         cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / index) ** 2, 0)), _SMALLEST_COSINE)
-        level = shear = horizontal / (index * cosine)[:, None]
+        level = shear = self._sense * horizontal / (index * cosine)[:, None]
         if tilts.any():
             refracted = refract_at_facet(axes, np.column_stack([-tilts, np.ones(len(tilts))]), index)
             shear = refracted[:, :2] / np.maximum(-refracted[:, 2:], _SMALLEST_COSINE)

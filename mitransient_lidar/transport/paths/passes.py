@@ -29,17 +29,21 @@ class ReceivedLight:
     ----------
     rays
         Number of rays traced.
+    gated
+        Light in gates that is received beside the histogram, or None.
     """
 
     def __init__(
-        self, histogram: TransientHistogram, classes: PathClasses, focusing: RippleFocusing | None = None
+        self, histograms: Sequence[TransientHistogram], classes: PathClasses, focusing: RippleFocusing | None = None
     ) -> None:
-        self.histogram, self.classes, self.focusing = histogram, classes, focusing
+        self._all, self.classes, self.focusing = histograms, classes, focusing
+        self.histogram, self.gated = histograms[0], histograms[1] if len(histograms) > 1 else None
         self.clear()
 
     def clear(self) -> None:
         """Remove all light."""
-        self.histogram.clear()
+        for each in self._all:
+            each.clear()
         self.rays = mi.Float64(0)
 
     def receive(
@@ -64,7 +68,9 @@ class ReceivedLight:
             factor = self.focusing.of(echo, order, length)
             energy = energy * factor
             sums = self.focusing.perturb(sums or [], factor, echo, order, length)
-        self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active, sums)
+        index = self.classes.index(pixel, order, reversals, solid)
+        for each in self._all:
+            each.add(index, length, energy, active, sums)
 
     @property
     def edge_loss(self) -> float:
@@ -73,7 +79,8 @@ class ReceivedLight:
 
     def evaluate(self) -> None:
         """Compute the energies."""
-        self.histogram.evaluate()
+        for each in self._all:
+            each.evaluate()
         dr.eval(self.rays)
 
 
@@ -129,11 +136,17 @@ class PassRenderer(ABC):
         return changed(self, scene=scene)
 
     def render_pass(
-        self, seed: int | Sequence[int], *, paths: int | None = None, gates: GateWeights | None = None
+        self,
+        seed: int | Sequence[int],
+        *,
+        paths: int | None = None,
+        gates: GateWeights | None = None,
+        beside: bool = False,
     ) -> ReceivedLight:
         """Render one pass, of one shot or, with several seeds, of several.
 
-        Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given.
+        Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given,
+        or `beside` them.
         The pixels of several shots are one row, shot after shot.
 
         Raises
@@ -146,8 +159,9 @@ class PassRenderer(ABC):
         shape = flat if self.classes.separate or shots.count > 1 else pixels.grid or flat
         scene = self.scene
         emitted, length = scene.transmitter.energy, scene.reference_length
-        histogram = TransientHistogram(scene.axis, shape, emitted, gates, length, scene.perturbations)
-        received = ReceivedLight(histogram, self.classes, self.focusing)
+        kinds = (None, gates) if beside else (gates,)
+        sums = [TransientHistogram(scene.axis, shape, emitted, kind, length, scene.perturbations) for kind in kinds]
+        received = ReceivedLight(sums, self.classes, self.focusing)
         with dr.suspend_grad():
             self.trace(received, shots, self.paths if paths is None else paths)
         received.evaluate()

@@ -37,6 +37,11 @@ CASES = {
         ["d/table1.nc"],
         {"instrument": ""},
     ),
+    "frames": (
+        ["gated_mine", *WRONG, "-o", "d"],
+        [f"d/gated_mine_frames{end}" for end in (".nc", "_gates.exr", "_gates.png", "_depth.png")],
+        OTHER,
+    ),
     "passive": (
         ["passive_sea", *WRONG, "-o", "d"],
         [f"d/passive_sea_passive{end}" for end in (".nc", ".exr", ".png")],

@@ -60,7 +60,7 @@ def test_each_definition_of_the_divergence_replaces_the_default(name, width):
 def test_a_given_start_of_the_gates_replaces_that_of_the_scene():
     """The film refuses both."""
     opened = open_scene("gated_mine", {**FLAT, "layout": "2x2", "gate_start_ns": 1500})
-    assert opened.scene.sensors()[0].film().gates.start_ns == 1500
+    assert opened.scene.sensors()[0].film().gates.start == 1500
     assert opened.parameters["gate_start_depth"] == ""
     assert open_scene(opened.source).parameters == opened.parameters
 

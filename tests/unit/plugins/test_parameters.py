@@ -43,7 +43,7 @@ WITHOUT_VALUE = {
     },
     "time_gated_film": {
         *("gate_start_ns", "gate_start_depth", "gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns"),
-        *("gate_profile", "pulses"),
+        *("gate_start_range", "gate_jitter_ns", "gate_profile", "pulses"),
     },
     "sediment": {"single_scattering_albedo"},
     "lidar_merging": {"paths_per_pass", "photons_per_pass"},
@@ -62,10 +62,10 @@ NEEDED = {
     "inner_mrad": {"shape": "ring"},
     **{"start_deg": SECTOR, "extent_deg": SECTOR, "width_mrad": RECTANGLE, "height_mrad": RECTANGLE},
     **{"angle_x_min_mrad": STRIP, "angle_x_max_mrad": STRIP},
-    **{name: {"gate_count": 2} for name in ("gate_start_ns", "gate_start_depth")},
+    **{name: {"gate_count": 2} for name in ("gate_start_ns", "gate_start_depth", "gate_start_range")},
     **{
         name: {"gate_count": 2, "gate_start_ns": 1400.0}
-        for name in ("gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns", "pulses")
+        for name in ("gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns", "gate_jitter_ns", "pulses")
     },
     "junge_slope": {"refractive_index": 1.1},
     "single_scattering_albedo": {"model": "hapke"},

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from oracles.gates import transmission
 from scipy.integrate import quad
+from scipy.stats import norm
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates import cut as gating
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
+from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_stack
 
@@ -226,6 +228,19 @@ def test_train_from_options(tmp_path):
     # The mean sea level on the axis is at 1419.886 ns, whatever the waves at `surface_time_ns`.
     assert deep.start_ns == pytest.approx(1429.886, abs=1e-3)
     assert deep.step_ns == 2.0
+    # 2 m in water at a group index of 1.364, behind 212.836 m of air.
+    far = gate_stack.train_from_options(GEOMETRY, start_range_m=200 / np.cos(np.radians(20)) + 2.0, width_ns=6.0)
+    assert far.start_ns == pytest.approx(1419.886 + 2 * 2.0 * 1.364 / 0.299792458, abs=1e-3)
+    wet = gate_stack.train_from_options(
+        {"altitude": -3.0, "group_index": 1.364}, start_range_m=2.0, width_ns=6.0, jitter_ns=0.5
+    )
+    assert wet.start_ns == pytest.approx(2 * 2.0 * 1.364 / 0.299792458)
+    assert (
+        gate_stack.build_gates(np.zeros((1, 1)), np.zeros((1, 1)), wet, coords={"pixel": ["a"]}, attributes={}).attrs[
+            "gate_jitter_ns"
+        ]
+        == 0.5
+    )
     path = tmp_path / "gate.txt"
     path.write_text("0 0\n1 1\n3 0\n")
     measured = gate_stack.train_from_options(GEOMETRY, start_ns=1430.0, profile_file=path, count=2)
@@ -235,10 +250,33 @@ def test_train_from_options(tmp_path):
     assert stack.attrs["gate_profile"] == [0.0, 1.0, 0.0]
 
 
+def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
+    """The largest error that an echo of a Gaussian pulse can have, of those at 200 times in their bins."""
+    train = GateTrain(1430.0, 1.0, 1.0, 30)
+    pulse, width = Pulse.gaussian(5.0), 5.0
+    axis = TimeAxis(1400.0, width, 24)
+    lag, kernel = pulse.kernel(width)
+    errors, largest = [], 0.0
+    for arrival in np.linspace(1445.0, 1450.0, 200, endpoint=False):
+        waveform = np.zeros(24)
+        waveform[int((arrival - 1400.0) // width) + lag :][: kernel.size] = kernel / width
+        rows = [train.gate_bins(gate, axis.start_ns, width, 24) for gate in range(30)]
+        cut = [width * waveform[first : first + weights.size] @ weights for first, weights in rows]
+        exact = np.diff(norm.cdf(np.append(train.starts_ns, 1460.0), arrival, 5.0 / 2.3548))
+        errors.append(np.abs(cut - exact).max())
+        largest = max(largest, exact.max())
+    bound = train.cutting_error(pulse, 0.0, width)
+    assert max(errors) / largest == pytest.approx(bound, rel=0.05)
+    coarse = record().coarsen(time=10).mean()
+    coarse.attrs |= {"pulse_fwhm_ns": 5.0, "bin_width_ns": 5.0}
+    gating.cut_gates(coarse, train)
+    assert f"than the bins of 5 ns: the energy of an echo may be wrong by up to {100 * bound:.0f} %" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"width_ns": 5.0}, "one start: either start_ns or start_depth_m"),
+        ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
         ({"start_ns": 1.0, "start_depth_m": 1.0, "width_ns": 5.0}, "one start"),
         ({"start_ns": 1.0}, "one shape: either width_ns or a profile file"),
         ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),

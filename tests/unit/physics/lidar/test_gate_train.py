@@ -53,6 +53,21 @@ def test_width_and_edges_of_measured_gates():
     assert PROFILE.open_time(99.0) == pytest.approx(0.4 + 1.6 + 0.6 + 0.6)
 
 
+@pytest.mark.parametrize("jitter", [0.2, 2.0, 20.0])
+def test_jitter_makes_the_mean_of_gates_that_open_early_and_late(jitter):
+    """A sharp gate becomes the difference of two normal distributions, with the same integral and mean start."""
+    shape = GateShape.edges(8.0).jittered(jitter)
+    t = np.linspace(-100, 100, 4001)
+    expected = norm.cdf(t / jitter) - norm.cdf((t - 8.0) / jitter)
+    # Means over cells of a thirty-second of the jitter.
+    np.testing.assert_allclose(np.interp(t, shape.times_ns, shape.values, 0, 0), expected, atol=1e-4)
+    assert shape.open_time(1e3) == pytest.approx(8.0, rel=1e-6)
+    assert (shape.width_ns, shape.rise_ns, shape.jitter_ns) == (8.0, 0.0, jitter)
+    assert GateTrain.measured(shape, 5.0, 2.0, 3).middles_ns.tolist() == [9.0, 11.0, 13.0]
+    assert PROFILE.jittered(0.0) is PROFILE
+    assert PROFILE.jittered(jitter).open_time(1e3) == pytest.approx(float(PROFILE.open_time(1e3)), rel=1e-6)
+
+
 def test_profile_files(tmp_path):
     path = tmp_path / "gate.csv"
     path.write_text("# ns, transmission\n0, 0\n1 1\n\n3,0 # end\n")

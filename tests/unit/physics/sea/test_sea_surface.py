@@ -159,7 +159,7 @@ def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
     np.testing.assert_allclose(added, np.stack([0 * added[:, 0], 0 * added[:, 0], offsets @ slopes], axis=1), atol=1e-9)
     assert inclined.slope_variance == level.slope_variance
     places = np.array([[10.0, 0.0], [-20.0, 7.0]])
-    (mesh, positions), (plain, _) = (sea.patches(places, 8.0) for sea in (inclined, level))
+    (mesh, positions), (plain, _) = (sea.patches(places, 8.0, [sea] * len(places)) for sea in (inclined, level))
     for half, position in zip(np.split(np.arange(len(mesh.vertices)), 2), positions, strict=True):
         offsets = np.clip(plain.vertices[half, :2] - position, -4.0, 4.0)
         np.testing.assert_allclose((mesh.vertices - plain.vertices)[half, 2], offsets @ slopes, atol=1e-9)
