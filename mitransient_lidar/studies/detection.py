@@ -17,7 +17,7 @@ from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
-    RECEIVERS,
+    RECEIVERS_OR_CAMERAS,
     BackgroundPower,
     Instrument,
     Numbers,
@@ -34,6 +34,7 @@ from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
@@ -59,7 +60,7 @@ def detect(
     params: Mapping[str, Any] | None = None,
     *,
     instrument: Instrument = None,
-    receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS)] = "apd",
+    receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS_OR_CAMERAS)] = "apd",
     pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
@@ -163,7 +164,7 @@ def detect(
     known. Each render is filtered with the weights of the others, so that the errors of renders lower the probability
     and never raise it.
     """
-    device = receiver if isinstance(receiver, Camera) else receiver_of("receiver", receiver)
+    device = receiver_of("receiver", receiver)
     camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
     if clutter != 0 and not 4 <= clutter <= 1000:
@@ -184,7 +185,7 @@ def detect(
     if camera is None and (grid := lidar.receiver.pixels.grid) is not None:
         raise UserError(
             f"receiver = {shown(receiver)} records waveforms of at most 16 pixels, and the scene is an image of "
-            f"{grid[0]}x{grid[1]}: it needs gates and a camera"
+            f"{grid[0]}x{grid[1]}: it needs gates and a camera ({', '.join(CAMERAS)}, or a TOML file)"
         )
     if lidar.receiver.optics.response_time_ns > 0 and chain is not None and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
@@ -305,7 +306,7 @@ def _in_images(
             data[f"{key}_at_depth{end}"] = dims, [one[f"{key}{end}"][1] for one in found]
     data |= {"depth": ("depth", list(depths))} if depths else {}
     built = stack.drop_vars(["gate_energy", "gate_energy_stderr", "gate_light"]).assign(data)
-    for name, units in (("background", "DN"), ("difference", "DN")):
+    for name, units in (("background", "count"), ("difference", "count")):
         built[name].attrs["units"] = units
     return label(built.assign_attrs({**stack.attrs, **attributes, "frames": frames}), "detection")
 
@@ -438,7 +439,7 @@ def _describe_images(found: xr.Dataset) -> list[str]:
         lines.append(f"{'':<18}{count * width[0]:>12.3g}{start[best]:>12.1f}{middle:>12.2f}{detected:>9}")
     counts = found["frames"].values[:_SHOWN_FRAMES]
     lines.append(f"{'P_d with frames':<18}{''.join(f'{count:>9}' for count in counts)}{'frames needed':>24}")
-    at_depths: Sequence[float] = found["depth"].values if "depth" in found.dims else []
+    at_depths = found["depth"].values.tolist() if "depth" in found.dims else []
     rows = [(f"{place:g} m", found.sel(depth=place), "_at_depth") for place in at_depths]
     for name, one, end in [("", found, ""), *rows]:
         rates = "".join(f"{_rate(float(one[f'detection{end}'].sel(frames=count))):>9}" for count in counts)

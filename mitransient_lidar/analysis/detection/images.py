@@ -90,8 +90,8 @@ class FilterProducts:
             return None
         answers = (weights @ product).reshape(len(renders), 2, -1, 2)[:, :, renders]
         rise, level = (answers[np.arange(len(renders)), kind, np.arange(len(renders))] for kind in (0, 1))
-        others = (answers[:, 1].mean(axis=2).sum(axis=1) - level.mean(axis=1)) / (len(renders) - 1)
-        null = level - others[:, None] if self.seas else np.zeros_like(rise)
+        others = (answers[:, 1].sum(axis=1) - level) / (len(renders) - 1)
+        null = level - others if self.seas else np.zeros_like(rise)
         target = null + rise
         variances = [np.einsum("ni,ij,nj->n", weights, noise, weights).mean() / frames for noise in noises]
         if self.seas:
@@ -99,7 +99,7 @@ class FilterProducts:
                 own + max(np.cov(one.T)[0, 1], 0.0) for own, one in zip(variances, (null, target), strict=True)
             ]
         means = float(null.mean()), float(target.mean())
-        return Statistic(weights, others, means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1]))
+        return Statistic(weights, others.mean(axis=1), means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1]))
 
 
 @dataclass(frozen=True)

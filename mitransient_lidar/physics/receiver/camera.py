@@ -8,6 +8,7 @@ have the shape (row, column, gate), or (pixel, gate) for pixels that are no imag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -23,6 +24,8 @@ from mitransient_lidar.physics.receiver.electronics import Expected
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+Values = npt.ArrayLike
 
 _TAIL = 1e-9  # of a kernel, left out at its ends
 _LEAST_SKEWNESS = 1e-3  # of a clipped distribution, against cancellation
@@ -138,6 +141,9 @@ class Camera(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for one in fields(self):
+            if one.name in _WITHOUT[self.kind] and (value := getattr(self, one.name)) != one.default:
+                raise UserError(f"{one.name} = {value:g} is no parameter of a camera of kind {self.kind!r}")
         least = _OFFSET * self.read_noise / self.electrons_per_dn
         if self.offset_dn < least * (1 - 1e-9):
             raise UserError(f"offset_dn = {self.offset_dn:g} must be at least {least:g}, 4 deviations of the read-out")
@@ -146,9 +152,6 @@ class Camera(Plan):
                 f"excess_noise = {self.excess_noise:g} must be at least 1 + 1/gain = {1 + 1 / self.gain:g} with an "
                 "intensifier_mtf, as the electrons of an event are spread at random"
             )
-        for one in fields(self):
-            if one.name in _WITHOUT[self.kind] and (value := getattr(self, one.name)) != one.default:
-                raise UserError(f"{one.name} = {value:g} is no parameter of a camera of kind {self.kind!r}")
 
     @property
     def top_dn(self) -> int:
@@ -163,12 +166,7 @@ class Camera(Plan):
         return Pattern(response, offset, np.where(random.random(pixels) < self.hot_pixels, self.hot_factor, 1.0))
 
     def events(
-        self,
-        energy: npt.ArrayLike,
-        open_ns: npt.ArrayLike,
-        background: npt.ArrayLike = 0.0,
-        pulses: int = 1,
-        pattern: Pattern | None = None,
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
     ) -> FloatArray:
         """Return the mean events of each pixel and gate, with dark events.
 
@@ -203,13 +201,12 @@ class Camera(Plan):
 
     def expected(
         self,
-        energy: npt.ArrayLike,
-        open_ns: npt.ArrayLike,
-        background: npt.ArrayLike = 0.0,
+        energy: Values,
+        open_ns: Values,
+        background: Values = 0.0,
         pulses: int = 1,
-        *,
         pattern: Pattern | None = None,
-        slope: npt.ArrayLike | None = None,
+        slope: Values | None = None,
     ) -> Expected:
         """Return mean [DN] and variance [DN^2] of a frame and its probability of saturation, in the shape of `energy`.
 
@@ -233,12 +230,7 @@ class Camera(Plan):
         return Expected(offset + clipped.mean / scale, clipped.variance / scale**2 + rest, clipped.saturation)
 
     def noise(
-        self,
-        energy: npt.ArrayLike,
-        open_ns: npt.ArrayLike,
-        background: npt.ArrayLike = 0.0,
-        pulses: int = 1,
-        pattern: Pattern | None = None,
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
     ) -> Noise:
         """Return the parts of the noise without saturation and jitter; parameters are those of `events`."""
         events = self.events(energy, open_ns, background, pulses, pattern)
@@ -251,21 +243,20 @@ class Camera(Plan):
         rounding = 0.0 if self.kind == "counting" else 1 / 12
         return Noise(shared / scale, variance / scale + rounding)
 
-    def spread(self, values: npt.ArrayLike) -> FloatArray:
+    def spread(self, values: Values) -> FloatArray:
         """Return values, shape (row, column, ...), after the blur of the intensifier, a symmetric matrix B."""
         return self._spread(np.asarray(values, np.float64), 1)
 
     def sample(
         self,
-        energy: npt.ArrayLike,
-        open_ns: npt.ArrayLike,
+        energy: Values,
+        open_ns: Values,
         frames: int,
-        seed: int,
-        background: npt.ArrayLike = 0.0,
+        seed: int | Sequence[int],
+        background: Values = 0.0,
         pulses: int = 1,
-        *,
         pattern: Pattern | None = None,
-        slope: npt.ArrayLike | None = None,
+        slope: Values | None = None,
     ) -> Record:
         """Draw frames; parameters are those of `expected`, and the shift of a gate is that of all pixels of a frame."""
         events = self.events(energy, open_ns, background, pulses, pattern)
@@ -355,7 +346,7 @@ class Camera(Plan):
             light = _blurred(light, self.optics_mtf, 1)
         return self.quantum_efficiency * photons_per_joule(self.wavelength_nm) * light
 
-    def _charge_slope(self, slope: npt.ArrayLike, events: FloatArray, pulses: int) -> FloatArray:
+    def _charge_slope(self, slope: Values, events: FloatArray, pulses: int) -> FloatArray:
         """Return the derivative of the mean charge with respect to the gate's time [electrons/ns]."""
         changed = self._signal_events(np.asarray(slope, np.float64))
         if self.kind == "counting":
@@ -366,7 +357,7 @@ class Camera(Plan):
         """Return the deviation of the mean time of a gate's pulses [ns]."""
         return float(self.gate_jitter_ns / np.sqrt(pulses))
 
-    def _opened(self, open_ns: npt.ArrayLike, pulses: int) -> FloatArray:
+    def _opened(self, open_ns: Values, pulses: int) -> FloatArray:
         """Return the open time of all pulses [s]."""
         return 1e-9 * integer("pulses", pulses, 1, 10**9) * non_negative_array("open_ns", open_ns)
 
@@ -409,13 +400,7 @@ def _blur_weights(size: int, mtf: float) -> sparse.csr_array:
     return sparse.csr_array((np.tile(kernel / kernel.sum(), size), places), (size, size))
 
 
-def _clipped(
-    mean: FloatArray,
-    variance: FloatArray,
-    third: FloatArray,
-    limit: npt.ArrayLike,
-    over: npt.ArrayLike,
-) -> Expected:
+def _clipped(mean: FloatArray, variance: FloatArray, third: FloatArray, limit: Values, over: Values) -> Expected:
     """Return the moments of min(X, limit) and P(X > over), for a Pearson distribution of type III with these cumulants.
 
     In units of the deviation, from the mean, X is (Y - k)/sqrt(k) with Y gamma-distributed with the shape k = 4 over
