@@ -99,7 +99,9 @@ class FilterProducts:
                 own + max(np.cov(one.T)[0, 1], 0.0) for own, one in zip(variances, (null, target), strict=True)
             ]
         means = float(null.mean()), float(target.mean())
-        return Statistic(weights, others.mean(axis=1), means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1]))
+        return Statistic(
+            weights, others.mean(axis=1), means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1])
+        )
 
 
 @dataclass(frozen=True)

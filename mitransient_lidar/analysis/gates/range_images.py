@@ -121,7 +121,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack of at least 3 gates, of which the last dimension is ``gate``.
+        A gate stack of at least 3 gates, of which the last dimension is ``gate``; or frames of a camera, whose mean
+        above the level without light counts, with the noise of frames and the error of the render.
     reach : int, optional
         As for `range_from_gates`.
 
@@ -143,7 +144,7 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
     axis's scale of depth.
     """
-    stack = dataset_of("stack", stack, "gates")
+    stack = _light(dataset_of("stack", stack, "gates", "frames"))
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
@@ -173,6 +174,19 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     return DepthImage(depth, found.sigma * per_ns, method, found.confidence)
 
 
+def _light(stack: xr.Dataset) -> xr.Dataset:
+    """Return a gate stack, or the mean of frames of a camera in its place [DN]."""
+    if "signal" not in stack:
+        return stack
+    count, level = stack.sizes["frame"], stack["signal"].mean("frame") - stack["dark_level"]
+    drawn, rendered = stack["signal_deviation"] ** 2 / count, stack["signal_mean_stderr"] ** 2
+    variance = sum(one.mean("frame") if "frame" in one.dims else one for one in (drawn, rendered))
+    light = {"gate_energy": level, "gate_energy_stderr": np.sqrt(variance)}
+    return stack.drop_vars(["signal", "saturated"]).assign(
+        {name: one.transpose(..., "gate") for name, one in light.items()}
+    )
+
+
 def _column(
     stack: xr.Dataset, found: RangeImage, lines: LinesOfSight, geometry: LidarGeometry, pulse_ns: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -197,7 +211,7 @@ def _column(
     # The sum of the pixels' columns from their surfaces on has this logarithm at time 0.
     gathered = np.log(np.sum(lines.beam_share * np.exp(-slope * (lines.surface_time - middles[0]))))
     open_s = 1e-9 * float(width[0]) * float(stack.attrs.get("pulses", 1))
-    level = math.exp(start + slope * middles[0] - gathered) / open_s
+    level = math.exp(start + slope * middles[0] - gathered) / open_s if "signal_mean" not in stack else math.nan
     return np.full(unknown.size, -0.5 * slope / geometry.metres_per_ns), lines.beam_share * level
 
 
@@ -273,8 +287,15 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
         depth = np.sum(weight * place, axis=1) / total
         lever = np.where(inside, place - depth[:, None], 0) / total[:, None]
         variance = np.sum((lever * np.take_along_axis(s, window, 1)) ** 2, axis=1)
-        shift = np.sum(np.where(limited | (weight == 0), 0, lever * level), axis=1)
-        variance += shift**2 * np.take_along_axis(background_variance, at_peak, 1)[:, 0]
+        # The column's error moves all its gates, and that of its slope those more that are farther behind its gates.
+        shift = np.where(limited | (weight == 0), 0, lever * level)
+        own, tilt = shift.sum(axis=1, keepdims=True), np.sum(shift * away, axis=1, keepdims=True)
+        falls, ends = (np.take_along_axis(one, at_peak, 1) for one in (slope < 0, before < between))
+        weights = np.where(ends, column.between.T[peak], column.mean.T[peak])
+        turned = np.where(falls, tilt + np.where(ends, 0, own * column.lever[at_peak]), 0)
+        variance += np.sum((own * weights + turned * column.slope.T[peak]) ** 2 * log_variance, axis=1)
+        behind = np.sum(np.where(limited & (weight > 0) & (deep > 0), lever, 0), axis=1, keepdims=True)
+        variance += np.sum((behind * column.deep.T[peak] * s) ** 2, axis=1)
     found = known & (z_peak > 0)
     confidence = ndtr(z_peak) ** (column.mid.size - column.first)
     return np.stack(
