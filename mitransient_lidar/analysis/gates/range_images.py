@@ -178,13 +178,11 @@ def _light(stack: xr.Dataset) -> xr.Dataset:
     """Return a gate stack, or the mean of frames of a camera in its place [DN]."""
     if "signal" not in stack:
         return stack
-    count, level = stack.sizes["frame"], stack["signal"].mean("frame") - stack["dark_level"]
-    drawn, rendered = stack["signal_deviation"] ** 2 / count, stack["signal_mean_stderr"] ** 2
-    variance = sum(one.mean("frame") if "frame" in one.dims else one for one in (drawn, rendered))
-    light = {"gate_energy": level, "gate_energy_stderr": np.sqrt(variance)}
-    return stack.drop_vars(["signal", "saturated"]).assign(
-        {name: one.transpose(..., "gate") for name, one in light.items()}
-    )
+    drawn, rendered = stack["signal_deviation"] ** 2 / stack.sizes["frame"], stack["signal_mean_stderr"] ** 2
+    drawn, rendered = (one.mean("frame") if "frame" in one.dims else one for one in (drawn, rendered))
+    mean = (stack["signal"].mean("frame") - stack["dark_level"]).transpose(..., "gate")
+    error = ((drawn + rendered) ** 0.5).transpose(..., "gate")
+    return stack.drop_vars(["signal", "saturated"]).assign(gate_energy=mean, gate_energy_stderr=error)
 
 
 def _column(
