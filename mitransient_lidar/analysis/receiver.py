@@ -1,30 +1,43 @@
-"""Recorded shots of a result: its waveforms after a receiver chain."""
+"""Recorded shots of a result: its waveforms after a receiver chain, or its gates as frames of a camera."""
 
 from __future__ import annotations
 
 import logging
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, NamedTuple, Union
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple, TypeVar, Union
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
+from mitransient_lidar.analysis.gates.recording import describe_frames, parameters_of, powers_of, record_gates
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import RECEIVERS, Option, Seed, checked
+from mitransient_lidar.core.options import RECEIVERS_OR_CAMERAS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
+from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
+from mitransient_lidar.physics.receiver.receiver_files import (
+    Channel,
+    ReceiverChannels,
+    Setting,
+    instrument_receiver,
+    waveform_receiver,
+)
+from mitransient_lidar.physics.receiver.receiver_files import camera as camera_of
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.variables import label
 
 #: A power, or those of pixels.
 Powers = Union[npt.ArrayLike, "xr.DataArray"]
+
+#: What a receiver is given by.
+Receiver = Camera | ReceiverChannels | ReceiverChain | str | os.PathLike[str]
+
+_R = TypeVar("_R")
 
 _LOG = logging.getLogger(__name__)
 
@@ -37,10 +50,12 @@ _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 def detect_waveforms(
     dataset: results.Given,
     chain: Annotated[
-        ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None,
-        Option(f"{RECEIVERS}. By default that of the result's instrument, or apd", flag="--receiver"),
+        Receiver | None,
+        Option(f"{RECEIVERS_OR_CAMERAS}. By default that of the result's instrument, or apd", flag="--receiver"),
     ] = None,
-    shots: Annotated[int, Option("Number of records of each waveform with independent noise", 1, 10**9)] = 1,
+    shots: Annotated[
+        int, Option("Number of records of each waveform, or frames of each gate, with independent noise", 1, 10**9)
+    ] = 1,
     seed: Seed = 0,
     background_power: Annotated[
         Powers,
@@ -65,16 +80,18 @@ def detect_waveforms(
         ),
     ] = None,
 ) -> xr.Dataset:
-    """Record shots of a result, or of each shot of a series, with a receiver chain.
+    """Record shots of a result, or of each shot of a series, with a receiver chain, or gates with a camera.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``.
-    chain : ReceiverChannels, ReceiverChain, str or path-like, optional
+        A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``; for a
+        camera a gate stack, optionally over ``frame``.
+    chain : Camera, ReceiverChannels, ReceiverChain, str or path-like, optional
         The receiver of every channel, or one chain for all; a name in `receiver_files.RECEIVERS` or of an instrument,
-        or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
-        of the result, and the preset ``apd`` without one.
+        a camera or its name in `receiver_files.CAMERAS`, or a TOML file
+        (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument of the result, and the
+        preset ``apd`` without one.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
@@ -104,11 +121,19 @@ def detect_waveforms(
         the weight of the light of a bin in later samples. Of a converter that stores blocks, samples outside them are
         NaN, and ``dark_level`` and ``block_level`` over the pixels are the levels without light, and of the threshold.
 
+        Of a camera ``signal`` and ``saturated`` are over (frame, row, column, gate) or (frame, pixel, gate), for a
+        stack over ``frame`` all of its first frame first, as integers [DN] with the fixed pattern of `Camera.pattern`.
+        The closed forms are over the same dimensions, without frame unless the stack has it, and those of each pixel
+        with its pattern; ``signal_mean_stderr`` is by ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean
+        without light. A mean over ``frame`` averages. The coordinates are those of the gate stack. See
+        `analysis.gates.recording.record_gates` for the jitter of gates.
+
     Raises
     ------
     UserError
-        If the dataset has other dimensions, its waveform is not finite or negative, the receiver is unknown or has no
-        amplifier for a gain, both are 'auto', noise alone exceeds the range, or another argument is out of range.
+        If the dataset has other dimensions, gates without a camera or a camera without gates, its waveform is not
+        finite or negative, the receiver is unknown or has no amplifier for a gain, both are 'auto', noise alone exceeds
+        the range, or another argument is out of range.
 
     Notes
     -----
@@ -116,7 +141,9 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
-    dataset = results.dataset_of("dataset", dataset, "waveforms")
+    dataset = results.dataset_of("dataset", dataset, "waveforms", "gates")
+    if (camera := _camera_of(dataset, chain)) is not None:
+        return record_gates(dataset, camera, shots, seed, background_power, (gain, optical_density))
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     if len(groups) == 1:
         recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky)
@@ -134,6 +161,18 @@ def detect_waveforms(
     return recorded
 
 
+def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:
+    """Return the camera that records the gates of a dataset, or None for a receiver that records its waveforms."""
+    found = None if given is None else receiver_of("chain", given)
+    if isinstance(found, Camera):
+        if "gate_energy" not in dataset:
+            raise UserError(
+                f"chain = {found.name!r} is a camera, but the dataset has no gates: cut them with gates first"
+            )
+        return found
+    return None if "waveform" in dataset else camera_of(found or "apd")
+
+
 class PixelChain(NamedTuple):
     """Receiver of one pixel as used in a record, with its gain."""
 
@@ -144,7 +183,7 @@ class PixelChain(NamedTuple):
 
 def pixel_chains(
     dataset: xr.Dataset,
-    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: Receiver | None = None,
     background_power: npt.ArrayLike | xr.DataArray = 0.0,
     *,
     gain: Setting | None = None,
@@ -169,7 +208,7 @@ def pixel_chains(
 
 def _channels(
     dataset: xr.Dataset,
-    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None,
+    chain: Receiver | None,
     gain: Setting | None,
     optical_density: Setting | None,
     background_power: npt.ArrayLike | xr.DataArray,
@@ -177,7 +216,7 @@ def _channels(
     """Return the receiver, its channels with the numbers of their pixels, and the background."""
     receiver = receiver_of_result(dataset, chain, gain, optical_density)
     dims = tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot")
-    sky = _background(dataset, background_power, dims)
+    sky = powers_of(dataset["waveform"].isel(time=0).isel(shot=0, missing_dims="ignore"), background_power, dims)
     pixels = [str(name) for name in dataset["pixel"].values] if dims == ("pixel",) else []
     # Shipped receivers go with other layouts and with some pixels alone; a file is of the lidar that it is given for.
     if receiver.name.endswith(".toml") and (absent := [name for name in receiver.channels if name not in pixels]):
@@ -194,15 +233,15 @@ def _channels(
 
 def receiver_of_result(
     dataset: xr.Dataset,
-    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: Receiver | None = None,
     gain: Setting | None = None,
     optical_density: Setting | None = None,
 ) -> ReceiverChannels:
     """Return the receiver that `detect_waveforms` would use, with its settings, of which some may be 'auto'."""
     if chain is not None:
-        receiver = receiver_of("chain", chain)
+        receiver = chain_of("chain", chain)
     else:
-        receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or receiver_named("apd")
+        receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or waveform_receiver("apd")
     if gain is None and optical_density is None:
         return receiver
     return receiver.with_settings(gain, optical_density)
@@ -310,7 +349,7 @@ def _record_channel(
         "rendered_bin_width_ns": width,
         "shots": len(signal),
         "background_power_w": np.ravel(sky).tolist() if np.ndim(sky) else float(sky),
-        **dict(_described("receiver", receiver)),
+        **dict(parameters_of("receiver", receiver)),
         **fitting,
     }
     axes = {"time": time, "shot": labels, "lag": (first + np.arange(weights.size)) * width}
@@ -335,6 +374,8 @@ def saturation_advice(recorded: xr.Dataset) -> str:
 
 def describe_recording(recorded: xr.Dataset) -> list[str]:
     """Return lines on a record of `detect_waveforms`: gain and filter as used, and saturation in total and by pixel."""
+    if "gate" in recorded.dims:
+        return describe_frames(recorded)
     attributes = recorded.attrs
     used = ", ".join(
         f"{name.replace('_', ' ')} {_span(attributes[name])}{' (auto)' if name in attributes['chosen'] else ''}"
@@ -401,10 +442,20 @@ def _in_range(
     return (chain.with_gain(factor) if gain == "auto" and factor < 1 else used), chosen, attributes
 
 
-def receiver_of(parameter: str, given: ReceiverChannels | ReceiverChain | str | os.PathLike[str]) -> ReceiverChannels:
+def receiver_of(parameter: str, given: Receiver) -> ReceiverChannels | Camera:
     """Return a receiver from itself, its chain, a name, or a TOML file, as the named parameter."""
+    return _named(parameter, lambda: receiver_named(given))
+
+
+def chain_of(parameter: str, given: Receiver) -> ReceiverChannels:
+    """Return a receiver of waveforms as `receiver_of`, which refuses a camera."""
+    return _named(parameter, lambda: waveform_receiver(given))
+
+
+def _named(parameter: str, found: Callable[[], _R]) -> _R:
+    """Return what a function finds, with the name of the parameter in the message of an error."""
     try:
-        return receiver_named(given)
+        return found()
     except UserError as error:
         text = str(error)
         raise UserError(
@@ -423,44 +474,3 @@ def _waveform(dataset: xr.Dataset) -> tuple[tuple[str, ...], FloatArray]:
     if np.any(values < 0):
         raise UserError(f"waveform holds {values.min():g} W; received power must not be negative")
     return dims, values
-
-
-def _background(dataset: xr.Dataset, power: npt.ArrayLike | xr.DataArray, dims: tuple[str, ...]) -> FloatArray:
-    """Return a number or one number per pixel."""
-    if isinstance(power, xr.DataArray):
-        if set(power.dims) - set(dims):
-            raise UserError(f"background_power has the dimensions {power.dims}; they must be among {dims}")
-        of_pixels = dataset["waveform"].isel(time=0).isel(shot=0, missing_dims="ignore")
-        power = power.broadcast_like(of_pixels).transpose(*dims) if power.ndim else power
-    try:
-        values = np.asarray(power, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise UserError(f"background_power = {power!r} must be a number, or one per pixel") from None
-    pixels = tuple(dataset.sizes[name] for name in dims)
-    if values.shape not in ((), pixels):
-        raise UserError(
-            f"background_power has the shape {values.shape}; it must be a number or have the shape {pixels}"
-        )
-    if np.any(values < 0):
-        raise UserError(f"background_power = {values.min():g} must not be negative")
-    return values
-
-
-def _described(name: str, part: Any) -> Mapping[str, int | float | str | list[float]]:
-    """Return the parameters of a stage and of its nested stages as attributes; None and () are left out."""
-    found: dict[str, int | float | str | list[float]] = {}
-    if is_dataclass(part):
-        if name != "receiver":
-            found[name] = type(part).__name__
-        for field in fields(part):
-            found |= _described(f"{name}.{field.name}", getattr(part, field.name))
-    elif isinstance(part, bool):
-        found[name] = int(part)
-    elif isinstance(part, tuple) and part and isinstance(part[0], tuple):
-        # A measured response; the record holds that of its bins.
-        found[name] = f"{len(part[0])} samples, {part[0][0]:g} to {part[0][-1]:g} ns"
-    elif isinstance(part, tuple):
-        found |= {name: list(part)} if part else {}
-    elif part is not None:
-        found[name] = part
-    return found

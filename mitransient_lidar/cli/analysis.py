@@ -20,7 +20,7 @@ _REFUSED = 1  # exit code of a fit that is refused
 
 def _record(
     call: Call,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: a shot, a series, or gates.")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
     ] = None,
@@ -33,7 +33,7 @@ def _record(
     from mitransient_lidar.analysis import receiver as analysis
 
     with reporting(quiet):
-        result = results.dataset_of("FILE", file, "result")
+        result = results.dataset_of("FILE", file, "result", "gates")
     recorded = call(result)
     name_subject(file, result.attrs, quiet)
     write_netcdf(recorded, target)
@@ -163,11 +163,12 @@ COMMANDS = {
         "Analyse results",
         "analysis.receiver:detect_waveforms",
         _record,
-        """Record the waveforms of a result with a receiver.
+        """Record the waveforms of a result with a receiver, or its gates with a camera.
 
         Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
         is saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
-        gain or the filter is chosen so that nothing is saturated.
+        gain or the filter is chosen so that nothing is saturated. Of a camera they are the digital numbers of frames,
+        with mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
         """,
     ),
     "echoes": Command(

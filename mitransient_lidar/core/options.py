@@ -147,6 +147,11 @@ RECEIVERS = (
     "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
     "file"
 )
+#: The same where gates may be recorded.
+RECEIVERS_OR_CAMERAS = (
+    "Receiver of waveforms: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, or the name of an "
+    "instrument; camera for gates: iccd, icmos, ebcmos, emccd, spad_camera or gated_cmos; or a TOML file of either"
+)
 
 
 def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:

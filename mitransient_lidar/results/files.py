@@ -17,6 +17,7 @@ from mitransient_lidar.core.files import checked_path, open_file, replacing
 from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, netcdf, sum_errors
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack
 
@@ -25,6 +26,7 @@ _KINDS = {
     "result": ("waveforms of a render", LIGHT),
     "waveforms": ("waveforms over time", ("waveform",)),
     "signals": ("signals of a receiver", ("signal",)),
+    "frames": ("frames of a gated camera", ("signal", "signal_mean", "gate_start")),
     "gates": ("a gate stack", ("gate_energy", "gate_energy_stderr")),
     "radiance": ("images by daylight", ("radiance", "radiance_stderr")),
     "echoes": ("a table of echoes", ("depth_m", "flags")),
@@ -61,6 +63,9 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
             check_axes(path, dataset, name)
     if "gates" in found:
         check_stack(dataset, path)
+    if "frames" in found:
+        check_attributes(path, dataset.attrs)
+        check_coordinates(path, dataset, "signal_mean")
     return dataset
 
 
@@ -128,8 +133,9 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
 
 
 def kinds_of(dataset: xr.Dataset) -> set[str]:
-    """Return the kinds of a dataset: ``result``, ``waveforms``, ``signals``, ``gates``, ``radiance``, ..."""
-    return {kind for kind, (_, variables) in _KINDS.items() if all(name in dataset for name in variables)}
+    """Return the kinds of a dataset: ``result``, ``waveforms``, ``signals``, ``frames``, ``gates``, ..."""
+    found = {kind for kind, (_, variables) in _KINDS.items() if all(name in dataset for name in variables)}
+    return found - {"signals"} if "frames" in found else found
 
 
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:

@@ -14,7 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
 from mitransient_lidar.analysis.jackknife import jackknife_error
-from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
+from mitransient_lidar.analysis.receiver import DENSEST, chain_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.options import (
@@ -184,7 +184,7 @@ def bounds(
 def _receivers(given: Any, gain: Any) -> dict[str, ReceiverChannels | None]:
     """Return receivers by name, None with an empty name for that of the scene's instrument."""
     listed = list(given) if isinstance(given, (list, tuple)) else [given]
-    found = [None if one is None else receiver_of("receiver", one) for one in listed]
+    found = [None if one is None else chain_of("receiver", one) for one in listed]
     named = {"" if one is None else one.name: one for one in found}
     if len(named) < len(listed) or not named:
         raise UserError(f"receiver = {shown(given)} must be one receiver, or several with different names")

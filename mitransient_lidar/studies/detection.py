@@ -13,7 +13,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.detection import trials
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
-from mitransient_lidar.analysis.receiver import receiver_of
+from mitransient_lidar.analysis.receiver import chain_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
     RECEIVERS,
@@ -134,7 +134,7 @@ def detect(
     seas, and the statistic is taken as normally distributed. Intervals are Student's from a jackknife over at most 10
     groups of renders or seas, and exact binomial ones for rates of random shots, given the rendered light and seas.
     """
-    chain = receiver_of("receiver", receiver).default.chain
+    chain = chain_of("receiver", receiver).default.chain
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
     if clutter != 0 and not 4 <= clutter <= 1000:
         raise UserError(f"clutter = {clutter} must be 0 or lie between 4 and 1000")

@@ -21,8 +21,7 @@ from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, positive, shown
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
-from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
-from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, waveform_receiver
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 
@@ -180,7 +179,7 @@ def measured(
         return _of_signal(source, receiver)
     if not isinstance(source, xr.Dataset):
         table = _with_noise(_read_csv(Path(source)), given)
-        return table if receiver is None else _behind(table, receiver_named(receiver))
+        return table if receiver is None else _behind(table, waveform_receiver(receiver))
     if receiver is not None:
         raise UserError("receiver is that of a signal or a table, and these waveforms are light [W]: leave it out")
     dims = results.record_dims(source, "waveform")
@@ -327,7 +326,7 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
     name = given if given is not None else dataset.attrs.get("receiver")
     if name is None:
         raise UserError("the signal does not name its receiver, which is a chain of its own: give it with receiver")
-    known = receiver_named(name)
+    known = waveform_receiver(name)
     lists = {
         key: np.broadcast_to(np.asarray(dataset.attrs.get(key, usual), dtype=np.float64), (count,))
         for key, usual in (("gain", 1.0), ("optical_density", 0.0), ("background_power_w", 0.0))

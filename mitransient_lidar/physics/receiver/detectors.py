@@ -188,7 +188,7 @@ class LinearDetector(SignalTail):
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
         """Draw charges in electrons per bin, shape ``(shots, *events.shape)``."""
         count = random.poisson(events, (shots, *events.shape))
-        charge = _multiplied(count, self.gain, self.excess_noise - 1, random)
+        charge = multiplied(count, self.gain, self.excess_noise - 1, random)
         if leakage := _electrons(self.leakage_current_na, bin_width_ns):
             charge += random.normal(leakage, np.sqrt(leakage), charge.shape)
         return charge
@@ -258,7 +258,7 @@ class SiliconPhotomultiplier(SignalTail):
                 born = random.poisson(offspring[parents % offspring.size] * born)
                 parents, born = parents[born > 0], born[born > 0]
                 flat[parents] += born
-        return _multiplied(count, self.gain, self.gain_spread**2, random)
+        return multiplied(count, self.gain, self.gain_spread**2, random)
 
     def _tail_sources(self, events: FloatArray, part_ns: float) -> FloatArray:
         """Return the mean primary avalanches, fewer than the events where cells are dead."""
@@ -360,7 +360,7 @@ def _electrons(current_na: float, bin_width_ns: float) -> float:
     return current_na * 1e-9 * bin_width_ns * 1e-9 / ELEMENTARY_CHARGE
 
 
-def _multiplied(count: IntArray, gain: float, relative_variance: float, random: np.random.Generator) -> FloatArray:
+def multiplied(count: IntArray, gain: float, relative_variance: float, random: np.random.Generator) -> FloatArray:
     """Random charge of `count` events, each with a mean `gain` and a relative variance."""
     if relative_variance == 0:
         return gain * count.astype(np.float64)

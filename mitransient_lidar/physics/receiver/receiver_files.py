@@ -1,4 +1,4 @@
-"""Receivers from TOML files: a chain for each channel, with its gain and filter."""
+"""Receivers from TOML files: a chain for each channel, with its gain and filter, or a camera."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
@@ -74,6 +75,16 @@ class ReceiverFile(ChannelTable):
     channels: Annotated[Mapping[str, Any], Option("Channels with own detectors, electronics or settings")] = field(
         default_factory=dict
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFile(Plan):
+    """A file of a camera, with the parameters of `Camera` in its table."""
+
+    camera: Annotated[Mapping[str, Any], Option("Camera")] = field(default_factory=dict)
+    preset: Annotated[str | None, Option("Camera whose parameters count where the file has no others")] = None
+    wavelength_nm: Annotated[float | None, positive_option("Vacuum wavelength of the light", "nm")] = None
+    source: Annotated[str | None, Option("Source of the numbers", form="a text")] = None
 
 
 @dataclass(frozen=True)
@@ -160,28 +171,51 @@ def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
     return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
 
 
-def receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels) -> ReceiverChannels:
-    """Return a receiver: a preset by name, that of an instrument by name, or one from a TOML file.
+def receiver(
+    name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera,
+) -> ReceiverChannels | Camera:
+    """Return a receiver: a preset or camera by name, that of an instrument by name, or one from a TOML file.
 
     Raises
     ------
     UserError
         If there is none of that name, or the file is invalid.
     """
-    if isinstance(name, ReceiverChannels):
+    if isinstance(name, (ReceiverChannels, Camera)):
         return name
     if isinstance(name, ReceiverChain):
         return ReceiverChannels(Channel(name))
     if isinstance(name, str) and name in RECEIVERS:
         return ReceiverChannels(Channel(RECEIVERS[name]), name=name)
+    if isinstance(name, str) and name in CAMERAS:
+        return CAMERAS[name]
     if isinstance(name, str) and (own := instrument_receiver(name)) is not None:
         return own
     path = Path(name)
     if path.suffix != ".toml":
+        known = ", ".join((*RECEIVERS, *CAMERAS))
+        raise UserError(f"receiver = {shown(str(name))} must be one of {known}, an instrument, or a .toml file")
+    return _parsed(read_text(path), str(path), path.parent)
+
+
+def waveform_receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera) -> ReceiverChannels:
+    """Return a receiver of waveforms; raise `UserError` as `receiver` does, and for a camera."""
+    if isinstance(found := receiver(name), Camera):
         raise UserError(
-            f"receiver = {shown(str(name))} must be one of {', '.join(RECEIVERS)}, an instrument, or a .toml file"
+            f"receiver = {shown(found.name)} is a camera, which needs gates, but this needs waveforms and one of "
+            f"{', '.join(RECEIVERS)}, an instrument, or a .toml file of a chain"
         )
-    return parse_receiver(read_text(path), str(path), path.parent)
+    return found
+
+
+def camera(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera) -> Camera:
+    """Return a camera; raise `UserError` as `receiver` does, and for a receiver of waveforms."""
+    if not isinstance(found := receiver(name), Camera):
+        raise UserError(
+            f"receiver = {shown(found.name)} is one of waveforms, but gates need a camera: {', '.join(CAMERAS)}, or a "
+            ".toml file with a table [camera]"
+        )
+    return found
 
 
 def instrument_receiver(instrument: str) -> ReceiverChannels | None:
@@ -203,7 +237,22 @@ def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
     UserError
         If a key is unknown, a parameter is out of range, or the stages do not fit together.
     """
-    return _receiver(parse_toml(text, name), name, folder, RECEIVERS)
+    return waveform_receiver(_parsed(text, name, folder))
+
+
+def _parsed(text: str, name: str, folder: Path) -> ReceiverChannels | Camera:
+    """Return the receiver or the camera that the text of a TOML file describes."""
+    given = parse_toml(text, name)
+    if "camera" not in given and given.get("preset") not in CAMERAS:
+        return _receiver(given, name, folder, RECEIVERS)
+    values = CameraFile.of(given, name, f"{name}: ")
+    parameters: dict[str, Any] = {}
+    if values.preset is not None:
+        preset = CAMERAS[one_of(f"{name}: preset", values.preset, CAMERAS)]
+        parameters = {key: getattr(preset, key) for key in tuple(Camera.keys())}
+    parameters |= {key: value for key in ("wavelength_nm", "source") if (value := getattr(values, key)) is not None}
+    found: Camera = _tried(name, lambda: Camera.of(parameters | dict(values.camera), "[camera]", name=name))
+    return found
 
 
 def _receiver(
@@ -301,5 +350,14 @@ def _presets() -> Mapping[str, ReceiverChain]:
     return MappingProxyType(found)
 
 
+def _cameras() -> Mapping[str, Camera]:
+    """Return the typical cameras for 532 nm."""
+    path = Path(__file__).with_name("cameras.toml")
+    tables = parse_toml(path.read_text("utf-8"), path).items()
+    return MappingProxyType({name: Camera.of(given, f"{path.name}: {name}", name=name) for name, given in tables})
+
+
 #: Typical chains for 532 nm, with their sources.
 RECEIVERS = _presets()
+#: Typical gated cameras for 532 nm, with their sources.
+CAMERAS = _cameras()

@@ -1,0 +1,438 @@
+"""Gated cameras: digital numbers of frames for the energy that each pixel collects in a gate, as moments and draws.
+
+A frame is the sum of the pulses of a gate on the chip. Its light passes, in this order: the blur of the optics; events
+(photoelectrons or avalanches, Poisson-distributed, with dark events while the gate is open); their multiplication; the
+blur of an intensifier; the chip with its dark current and full well; the read-out; and the converter. Arrays of pixels
+have the shape (row, column, gate), or (pixel, gate) for pixels that are no image, which have no blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.validation import BoolArray, FloatArray, integer, non_negative_array
+from mitransient_lidar.physics.receiver.detectors import multiplied, photons_per_joule
+from mitransient_lidar.physics.receiver.electronics import Expected
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+Values = npt.ArrayLike
+
+_TAIL = 1e-9  # of a kernel, left out at its ends
+_LEAST_SKEWNESS = 1e-3  # of a clipped distribution, against cancellation
+_FAR = 12.0  # deviations from a limit beyond which nothing is clipped
+_OFFSET = 4.0  # least offset in deviations of the read-out
+
+#: Parameters that a kind of camera has not.
+_GAIN = ("gain", "excess_noise", "frame_dark", "intensifier_mtf")
+_CHIP = ("dark_current_hz", "read_noise", "full_well", "electrons_per_dn", "offset_dn", "offset_spread_dn")
+_WITHOUT = {
+    "intensified": ("pulses_per_exposure",),
+    "electron_multiplying": ("pulses_per_exposure", "intensifier_mtf"),
+    "counting": (*_GAIN, *_CHIP),
+    "direct": ("pulses_per_exposure", *_GAIN),
+}
+
+
+class Record(NamedTuple):
+    """Drawn frames, each of shape (frame, ..., gate)."""
+
+    signal: npt.NDArray[np.unsignedinteger[Any]]  #: Digital numbers, of 16 bits, or 32 for a converter of more.
+    saturated: BoolArray  #: Whether the full well or the range of the converter was reached.
+
+
+class Pattern(NamedTuple):
+    """Fixed pattern of a camera's pixels, the same in all frames, each of shape (row, column) or (pixel,)."""
+
+    response: FloatArray  #: Events over those of the mean pixel [1].
+    offset: FloatArray  #: Added to the offset [DN].
+    dark: FloatArray  #: Dark current over that of most pixels [1].
+
+
+class Noise(NamedTuple):
+    """Parts of the noise: the covariance of pixels is B diag(shared) B + diag(own), with B of `Camera.spread`."""
+
+    shared: FloatArray  #: Variance of the events of a pixel that the intensifier spreads over its neighbours [DN^2].
+    own: FloatArray  #: Variance of a pixel that others do not share [DN^2].
+
+
+@dataclass(frozen=True)
+class Camera(Plan):
+    """Gated camera.
+
+    Notes
+    -----
+    The response of pixels to steady light is in closed form: mean and variance are exact below saturation; a limit cuts
+    a Pearson distribution of type III with the mean, variance and skewness of the charge. Of full well and converter,
+    the higher limit is left out. Blur is the discrete Gaussian of T. Lindeberg, IEEE Trans. PAMI 12, 234 (1990),
+    doi:10.1109/34.49051, with the MTF exp(-t (1 - cos 2 pi f)) at f cycles per pixel; images are mirrored at their
+    edges, which keeps the sum. The gate is that of the light: a photon counter is gated itself, and an
+    electron-multiplying CCD needs a shutter before it. The afterglow of phosphors and the crosstalk and afterpulses of
+    counters are left out.
+    """
+
+    kind: Annotated[
+        Literal["intensified", "electron_multiplying", "counting", "direct"],
+        Option(
+            "Place of the gain: before the chip (image intensifier, electron bombardment), in its register behind the "
+            "dark current, in pixels that count at most one event per exposure, or none"
+        ),
+    ]
+    quantum_efficiency: Annotated[
+        float, Option("Events per photon, of a cathode or chip with all windows and fill factors", 0, 1, above=True)
+    ]
+    gain: Annotated[float, Option("Mean electrons on the chip per event", 1)] = 1.0
+    excess_noise: Annotated[float, Option("Mean square of these electrons over the square of their mean", 1)] = 1.0
+    open_dark_hz: Annotated[
+        float,
+        Option("Dark events per pixel while the gate is open: equivalent background or dark counts", 0, unit="1/s"),
+    ] = 0.0
+    frame_dark: Annotated[
+        float, Option("Dark events per pixel and frame, multiplied, as of the clocks of a register", 0)
+    ] = 0.0
+    dark_current_hz: Annotated[
+        float, Option("Dark current of the chip per pixel, during the frame", 0, unit="electrons/s")
+    ] = 0.0
+    frame_time_ms: Annotated[float, Option("Exposure of the chip for a frame", 0, unit="ms")] = 0.0
+    leakage: Annotated[
+        float, Option("Share of the daylight that is recorded while the gate is closed, during the frame", 0, 1)
+    ] = 0.0
+    pulses_per_exposure: Annotated[
+        int, Option("Pulses during which a pixel that counts has at most one count", 1, 10**9)
+    ] = 1
+    read_noise: Annotated[float, Option("Standard deviation of the read-out", 0, unit="electrons")] = 0.0
+    full_well: Annotated[
+        float, positive_option("Largest charge of a pixel, or of the register behind the gain", "electrons")
+    ] = np.inf
+    bits: Annotated[int, Option("Resolution of the converter, or size of the counter", 1, 24)] = 16
+    electrons_per_dn: Annotated[float, positive_option("Charge per digital number", "electrons")] = 1.0
+    offset_dn: Annotated[
+        float, Option("Digital number without charge, at least 4 standard deviations of the read-out", 0, unit="DN")
+    ] = 0.0
+    response_spread: Annotated[float, Option("Standard deviation of the pixels' response over its mean", 0, 1)] = 0.0
+    offset_spread_dn: Annotated[float, Option("Standard deviation of the pixels' offset", 0, unit="DN")] = 0.0
+    hot_pixels: Annotated[float, Option("Share of hot pixels", 0, 1)] = 0.0
+    hot_factor: Annotated[float, Option("Dark current, or dark counts, of a hot pixel over those of others", 1)] = 1.0
+    pattern_seed: Annotated[int, Option("Seed of the fixed pattern: one for each camera", 0, 2**53)] = 0
+    optics_mtf: Annotated[
+        float, Option("MTF of the optics before the detector at half a cycle per pixel", 0, 1, above=True)
+    ] = 1.0
+    intensifier_mtf: Annotated[
+        float,
+        Option("MTF of the intensifier behind its gain at half a cycle per pixel, 1 for no blur", 0, 1, above=True),
+    ] = 1.0
+    gate_jitter_ns: Annotated[float, Option("Standard deviation of the gate's time in a pulse", 0, unit="ns")] = 0.0
+    insertion_delay_ns: Annotated[
+        float, Option("Earliest gate after the pulse, by the delay of its generator", 0, unit="ns")
+    ] = 0.0
+    shortest_gate_ns: Annotated[float, Option("Width of the shortest gate", 0, unit="ns")] = 0.0
+    wavelength_nm: Annotated[float, positive_option("Vacuum wavelength of the light", "nm")] = 532.0
+    source: Annotated[str, Option("Sources of the numbers, and which of them are assumed", form="a text")] = ""
+    name: str = "custom"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for one in fields(self):
+            if one.name in _WITHOUT[self.kind] and (value := getattr(self, one.name)) != one.default:
+                raise UserError(f"{one.name} = {value:g} is no parameter of a camera of kind {self.kind!r}")
+        least = _OFFSET * self.read_noise / self.electrons_per_dn
+        if self.offset_dn < least * (1 - 1e-9):
+            raise UserError(f"offset_dn = {self.offset_dn:g} must be at least {least:g}, 4 deviations of the read-out")
+        if self.intensifier_mtf < 1 and self.excess_noise < 1 + 1 / self.gain:
+            raise UserError(
+                f"excess_noise = {self.excess_noise:g} must be at least 1 + 1/gain = {1 + 1 / self.gain:g} with an "
+                "intensifier_mtf, as the electrons of an event are spread at random"
+            )
+
+    @property
+    def top_dn(self) -> int:
+        """Largest digital number."""
+        return (1 << self.bits) - 1
+
+    def pattern(self, pixels: tuple[int, ...]) -> Pattern:
+        """Return the fixed pattern of pixels of a shape (row, column) or (pixel,)."""
+        random = np.random.default_rng(self.pattern_seed)
+        response = np.maximum(random.normal(1, self.response_spread, pixels), 0)
+        offset = random.normal(0, self.offset_spread_dn, pixels)
+        return Pattern(response, offset, np.where(random.random(pixels) < self.hot_pixels, self.hot_factor, 1.0))
+
+    def events(
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
+    ) -> FloatArray:
+        """Return the mean events of each pixel and gate, with dark events.
+
+        Parameters
+        ----------
+        energy : array_like, shape (row, column, gate) or (pixel, gate)
+            Energy of the signal in a gate over all pulses [J], not negative.
+        open_ns : array_like
+            Integral of the gate's transmission [ns], not negative: a number, or shape (gate,).
+        background : array_like
+            Power of the daylight on each pixel [W], not negative: a number, or of the shape of the pixels.
+        pulses : int
+            Pulses of a frame.
+        pattern : Pattern, optional
+            Fixed pattern; without one, all pixels are alike.
+        """
+        light, opened = non_negative_array("energy", energy), self._opened(open_ns, pulses)
+        if light.ndim not in (2, 3):
+            raise UserError(f"energy of shape {light.shape} must have the axes (row, column, gate) or (pixel, gate)")
+        sky = non_negative_array("background", background)
+        if sky.shape not in ((), light.shape[:-1]):
+            raise UserError(f"background of shape {sky.shape} must be a number or have the shape {light.shape[:-1]}")
+        light += (sky[..., np.newaxis] if sky.ndim else sky) * (opened + 1e-3 * self.leakage * self.frame_time_ms)
+        found = self._signal_events(light)
+        hot: FloatArray | float = 1.0
+        if pattern is not None:
+            found, hot = found * pattern.response[..., np.newaxis], pattern.dark[..., np.newaxis]
+        found = found + self.frame_dark + self.open_dark_hz * opened * (hot if self.kind == "counting" else 1.0)
+        if self.kind == "electron_multiplying":
+            found = found + 1e-3 * self.dark_current_hz * self.frame_time_ms * hot
+        return np.asarray(found)
+
+    def expected(
+        self,
+        energy: Values,
+        open_ns: Values,
+        background: Values = 0.0,
+        pulses: int = 1,
+        pattern: Pattern | None = None,
+        slope: Values | None = None,
+    ) -> Expected:
+        """Return mean [DN] and variance [DN^2] of a frame and its probability of saturation, in the shape of `energy`.
+
+        Parameters are those of `events`; `slope` is the derivative of the energy with respect to the gate's time
+        [J/ns], of the same shape: without it, `gate_jitter_ns` has no effect.
+        """
+        events = self.events(energy, open_ns, background, pulses, pattern)
+        mean, variance, third = self._charge(events, pulses, pattern)
+        if slope is not None:
+            variance = variance + (self._charge_slope(slope, events, pulses) * self._jitter_ns(pulses)) ** 2
+        if self.kind == "counting":  # whose codes are counts, without rounding
+            return self._expected_counts(events, pulses, mean, variance, third)
+        offset = self._offset(pattern)
+        scale, read = self.electrons_per_dn, self.read_noise**2
+        top = (self.top_dn - offset) * scale
+        is_well = np.broadcast_to(top > self.full_well, mean.shape)  # before the read-out, whose noise stays
+        limit = np.where(is_well, self.full_well, top)
+        over = np.where(is_well, self.full_well, top + 0.5 * scale)
+        clipped = _clipped(mean, np.where(is_well, variance, variance + read), third, limit, over)
+        rest = np.where(is_well, read / scale**2 + 1 / 12, (1 - clipped.saturation) / 12)
+        return Expected(offset + clipped.mean / scale, clipped.variance / scale**2 + rest, clipped.saturation)
+
+    def noise(
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
+    ) -> Noise:
+        """Return the parts of the noise without saturation and jitter; parameters are those of `events`."""
+        events = self.events(energy, open_ns, background, pulses, pattern)
+        variance = self._charge(events, pulses, pattern)[1] + self.read_noise**2
+        shared = np.zeros_like(events)
+        if self.intensifier_mtf < 1 and events.ndim == 3:
+            shared = (self.gain**2 * self.excess_noise - self.gain) * events
+            variance = variance - self._spread(shared, 2)
+        scale = self.electrons_per_dn**2
+        rounding = 0.0 if self.kind == "counting" else 1 / 12
+        return Noise(shared / scale, variance / scale + rounding)
+
+    def spread(self, values: Values) -> FloatArray:
+        """Return values, shape (row, column, ...), after the blur of the intensifier, a symmetric matrix B."""
+        return self._spread(np.asarray(values, np.float64), 1)
+
+    def sample(
+        self,
+        energy: Values,
+        open_ns: Values,
+        frames: int,
+        seed: int | Sequence[int],
+        background: Values = 0.0,
+        pulses: int = 1,
+        pattern: Pattern | None = None,
+        slope: Values | None = None,
+    ) -> Record:
+        """Draw frames; parameters are those of `expected`, and the shift of a gate is that of all pixels of a frame."""
+        events = self.events(energy, open_ns, background, pulses, pattern)
+        shifted = (
+            None if slope is None else self._signal_events(np.asarray(slope, np.float64)) * self._jitter_ns(pulses)
+        )
+        shape = (integer("frames", frames, 1, 10**9), *events.shape)
+        random = np.random.default_rng(seed)
+        signal = np.empty(shape, np.uint16 if self.bits <= 16 else np.uint32)
+        saturated = np.empty(shape, np.bool_)
+        offset, most = self._offset(pattern), self.top_dn
+        if self.kind == "counting":
+            most = min(self.top_dn, self._exposures(pulses)) - 1
+        for frame in range(len(signal)):
+            mean = events
+            if shifted is not None:
+                mean = np.maximum(events + shifted * random.standard_normal(events.shape[-1]), 0)
+            charge = self._drawn(mean, pulses, pattern, random)
+            full = charge > self.full_well
+            charge = np.minimum(charge, self.full_well)
+            if self.read_noise:
+                charge += random.normal(0, self.read_noise, charge.shape)
+            codes = np.rint(offset + charge / self.electrons_per_dn)
+            saturated[frame] = full | (codes > most)
+            signal[frame] = np.clip(codes, 0, self.top_dn)
+        return Record(signal, saturated)
+
+    def _expected_counts(
+        self, events: FloatArray, pulses: int, mean: FloatArray, variance: FloatArray, third: FloatArray
+    ) -> Expected:
+        """Return the moments of counts, which are saturated where the counter or all exposures are full."""
+        from scipy.special import bdtrc
+
+        exposures = self._exposures(pulses)
+        full = bdtrc(min(self.top_dn, exposures) - 1, exposures, -np.expm1(-events / exposures))
+        if exposures > self.top_dn:
+            mean, variance, _ = _clipped(mean, variance, third, self.top_dn, self.top_dn)
+        return Expected(mean, variance, np.asarray(full))
+
+    def _drawn(
+        self, events: FloatArray, pulses: int, pattern: Pattern | None, random: np.random.Generator
+    ) -> FloatArray:
+        """Draw the charge of a frame without full well [electrons]."""
+        if self.kind == "counting":
+            exposures = self._exposures(pulses)
+            return random.binomial(exposures, -np.expm1(-events / exposures)).astype(np.float64)
+        blurred = self.intensifier_mtf < 1 and events.ndim == 3
+        spread = self.excess_noise - 1 - (1 / self.gain if blurred else 0)
+        charge = multiplied(random.poisson(events), self.gain, spread, random)
+        if blurred:
+            charge = random.poisson(self._spread(charge, 1)).astype(np.float64)
+        if dark := self._dark(pattern, events):
+            charge += random.poisson(*dark, charge.shape)
+        return charge
+
+    def _charge(
+        self, events: FloatArray, pulses: int, pattern: Pattern | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the first three cumulants of the charge of a frame without full well [electrons]."""
+        if self.kind == "counting":
+            exposures = self._exposures(pulses)
+            silent = np.exp(-events / exposures)
+            mean = exposures * -np.expm1(-events / exposures)
+            return mean, mean * silent, mean * silent * (2 * silent - 1)
+        gain, noise = self.gain, self.excess_noise
+        # Of gamma-distributed charges, the mean cube is that of the mean times F (2 F - 1).
+        mean, variance, third = gain * events, gain**2 * noise * events, gain**3 * noise * (2 * noise - 1) * events
+        if self.intensifier_mtf < 1 and events.ndim == 3:
+            bunched = noise - 1 / gain
+            mean, pairs = self._spread(mean, 1), gain**2 * bunched * self._spread(events, 2)
+            variance = pairs + mean
+            third = gain**3 * bunched * (2 * bunched - 1) * self._spread(events, 3) + 3 * pairs + mean
+        if dark := self._dark(pattern, events):
+            mean, variance, third = mean + dark[0], variance + dark[0], third + dark[0]
+        return mean, variance, third
+
+    def _dark(self, pattern: Pattern | None, events: FloatArray) -> tuple[FloatArray] | tuple[()]:
+        """Return the mean charge on the chip that is not multiplied, broadcast to the events, or nothing."""
+        if self.kind == "electron_multiplying" or self.dark_current_hz * self.frame_time_ms == 0:
+            return ()
+        hot = 1.0 if pattern is None else pattern.dark[..., np.newaxis]
+        return (np.broadcast_to(1e-3 * self.dark_current_hz * self.frame_time_ms * hot, events.shape),)
+
+    def _signal_events(self, light: FloatArray) -> FloatArray:
+        """Return the mean events of energies [J] behind the optics."""
+        if light.ndim == 3:
+            light = _blurred(light, self.optics_mtf, 1)
+        return self.quantum_efficiency * photons_per_joule(self.wavelength_nm) * light
+
+    def _charge_slope(self, slope: Values, events: FloatArray, pulses: int) -> FloatArray:
+        """Return the derivative of the mean charge with respect to the gate's time [electrons/ns]."""
+        changed = self._signal_events(np.asarray(slope, np.float64))
+        if self.kind == "counting":
+            return np.asarray(changed * np.exp(-events / self._exposures(pulses)))
+        return self.gain * (self._spread(changed, 1) if events.ndim == 3 else changed)
+
+    def _jitter_ns(self, pulses: int) -> float:
+        """Return the deviation of the mean time of a gate's pulses [ns]."""
+        return float(self.gate_jitter_ns / np.sqrt(pulses))
+
+    def _opened(self, open_ns: Values, pulses: int) -> FloatArray:
+        """Return the open time of all pulses [s]."""
+        return 1e-9 * integer("pulses", pulses, 1, 10**9) * non_negative_array("open_ns", open_ns)
+
+    def _offset(self, pattern: Pattern | None) -> FloatArray:
+        """Return the digital numbers without charge, to broadcast to pixels and gates."""
+        return np.asarray(self.offset_dn + (0.0 if pattern is None else pattern.offset[..., np.newaxis]))
+
+    def _exposures(self, pulses: int) -> int:
+        """Return in how many exposures the pulses are counted."""
+        return -(-pulses // self.pulses_per_exposure)
+
+    def _spread(self, values: FloatArray, power: int) -> FloatArray:
+        """Return values behind the intensifier, whose weights have a power."""
+        return _blurred(values, self.intensifier_mtf, power)
+
+
+def _blurred(values: FloatArray, mtf: float, power: int) -> FloatArray:
+    """Return values, shape (row, column, ...), blurred along rows and columns with a power of the weights."""
+    if mtf == 1:
+        return values
+    for axis in (0, 1):
+        moved = np.moveaxis(values, axis, 0)
+        flat = np.ascontiguousarray(moved).reshape(len(moved), -1)
+        values = np.moveaxis((_blur_weights(len(moved), mtf).power(power) @ flat).reshape(moved.shape), 0, axis)
+    return values
+
+
+def _blur_weights(size: int, mtf: float) -> sparse.csr_array:
+    """Return the discrete Gaussian with this MTF at half a cycle per pixel as a matrix that mirrors at its ends."""
+    from scipy import sparse
+    from scipy.special import ive
+
+    width = -0.5 * np.log(mtf)
+    reach = 4 + int(12 * np.sqrt(width) + 6 * width)
+    kernel = ive(np.abs(np.arange(-reach, reach + 1)), width)
+    kernel = kernel[kernel > _TAIL]
+    reach = kernel.size // 2
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(np.arange(size), reach, "symmetric"), kernel.size)
+    places = np.repeat(np.arange(size), kernel.size), near.ravel()
+    return sparse.csr_array((np.tile(kernel / kernel.sum(), size), places), (size, size))
+
+
+def _clipped(mean: FloatArray, variance: FloatArray, third: FloatArray, limit: Values, over: Values) -> Expected:
+    """Return the moments of min(X, limit) and P(X > over), for a Pearson distribution of type III with these cumulants.
+
+    In units of the deviation, from the mean, X is (Y - k)/sqrt(k) with Y gamma-distributed with the shape k = 4 over
+    the square of the skewness, or the negative of that.
+    """
+    deviation = np.sqrt(variance)
+    limit, over = np.broadcast_to(limit, mean.shape), np.broadcast_to(over, mean.shape)
+    found = Expected(mean.copy(), variance.copy(), np.asarray(mean > over, np.float64))
+    near = mean + _FAR * deviation + third / np.maximum(variance, 1e-300) * _FAR > limit
+    found.mean[near & (deviation == 0)] = limit[near & (deviation == 0)]
+    near &= deviation > 0
+    m, s, x, end = mean[near], deviation[near], limit[near], over[near]
+    skewness = third[near] / s**3
+    below, first, second = _partial_moments((x - m) / s, skewness)
+    step = (x - m) / s
+    shift = first + step * (1 - below)
+    found.mean[near] = m + s * shift
+    found.variance[near] = s**2 * np.maximum(second + step**2 * (1 - below) - shift**2, 0)
+    found.saturation[near] = 1 - _partial_moments((end - m) / s, skewness)[0]
+    return found
+
+
+def _partial_moments(x: FloatArray, skewness: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the integrals of 1, z and z^2 up to x over a standardised Pearson distribution of type III."""
+    from scipy.special import gammainc, gammaln, xlogy
+
+    sign = np.where(skewness < 0, -1.0, 1.0)
+    shape = 4 / np.maximum(np.abs(skewness), _LEAST_SKEWNESS) ** 2
+    y = np.maximum(shape + np.sqrt(shape) * sign * x, 0)
+    below = gammainc(shape, y)
+    density = np.exp(xlogy(shape, y) - y - gammaln(shape + 1))
+    second = below + density * (shape - 1 - y)
+    # The distribution is mirrored for a negative skewness.
+    mirrored = sign < 0
+    return np.where(mirrored, 1 - below, below), -np.sqrt(shape) * density, np.where(mirrored, 1 - second, second)
