@@ -14,6 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
+from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
@@ -121,7 +122,7 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack of at least 3 gates, of which the last dimension is ``gate``.
+        A gate stack of at least 3 gates, or frames of a camera.
     reach : int, optional
         As for `range_from_gates`.
 
@@ -143,7 +144,7 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
     axis's scale of depth.
     """
-    stack = dataset_of("stack", stack, "gates")
+    stack = as_stack(dataset_of("stack", stack, "gates", "frames"))
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
