@@ -139,9 +139,9 @@ class GateFiles:
         from mitransient_lidar.plots.gates import images
         from mitransient_lidar.plots.viewer import view
         from mitransient_lidar.results import exr
-        from mitransient_lidar.results.gate_stack import as_stack, check_stack
+        from mitransient_lidar.results.gate_stack import as_stack, check_stack, has_frames
 
-        frames = "gate_energy" not in stack
+        frames = has_frames(stack)
         drawn = as_stack(stack)
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):

@@ -43,13 +43,14 @@ def _gates(
 ) -> None:
     """Cut the gates of a train, or take those that are there, and write and draw them."""
     from mitransient_lidar.analysis.gates import cut as gating
+    from mitransient_lidar.results.gate_stack import has_frames
 
     count, starts = call.arguments["count"], [call.arguments[name] for name in ("start_ns", "start_depth_m")]
     given = {"--width-ns": call.arguments["width_ns"], "--step-ns": call.arguments["step_ns"]}
     given["--count"] = None if count == 1 else count
     with reporting(quiet):
         result = _open(stack)
-        is_record = "gate_energy" not in result and "gate_start" in result.coords
+        is_record = has_frames(result)
         has_gates = is_record or "gate_energy" in result
         is_cut = not has_gates or starts != [None, None]
         stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")

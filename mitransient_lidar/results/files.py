@@ -19,7 +19,7 @@ from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, image_files, netcdf, sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import LIGHT, check_axes
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
 #: What a kind of dataset is called, and the variables that one has.
 _KINDS = {
@@ -141,7 +141,7 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
 def kinds_of(dataset: xr.Dataset) -> set[str]:
     """Return the kinds of a dataset: ``result``, ``waveforms``, ``signals``, ``frames``, ``gates``, ..."""
     found = {kind for kind, (_, variables) in _KINDS.items() if all(name in dataset for name in variables)}
-    return found - {"signals"} if "frames" in found else found
+    return found - {"signals" if has_frames(dataset) else "frames"}
 
 
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:

@@ -236,7 +236,7 @@ def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Datase
     UserError
         As of `check_stack`.
     """
-    if "signal_mean" not in dataset or "gate_start" not in dataset.coords:
+    if not has_frames(dataset):
         if "frame" in dataset.get("gate_energy", dataset).dims:
             error = np.sqrt((dataset["gate_energy_stderr"] ** 2).mean("frame") / dataset.sizes["frame"])
             dataset = _without_frames(dataset).assign(
@@ -253,6 +253,11 @@ def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Datase
     stack = check_stack(stack.assign_attrs(dataset.attrs), place)
     stack["gate_energy"].attrs |= {"long_name": "signal above the dark level", "units": "DN"}
     return stack
+
+
+def has_frames(dataset: xr.Dataset) -> bool:
+    """Return whether a dataset has frames of a camera: a signal over gates. A record in time may have gates beside."""
+    return "signal" in dataset and "gate" in dataset["signal"].dims
 
 
 def _without_frames(dataset: xr.Dataset) -> xr.Dataset:

@@ -21,7 +21,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
 SUFFIXES = (".tif", ".tiff", ".png")
 _MOST = 65535
@@ -66,7 +66,7 @@ def write(dataset: xr.Dataset, path: Path) -> list[Path]:
 
 def _numbers(dataset: xr.Dataset, path: Path) -> tuple[npt.NDArray[np.uint16], float]:
     """Return numbers of 16 bits over (frame, gate, row, column), and the value of one [J or digital number]."""
-    is_frames = "signal" in dataset and "gate_start" in dataset.coords
+    is_frames = has_frames(dataset)
     if not is_frames and "gate_energy" not in dataset:
         raise UserError(f"cannot write {path}: a {path.suffix} file holds gates or frames of a camera")
     found = dataset["signal"] if is_frames else check_stack(dataset)["gate_energy"]
@@ -88,7 +88,7 @@ def _described(
 ) -> Iterator[tuple[dict[str, Any], npt.NDArray[np.uint16]]]:
     """Yield each image with its description."""
     known = {"gate_start_ns": "gate_start", "gate_width_ns": "gate_width", "gate_depth_m": "gate_depth"}
-    unit = "DN" if "signal" in dataset else "J"
+    unit = "DN" if has_frames(dataset) else "J"
     for frame, gate in np.ndindex(images.shape[:2]):
         places = {
             key: float(dataset[name].isel(frame=frame, missing_dims="ignore").values[gate])

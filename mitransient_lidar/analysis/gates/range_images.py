@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
-from mitransient_lidar.results.gate_stack import as_stack
+from mitransient_lidar.results.gate_stack import as_stack, has_frames
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
@@ -144,7 +144,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
     axis's scale of depth.
     """
-    stack = as_stack(dataset_of("stack", stack, "gates", "frames"))
+    stack = dataset_of("stack", stack, "gates", "frames")
+    stack = as_stack(stack) if has_frames(stack) else stack
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0

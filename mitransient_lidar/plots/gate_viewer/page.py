@@ -29,7 +29,7 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gate_viewer.time_bins import RECORDS, one_record, time_bins
 from mitransient_lidar.plots.gates.images import known_depths
 from mitransient_lidar.results.dataset import time_axis
-from mitransient_lidar.results.gate_stack import as_stack
+from mitransient_lidar.results.gate_stack import as_stack, has_frames
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None
-    gated_already = "gate_energy" in stack or "gate_start" in stack.coords
+    gated_already = "gate_energy" in stack or has_frames(stack)
     if is_record := not gated_already and bool({*RECORDS} & {*stack.data_vars}):
         record = one_record(stack)
         gated = time_bins(record)

@@ -157,7 +157,7 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
         top = float(finite.max()) if finite.max() > 0 else 1.0
     brighter = np.count_nonzero(finite > top) / finite.size
     factor, unit = unit_of(stack, top)
-    label = f"{stack['gate_energy'].attrs['long_name']} ({unit})"
+    label = f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit})"
     if brighter:
         surface = "" if below.all() else ", including the surface echo,"
         label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
@@ -172,7 +172,7 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
 
 def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
     """Return factor and name of the unit in which values of `as_stack` up to the largest one are drawn."""
-    if (unit := stack["gate_energy"].attrs["units"]) != "J":
+    if (unit := stack["gate_energy"].attrs.get("units", "J")) != "J":
         return 1.0, str(unit)
     factor, prefix = drawing.si_prefix(largest)
     return factor, f"{prefix}J"
