@@ -14,6 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
+from mitransient_lidar.results.gate_stack import as_stack, has_frames
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
@@ -144,7 +145,11 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
     axis's scale of depth.
     """
-    stack = _light(dataset_of("stack", stack, "gates", "frames"))
+    stack = dataset_of("stack", stack, "gates", "frames")
+    if has_frames(stack):
+        stack = _light_of_frames(stack)
+    elif "frame" in stack.dims:
+        stack = as_stack(stack)
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
@@ -174,15 +179,12 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     return DepthImage(depth, found.sigma * per_ns, method, found.confidence)
 
 
-def _light(stack: xr.Dataset) -> xr.Dataset:
-    """Return a gate stack, or the mean of frames of a camera in its place [DN]."""
-    if "signal" not in stack:
-        return stack
-    drawn, rendered = stack["signal_deviation"] ** 2 / stack.sizes["frame"], stack["signal_mean_stderr"] ** 2
-    drawn, rendered = (one.mean("frame") if "frame" in one.dims else one for one in (drawn, rendered))
-    mean = (stack["signal"].mean("frame") - stack["dark_level"]).transpose(..., "gate")
-    error = ((drawn + rendered) ** 0.5).transpose(..., "gate")
-    return stack.drop_vars(["signal", "saturated"]).assign(gate_energy=mean, gate_energy_stderr=error)
+def _light_of_frames(frames: xr.Dataset) -> xr.Dataset:
+    """Return the mean of frames as a gate stack, whose errors are those of the noise and of the render [DN]."""
+    stack, rendered = as_stack(frames), frames["signal_mean_stderr"]
+    if "frame" in rendered.dims:  # of as many seas
+        rendered = (rendered**2).mean("frame") ** 0.5 / math.sqrt(frames.sizes["frame"])
+    return stack.assign(gate_energy_stderr=(stack["gate_energy_stderr"] ** 2 + rendered**2) ** 0.5)
 
 
 def _column(
@@ -208,8 +210,9 @@ def _column(
         return unknown, unknown
     # The sum of the pixels' columns from their surfaces on has this logarithm at time 0.
     gathered = np.log(np.sum(lines.beam_share * np.exp(-slope * (lines.surface_time - middles[0]))))
+    in_joules = stack["gate_energy"].attrs.get("units") != "DN"  # as of frames, whose level is no power
     open_s = 1e-9 * float(width[0]) * float(stack.attrs.get("pulses", 1))
-    level = math.exp(start + slope * middles[0] - gathered) / open_s if "signal_mean" not in stack else math.nan
+    level = math.exp(start + slope * middles[0] - gathered) / open_s if in_joules else math.nan
     return np.full(unknown.size, -0.5 * slope / geometry.metres_per_ns), lines.beam_share * level
 
 

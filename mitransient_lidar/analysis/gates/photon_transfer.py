@@ -1,0 +1,68 @@
+"""Photon transfer curve: variance against mean of frames, from which the gain and the read-out noise follow.
+
+J. R. Janesick, Photon Transfer (SPIE, 2007), doi:10.1117/3.725073.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, integer
+
+
+class PhotonTransfer(NamedTuple):
+    """Variance of frames against their mean at levels of light, and the line through them."""
+
+    mean: FloatArray  #: Mean of the pixels at each level, less their levels without light [DN], shape (level,).
+    variance: FloatArray  #: Mean variance over the frames [DN^2], shape (level,).
+    variance_stderr: FloatArray  #: Its standard error from the spread of the pixels [DN^2], shape (level,).
+    electrons_per_dn: float  #: Inverse slope: electrons per DN, with a gain over the gain times the excess noise.
+    electrons_per_dn_stderr: float  #: Its standard error.
+    dark_deviation: float  #: Root of the variance without light [DN]: read-out, rounding and dark events.
+    dark_deviation_stderr: float  #: Its standard error [DN].
+
+
+def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
+    """Return the photon transfer of frames of `analysis.receiver.detect_waveforms`, without saturated pixels.
+
+    Pixels are sorted into levels by the mean of the first half of the frames; means and variances are those of the
+    second half, without which the sorting would change them. The relation is a line where each pixel has its own light:
+    behind an intensifier, for light that changes little over its blur; of a photon counter, for few counts.
+
+    Parameters
+    ----------
+    recorded : xarray.Dataset
+        Frames, at least 4, with ``signal``, ``saturated`` and ``dark_level``.
+    levels : int
+        Number of levels, 2 to 1000, each with as many pixels and gates.
+
+    Raises
+    ------
+    UserError
+        If there are fewer frames, or fewer than 2 pixels and gates a level that are not saturated.
+    """
+    number, frames = integer("levels", levels, 2, 1000), recorded.sizes.get("frame", 0)
+    if frames < 4:
+        raise UserError(f"the dataset has {frames} frames, but photon transfer needs at least 4")
+    used = ~recorded["saturated"].any("frame").values
+    light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *recorded["snr"].dims)
+    values = light.values[:, used]
+    if values.shape[1] < 2 * number:
+        raise UserError(
+            f"levels = {number} needs {2 * number} pixels and gates that are not saturated, not {values.shape[1]}"
+        )
+    first, second = values[: frames // 2], values[frames // 2 :]
+    order = np.array_split(np.argsort(first.mean(axis=0)), number)
+    mean, variance = second.mean(axis=0), second.var(axis=0, ddof=1)
+    of_mean = np.array([mean[one].mean() for one in order])
+    of_variance = np.array([variance[one].mean() for one in order])
+    error = np.array([max(variance[one].std(ddof=1), 1e-9) / np.sqrt(one.size) for one in order])
+    line, covariance = np.polyfit(of_mean, of_variance, 1, w=1 / error, cov="unscaled")
+    slope_error, dark_error = np.sqrt(np.diag(covariance))
+    slope, dark = float(line[0]), float(np.sqrt(max(line[1], 0)))
+    at_dark = float(dark_error) / (2 * dark) if dark > 0 else np.inf
+    return PhotonTransfer(of_mean, of_variance, error, 1 / slope, float(slope_error) / slope**2, dark, at_dark)
