@@ -138,7 +138,8 @@ def detect(
         over ``frames`` (averaged numbers) and ``frames_needed``, and with `depths` ``detection_at_depth`` and
         ``frames_needed_at_depth``, all with limits; ``gate_detection`` and ``gate_deflection`` of a single gate as
         wide as some that adjoin, over ``adjoining`` (their number) and ``gate`` (`images.single_gates`). Digital
-        numbers x are filtered as sum(``filter_weight`` (x - ``background``)), 1 on average with the target.
+        numbers x are filtered as sum(``filter_weight`` (x - ``background``)), which is 1 on average with the target,
+        and with `frames` exceeds the attribute ``threshold`` by chance with the probability `pfa`.
 
     Raises
     ------
@@ -308,7 +309,9 @@ def _in_images(
     built = stack.drop_vars(["gate_energy", "gate_energy_stderr", "gate_light"]).assign(data)
     for name, units in (("background", "count"), ("difference", "count")):
         built[name].attrs["units"] = units
-    return label(built.assign_attrs({**stack.attrs, **attributes, "frames": frames}), "detection")
+    statistic = trial.products.statistic(frames)
+    attributes |= {"frames": frames, "threshold": math.inf if statistic is None else float(statistic.threshold(pfa))}
+    return label(built.assign_attrs({**stack.attrs, **attributes}), "detection")
 
 
 def _experiment(

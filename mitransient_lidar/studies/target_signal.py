@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
@@ -19,13 +18,13 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.describe import describe_scene
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.gate_stack import build_gates, check_train
+from mitransient_lidar.results.gate_stack import check_train
 from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.transport.paths.histogram import GateWeights
 from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.solids import shape_groups
 
@@ -179,8 +178,8 @@ def target_gates(
     Returns
     -------
     xarray.Dataset
-        ``gate_energy`` [J] over (row, column, gate) or (pixel, gate), with the target, its standard error, and
-        ``gate_light`` over ``kind`` (with, without), ``half`` (odd and even passes) and these.
+        A gate stack of the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
+        without), ``half`` (of the passes), and its dimensions.
 
     Raises
     ------
@@ -193,31 +192,25 @@ def target_gates(
         raise UserError(
             f"scene {session.name} has no gates, which a camera needs: give its film gate_width_ns and gate_start_depth"
         )
-    train = lidar.gate_train(lidar.gates)
+    train, window = lidar.gate_train(lidar.gates), ErrorWindow.of_probe(renderers[0].probe)
     check_train(train, {}, lidar.axis)
-    response = train.response_weights(lidar.transmitter.pulse, lidar.receiver.optics.response_time_ns)
-    weights, pixels = GateWeights(train, response, lidar.reference_length), lidar.receiver.pixels
-    sums = np.zeros((2, 2, pixels.count, train.count))
-    statistics = PassStatistics()
+    halves = [[PassAccumulator(lidar, window, train, kept="direct") for _ in renderers] for _ in range(2)]
 
     def render_pass(number: int, seed: int) -> float:
-        received = [renderer.render_pass(seed, gates=weights) for renderer in renderers]
-        energy = np.array([one.histogram.energy().reshape(sums.shape[2:]) for one in received])
-        sums[:, number % 2] += energy
-        statistics.add(energy[0])
-        return received[0].edge_loss
+        for gates, renderer in zip(halves[number % 2], renderers, strict=True):
+            received = renderer.render_pass(seed, gates=gates.gate_weights)
+            gates.add(received.histogram)
+        return received.edge_loss
 
     log = run_passes(render_pass, Goal(passes=passes), seed=seed, smallest=_GROUPS, progress=progress)
-    warn_of_edge_loss(log.edge_loss_share(float(sums[0].sum())))
-    done = statistics.count
-    coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
-    probe = renderers[0].probe
-    geometry = describe_scene(probe, ErrorWindow.of_probe(probe), renderers[0].focusing)
-    attributes = session.attributes(lidar, chosen, target=target_id, **log.attributes(seed), **geometry)
-    stack = build_gates(statistics.mean, statistics.stderr, train, coords=coords, attributes=attributes)
-    sums /= np.array([(done + 1) // 2, done // 2])[:, None, None]
-    light = sums.reshape(2, 2, *stack["gate_energy"].shape).astype(np.float32)
-    return stack.assign(gate_light=(("kind", "half", *stack["gate_energy"].dims), light))
+    warn_of_edge_loss(log.edge_loss_share(sum(one[1].received for one in halves)))
+    geometry = describe_scene(renderers[0].probe, window, renderers[0].focusing)
+    stack = halves[0][0].dataset(
+        session.attributes(lidar, chosen, target=target_id, **log.attributes(seed), **geometry)
+    )
+    energy = stack["gate_energy"]
+    light = [[half[kind].gates.mean.reshape(energy.shape) for half in halves] for kind in (0, 1)]
+    return stack.assign(gate_light=(("kind", "half", *energy.dims), np.array(light, np.float32)))
 
 
 def _pair(
