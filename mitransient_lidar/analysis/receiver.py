@@ -20,6 +20,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, inte
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import (
+    CAMERAS,
     Channel,
     ReceiverChannels,
     Setting,
@@ -124,9 +125,9 @@ def detect_waveforms(
         Of a camera ``signal`` and ``saturated`` are over (frame, row, column, gate) or (frame, pixel, gate), for a
         stack over ``frame`` all of its first frame first, as integers [DN] with the fixed pattern of `Camera.pattern`.
         The closed forms are over the same dimensions, without frame unless the stack has it, and those of each pixel
-        with its pattern; ``signal_mean_stderr`` is by ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean
-        without light. A mean over ``frame`` averages. The coordinates are those of the gate stack. See
-        `analysis.gates.recording.record_gates` for the jitter of gates.
+        with its pattern; ``snr`` is NaN where most frames saturate, ``signal_mean_stderr`` is by
+        ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean without light. A mean over ``frame`` averages. The
+        coordinates are those of the gate stack. See `analysis.gates.recording.record_gates` for the jitter of gates.
 
     Raises
     ------
@@ -170,7 +171,11 @@ def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:
                 f"chain = {found.name!r} is a camera, but the dataset has no gates: cut them with gates first"
             )
         return found
-    return None if "waveform" in dataset else camera_of(found or "apd")
+    if "waveform" in dataset:
+        return None
+    if found is None:
+        raise UserError(f"the dataset has gates alone, which need a camera: {', '.join(CAMERAS)}, or a .toml file")
+    return _named("chain", lambda: camera_of(found))
 
 
 class PixelChain(NamedTuple):

@@ -13,6 +13,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 
+_SATURATION = 1e-6  # largest probability of a saturated frame
+
 
 class PhotonTransfer(NamedTuple):
     """Variance of frames against their mean at levels of light, and the line through them."""
@@ -36,7 +38,7 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     Parameters
     ----------
     recorded : xarray.Dataset
-        Frames, at least 4, with ``signal``, ``saturated`` and ``dark_level``.
+        Frames, at least 4, with ``signal``, ``saturation`` and ``dark_level``.
     levels : int
         Number of levels, 2 to 1000, each with as many pixels and gates.
 
@@ -48,21 +50,25 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     number, frames = integer("levels", levels, 2, 1000), recorded.sizes.get("frame", 0)
     if frames < 4:
         raise UserError(f"the dataset has {frames} frames, but photon transfer needs at least 4")
-    used = ~recorded["saturated"].any("frame").values
-    light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *recorded["snr"].dims)
-    values = light.values[:, used]
-    if values.shape[1] < 2 * number:
-        raise UserError(
-            f"levels = {number} needs {2 * number} pixels and gates that are not saturated, not {values.shape[1]}"
-        )
-    first, second = values[: frames // 2], values[frames // 2 :]
+    # Those that may saturate would lose their highest frames.
+    saturates = recorded["saturation"].max([dim for dim in recorded["saturation"].dims if dim == "frame"])
+    used = (saturates < _SATURATION).values
+    light = (recorded["signal"].astype(np.float64) - recorded["dark_level"]).transpose("frame", *saturates.dims)
+    if (count := int(used.sum())) < 2 * number:
+        raise UserError(f"levels = {number} needs {2 * number} pixels and gates that do not saturate, not {count}")
+    first, second = np.split(light.values[:, used], [frames // 2])
     order = np.array_split(np.argsort(first.mean(axis=0)), number)
     mean, variance = second.mean(axis=0), second.var(axis=0, ddof=1)
-    of_mean = np.array([mean[one].mean() for one in order])
-    of_variance = np.array([variance[one].mean() for one in order])
-    error = np.array([max(variance[one].std(ddof=1), 1e-9) / np.sqrt(one.size) for one in order])
-    line, covariance = np.polyfit(of_mean, of_variance, 1, w=1 / error, cov="unscaled")
+    level, spread, error, size = np.array(
+        [(mean[one].mean(), variance[one].mean(), variance[one].std(ddof=1) / one.size**0.5, one.size) for one in order]
+    ).T
+    # An error of the mean moves a level along the line.
+    slope = (spread[-1] - spread[0]) / max(level[-1] - level[0], 1e-9)
+    weights = 1 / np.maximum(np.hypot(error, slope * np.sqrt(spread / (len(second) * size))), 1e-9)
+    line, covariance = np.polyfit(level, spread, 1, w=weights, cov="unscaled")
     slope_error, dark_error = np.sqrt(np.diag(covariance))
-    slope, dark = float(line[0]), float(np.sqrt(max(line[1], 0)))
-    at_dark = float(dark_error) / (2 * dark) if dark > 0 else np.inf
-    return PhotonTransfer(of_mean, of_variance, error, 1 / slope, float(slope_error) / slope**2, dark, at_dark)
+    dark = float(np.sqrt(max(line[1], 0)))
+    inverse, its_error = 1 / float(line[0]), float(slope_error / line[0] ** 2)
+    return PhotonTransfer(
+        level, spread, error, inverse, its_error, dark, float(dark_error) / (2 * dark) if dark else np.inf
+    )

@@ -30,185 +30,151 @@ _MOMENTS = ("signal_mean", "signal_deviation", "snr", "saturation", "signal_mean
 def record_gates(
     dataset: xr.Dataset, camera: Camera, frames: int, seed: int, background_power: Any, settings: tuple[Any, Any]
 ) -> xr.Dataset:
-    """Return the frames of a camera for a gate stack.
+    """Return the frames of a camera for a gate stack, of one sea or with one for each ``frame``.
 
     The arguments are those of `analysis.receiver.detect_waveforms`, with gain and optical density as settings.
-    """
-    names = ("gain", "optical_density")
-    for name, value in zip(names, settings, strict=True):
-        if value == "auto":
-            raise UserError(f"{name} = 'auto' needs a receiver of waveforms: give a number for a camera")
-    factor, density = (float(usual if one is None else one) for one, usual in zip(settings, (1, 0), strict=True))
-    check_stack(dataset)
-    first = dataset["gate_energy"].isel(gate=0).isel(frame=0, missing_dims="ignore")
-    sky = powers_of(first, background_power, tuple(str(dim) for dim in first.dims))
-    used = camera if factor == 1 else replace(camera, gain=camera.gain * factor)
-    dimmed = dataset.assign({name: one * 10**-density for name, one in dataset.items() if name in _DIMMED})
-    recorded = _recorded(dimmed, used, frames, seed, sky * 10**-density)
-    own = {"noise_seed": int(seed), "receiver": camera.name, **dict(zip(names, (factor, density), strict=True))}
-    recorded.attrs |= own | dict(parameters_of("receiver", used))
-    return recorded
-
-
-def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: FloatArray) -> xr.Dataset:
-    """Return frames of a gate stack; see `record_gates`.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack, of one sea or with one for each ``frame``, and waveforms if it has them.
-    camera : Camera
-        The camera.
-    frames : int
-        Frames of each gate and sea.
-    seed : int
-        Seed of the noise.
-    sky : ndarray
-        Power of the daylight on each pixel [W], a number or over the pixels.
 
     Notes
     -----
     The jitter of the gates needs the energy at shifted gates: that of the waveforms of the same dataset, or else of
     the gates before and after one if they follow within the longer of the pulse and the gate's edges. With neither, it
-    is left out, and a warning says so. The standard errors of the mean are as if those of all pixels had one sign.
+    is left out, and a warning says so. The mean of a stack that was rendered with jitter has it already. The standard
+    errors of the mean are as if those of all pixels had one sign.
     """
-    energy, error = (dataset[name].transpose(..., "gate") for name in ("gate_energy", "gate_energy_stderr"))
-    lowest = float(energy.min())
-    if not np.isfinite(lowest) or lowest < 0 or not np.isfinite(float(energy.max())):
-        raise UserError(f"gate_energy holds {lowest:g} J; the energy of a gate must be finite and not negative")
-    seas = dataset.sizes["frame"] if "frame" in energy.dims else 1
-    energy, error = (one.transpose("frame", ..., missing_dims="ignore") for one in (energy, error))
-    dims = tuple(str(dim) for dim in energy.dims if dim != "frame")
-    shape = tuple(dataset.sizes[dim] for dim in dims)
-    _warn(dataset, camera, dims)
+    if "auto" in settings:
+        name = ("gain", "optical_density")[settings.index("auto")]
+        raise UserError(f"{name} = 'auto' needs a receiver of waveforms: give a number for a camera")
+    factor, density = (float(usual if one is None else one) for one, usual in zip(settings, (1, 0), strict=True))
+    first = check_stack(dataset.isel(frame=0, missing_dims="ignore"))["gate_energy"].isel(gate=0)
+    sky = powers_of(first, background_power, tuple(str(dim) for dim in first.dims))
+    _warn(dataset, camera)
+    jitter = float(np.hypot(camera.gate_jitter_ns, float(dataset.attrs.get("gate_jitter_ns", 0))))
+    used = replace(camera, gate_jitter_ns=jitter)
+    used = used if factor == 1 else replace(used, gain=camera.gain * factor)
+    dimmed = dataset.assign({name: one * 10**-density for name, one in dataset.items() if name in _DIMMED})
+    recorded = _recorded(dimmed, used, frames, seed, sky * 10**-density)
+    recorded.attrs |= {
+        **made_from(dataset.attrs, "Frames of a gated camera", "recorded"),
+        **{"noise_seed": int(seed), "receiver": camera.name, "gain": factor, "optical_density": density},
+        "background_power_w": float(sky) if sky.ndim == 0 else float(sky.mean()),
+        **dict(parameters_of("receiver", used)),
+    }
+    return recorded
+
+
+def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: FloatArray) -> xr.Dataset:
+    """Return frames of a gate stack for the power of the daylight on each pixel [W]."""
+    energy = dataset["gate_energy"]
+    if not (np.isfinite(energy) & (energy >= 0)).all():
+        raise UserError(f"gate_energy holds {float(energy.min()):g} J; it must be finite and not negative")
+    own = ("frame",) if "frame" in energy.dims else ()
+    dims = ("row", "column", "gate") if "row" in energy.dims else ("pixel", "gate")
+    seas, shape = dataset.sizes["frame"] if own else 1, tuple(dataset.sizes[dim] for dim in dims)
     number, size = seas * frames, int(np.prod(shape))
     require_memory(f"{number} frames of {size} pixels and gates", size * (4 * number + 24 * seas + 32), "take fewer")
-    opened, pulses = _open_ns(dataset), int(dataset.attrs.get("pulses", 1))
+    lights, errors = (
+        dataset[name].transpose(*own, *dims).values.reshape(seas, *shape)
+        for name in ("gate_energy", "gate_energy_stderr")
+    )
+    gate, pattern = _shape(dataset), camera.pattern(shape[:-1])
+    opened = float(gate.open_time(gate.span_ns[1]))
+    known: dict[str, Any] = {"background": sky, "pulses": int(dataset.attrs.get("pulses", 1)), "pattern": pattern}
+    nothing = np.zeros((*shape[:-1], 1))
+    unlit = camera.expected(nothing, opened, **known).mean
+    dark = camera.expected(nothing, opened, **{**known, "background": 0.0}).mean
     signal = np.empty((number, *shape), np.uint16 if camera.bits <= 16 else np.uint32)
     saturated = np.empty(signal.shape, np.bool_)
-    moments = {name: np.empty((seas, *shape), np.float32) for name in _MOMENTS}
-    pattern = camera.pattern(shape[:-1])
-    known: dict[str, Any] = {"background": sky, "pulses": pulses, "pattern": pattern}
-    dark = camera.expected(np.zeros((*shape[:-1], 1)), opened, pulses=pulses, pattern=pattern).mean
-    step = max(_BLOCK // (size // shape[-1]), 1)
+    moments = np.empty((len(_MOMENTS), seas, *shape), np.float32)
+    step = max(_BLOCK * shape[-1] // size, 1)
     for sea in range(seas):
-        light, stderr = (np.reshape(one.values, (seas, *shape))[sea] for one in (energy, error))
-        light, slope = _jittered(dataset, camera, light)
-        for block, start in enumerate(range(0, shape[-1], step)):
+        light, slope = _jittered(dataset, camera, lights[sea])
+        for start in range(0, shape[-1], step):
             part = (..., slice(start, start + step))
             known["slope"] = None if slope is None else slope[part]
             expected = camera.expected(light[part], opened, **known)
-            shifted = camera.expected(light[part] + np.nan_to_num(stderr[part]), opened, **known).mean
+            shifted = camera.expected(light[part] + np.nan_to_num(errors[sea][part]), opened, **known).mean
             deviation = np.sqrt(expected.variance)
-            snr = np.divide(expected.mean - dark, deviation, out=np.zeros_like(dark + deviation), where=deviation > 0)
-            for name, one in zip(
-                _MOMENTS, (expected.mean, deviation, snr, expected.saturation, shifted - expected.mean), strict=True
-            ):
-                moments[name][sea][part] = one
-            drawn = camera.sample(light[part], opened, frames, (seed, sea, block), **known)
-            own = (slice(sea * frames, (sea + 1) * frames), *part)
-            signal[own], saturated[own] = drawn
-    over = dims if "frame" not in energy.dims else ("frame", *dims)
+            snr = np.divide(expected.mean - unlit, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+            snr[expected.saturation > 0.5] = np.nan
+            moments[:, sea][part] = expected.mean, deviation, snr, expected.saturation, shifted - expected.mean
+            mine = slice(sea * frames, (sea + 1) * frames), *part
+            signal[mine], saturated[mine] = camera.sample(light[part], opened, frames, (seed, sea, start), **known)
     values: dict[str, Any] = {"signal": (("frame", *dims), signal), "saturated": (("frame", *dims), saturated)}
-    for name, one in moments.items():
-        values[name] = (over, np.repeat(one, frames, axis=0) if "frame" in over else one[0])
+    for name, one in zip(_MOMENTS, moments, strict=True):
+        values[name] = ((*own, *dims), np.repeat(one, frames, axis=0) if own else one[0])
     values["dark_level"] = (dims[:-1], dark[..., 0].astype(np.float32))
-    coords = {name: one for name, one in dataset.coords.items() if {"frame", *dims}.issuperset(one.dims)}
-    if "frame" in over:
-        places = np.repeat(np.arange(seas), frames)
-        coords = {name: one.isel(frame=places, missing_dims="ignore") for name, one in coords.items()}
-    attributes = {
-        **dataset.attrs,
-        **made_from(dataset.attrs, "Frames of a gated camera", "recorded"),
-        "frames": number,
-        "background_power_w": np.ravel(sky).tolist() if sky.ndim and sky.size <= 100 else float(sky.mean()),
-    }
+    coords = {name: one for name, one in dataset.coords.items() if {*own, *dims}.issuperset(one.dims)}
+    if own:
+        each = np.repeat(np.arange(seas), frames)
+        coords = {name: one.isel(frame=each, missing_dims="ignore") for name, one in coords.items()}
+    coords |= {"frame": np.arange(number)}
     counts = dict.fromkeys(("signal", "signal_mean", "signal_deviation", "dark_level"), "count")
-    return label(xr.Dataset(values, {**coords, "frame": np.arange(number)}, attributes), "frames", **counts)
+    return label(xr.Dataset(values, coords, {**dataset.attrs, "frames": number}), "frames", **counts)
 
 
 def describe_frames(recorded: xr.Dataset) -> list[str]:
     """Return lines on frames of `record_gates`: their number, signal-to-noise ratio, and saturation."""
-    attributes, gates = recorded.attrs, recorded["snr"].dims[:-1]
-    mean, share = recorded["snr"].mean(gates), recorded["saturated"].mean(("frame", *gates))
-    best = int(np.argmax(mean.values))
-    lines = [
-        f"{recorded.sizes['frame']} frames of {recorded.sizes['gate']} gates, camera {attributes.get('receiver')}, "
-        f"{attributes.get('pulses', 1)} pulses a frame",
-        f"largest mean signal-to-noise ratio of a pixel and frame: {float(mean[best]):.3g} in gate {best}",
-    ]
-    if not share.any():
-        return [*lines, "no pixel is saturated"]
-    worst = int(np.argmax(share.values))
+    pulses, gates = recorded.attrs.get("pulses", 1), recorded["signal"].dims[1:-1]
+    mean = recorded["snr"].mean([dim for dim in recorded["snr"].dims if dim != "gate"]).fillna(0).values
+    share = recorded["saturated"].mean(("frame", *gates)).values
+    best, worst = int(np.argmax(mean)), int(np.argmax(share))
     return [
-        *lines,
-        f"saturated in gate {worst}: {100 * float(share[worst]):.3g} % of the pixels, the most of all gates",
+        f"{recorded.sizes['frame']} frames of {recorded.sizes['gate']} gates, "
+        f"camera {recorded.attrs.get('receiver')}, pulses a frame: {pulses}",
+        f"largest mean signal-to-noise ratio of a pixel and frame: {mean[best]:.3g} in gate {best}",
+        f"saturated in gate {worst}: {100 * share[worst]:.3g} % of the pixels, the most of all gates"
+        if share.any()
+        else "no pixel is saturated",
     ]
 
 
-def _open_ns(dataset: xr.Dataset) -> float:
-    """Return the integral of the transmission of each gate [ns]."""
-    shape = _shape(dataset.attrs)
-    return float(dataset["gate_width"][0]) if shape is None else float(shape.open_time(np.inf))
-
-
-def _shape(attributes: Mapping[Any, Any]) -> GateShape | None:
-    """Return the measured shape of the gates, or None for edges, whose integral is the width."""
-    if "gate_profile" not in attributes:
-        return None
-    return GateShape.sampled(attributes["gate_profile_ns"], attributes["gate_profile"])
+def _shape(dataset: xr.Dataset) -> GateShape:
+    """Return the shape of the gates of a stack."""
+    attributes = dataset.attrs
+    if "gate_profile" in attributes:
+        return GateShape.sampled(attributes["gate_profile_ns"], attributes["gate_profile"])
+    edges = (float(attributes.get(name, 0)) for name in ("gate_rise_ns", "gate_fall_ns"))
+    return GateShape.edges(float(dataset["gate_width"][0]), *edges)
 
 
 def _jittered(dataset: xr.Dataset, camera: Camera, energy: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-    """Return the mean energy over the jitter of the gates [J], and its derivative with their time [J/ns] or None.
-
-    The energy is of second order in the jitter.
-    """
+    """Return the mean energy over the jitter of the gates [J], and its derivative with their time [J/ns] or None."""
     jitter, attributes = camera.gate_jitter_ns, dataset.attrs
     if jitter == 0:
         return energy, None
+    step = float(attributes.get("gate_step_ns", np.inf))
+    shape = _shape(dataset)
+    longest = max(float(attributes.get("pulse_fwhm_ns", 0)), shape.rise_ns, shape.fall_ns)
     if "waveform" in dataset and "frame" not in dataset.dims:
-        shape, width = _shape(attributes), float(dataset["gate_width"][0])
-        edges = float(attributes.get("gate_rise_ns", 0)), float(attributes.get("gate_fall_ns", 0))
-        rest = float(attributes.get("gate_step_ns", width)), dataset.sizes["gate"]
-        early, late = (
-            cut_gates(
-                dataset.drop_dims("gate"),
-                GateTrain(
-                    float(dataset["gate_start"][0]) + shift, width, *rest, *edges, int(attributes["pulses"]), shape
-                ),
-            )["gate_energy"].values
+        apart, start, pulses = jitter, float(dataset["gate_start"][0]), int(attributes.get("pulses", 1))
+        train = GateTrain.measured(shape, start, step, energy.shape[-1], pulses)
+        before, after = (
+            cut_gates(dataset.drop_dims("gate"), replace(train, start_ns=start + shift))["gate_energy"].values
             for shift in (-jitter, jitter)
         )
-        return 0.5 * (early + late), (late - early) / (2 * jitter)
-    step = float(attributes.get("gate_step_ns", np.inf))
-    scale = max(float(attributes.get(name, 0)) for name in ("pulse_fwhm_ns", "gate_rise_ns", "gate_fall_ns"))
-    if energy.shape[-1] < 2 or step > scale:
-        _LOG.warning(
-            "the gate jitter of %g ns is left out: it needs waveforms, or gates that follow within %g ns", jitter, scale
-        )
+    elif energy.shape[-1] > 1 and step <= longest:
+        apart = step
+        # Beyond the ends the energy is taken as a straight line.
+        first, last = (2 * energy[..., [end]] - energy[..., [beside]] for end, beside in ((0, 1), (-1, -2)))
+        before, after = np.concatenate([first, energy[..., :-1]], -1), np.concatenate([energy[..., 1:], last], -1)
+    else:
+        text = "the gate jitter of %g ns is left out: it needs waveforms, or gates that follow within %g ns"
+        _LOG.warning(text, jitter, longest)
         return energy, None
-    # Beyond the ends the energy is taken as a straight line.
-    ends = np.concatenate(
-        [2 * energy[..., :1] - energy[..., 1:2], energy, 2 * energy[..., -1:] - energy[..., -2:-1]], axis=-1
-    )
-    before, after = ends[..., :-2], ends[..., 2:]
-    mean = energy + 0.5 * (jitter / step) ** 2 * (before + after - 2 * energy)
-    return np.maximum(mean, 0), (after - before) / (2 * step)
+    variance = jitter**2 - float(attributes.get("gate_jitter_ns", 0)) ** 2
+    mean = energy + 0.5 * variance / apart**2 * (before + after - 2 * energy)
+    return np.maximum(mean, 0), (after - before) / (2 * apart)
 
 
-def _warn(dataset: xr.Dataset, camera: Camera, dims: tuple[str, ...]) -> None:
+def _warn(dataset: xr.Dataset, camera: Camera) -> None:
     """Warn of gates that the camera does not open, and of blur that is left out."""
     start, width = float(dataset["gate_start"].min()), float(dataset["gate_width"].min())
     if start < camera.insertion_delay_ns:
-        _LOG.warning(
-            "the first gate opens at %g ns, before the insertion delay of %g ns", start, camera.insertion_delay_ns
-        )
+        text = "the first gate opens at %g ns, before the insertion delay of %g ns"
+        _LOG.warning(text, start, camera.insertion_delay_ns)
     if width < camera.shortest_gate_ns:
-        _LOG.warning(
-            "the gates of %g ns are shorter than the camera's, of at least %g ns", width, camera.shortest_gate_ns
-        )
-    if "pixel" in dims and min(camera.optics_mtf, camera.intensifier_mtf) < 1:
+        _LOG.warning("the gates of %g ns are shorter than those of the camera, %g ns", width, camera.shortest_gate_ns)
+    if "row" not in dataset.dims and min(camera.optics_mtf, camera.intensifier_mtf) < 1:
         _LOG.warning("the blur of optics and intensifier is left out: the pixels are no image")
 
 

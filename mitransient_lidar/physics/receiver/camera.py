@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Values = npt.ArrayLike
 
-_TAIL = 1e-9  # of a kernel, left out at its ends
+_TAIL = 1e-6  # of a kernel, left out at its ends
 _LEAST_SKEWNESS = 1e-3  # of a clipped distribution, against cancellation
 _FAR = 12.0  # deviations from a limit beyond which nothing is clipped
 _OFFSET = 4.0  # least offset in deviations of the read-out
@@ -58,6 +58,9 @@ class Pattern(NamedTuple):
     dark: FloatArray  #: Dark current over that of most pixels [1].
 
 
+_ALIKE = Pattern(np.ones(1), np.zeros(1), np.ones(1))
+
+
 class Noise(NamedTuple):
     """Parts of the noise: the covariance of pixels is B diag(shared) B + diag(own), with B of `Camera.spread`."""
 
@@ -71,69 +74,41 @@ class Camera(Plan):
 
     Notes
     -----
-    The response of pixels to steady light is in closed form: mean and variance are exact below saturation; a limit cuts
-    a Pearson distribution of type III with the mean, variance and skewness of the charge. Of full well and converter,
-    the higher limit is left out. Blur is the discrete Gaussian of T. Lindeberg, IEEE Trans. PAMI 12, 234 (1990),
-    doi:10.1109/34.49051, with the MTF exp(-t (1 - cos 2 pi f)) at f cycles per pixel; images are mirrored at their
-    edges, which keeps the sum. The gate is that of the light: a photon counter is gated itself, and an
-    electron-multiplying CCD needs a shutter before it. The afterglow of phosphors and the crosstalk and afterpulses of
-    counters are left out.
+    Mean and variance are exact below saturation; a limit cuts a Pearson distribution of type III with the mean,
+    variance and skewness of the charge. Of full well and converter, the higher limit is left out. Blur is the discrete
+    Gaussian of T. Lindeberg, IEEE Trans. PAMI 12, 234 (1990), doi:10.1109/34.49051, with the MTF exp(-t (1 - cos 2 pi
+    f)) along each axis at f cycles per pixel; images are mirrored at their edges, which keeps the sum. Intensifiers and
+    electron bombardment multiply before the chip. An electron-multiplying CCD needs a shutter before it, and multiplies
+    its dark current. The afterglow of phosphors and the crosstalk and afterpulses of counters are left out.
     """
 
     kind: Annotated[
         Literal["intensified", "electron_multiplying", "counting", "direct"],
-        Option(
-            "Place of the gain: before the chip (image intensifier, electron bombardment), in its register behind the "
-            "dark current, in pixels that count at most one event per exposure, or none"
-        ),
+        Option("Place of the gain: before the chip, in its register, in pixels that count, or none"),
     ]
-    quantum_efficiency: Annotated[
-        float, Option("Events per photon, of a cathode or chip with all windows and fill factors", 0, 1, above=True)
-    ]
+    quantum_efficiency: Annotated[float, Option("Events per photon, with windows and fill factors", 0, 1, above=True)]
     gain: Annotated[float, Option("Mean electrons on the chip per event", 1)] = 1.0
     excess_noise: Annotated[float, Option("Mean square of these electrons over the square of their mean", 1)] = 1.0
-    open_dark_hz: Annotated[
-        float,
-        Option("Dark events per pixel while the gate is open: equivalent background or dark counts", 0, unit="1/s"),
-    ] = 0.0
-    frame_dark: Annotated[
-        float, Option("Dark events per pixel and frame, multiplied, as of the clocks of a register", 0)
-    ] = 0.0
-    dark_current_hz: Annotated[
-        float, Option("Dark current of the chip per pixel, during the frame", 0, unit="electrons/s")
-    ] = 0.0
+    open_dark_hz: Annotated[float, Option("Dark events per pixel while the gate is open", 0, unit="1/s")] = 0.0
+    frame_dark: Annotated[float, Option("Dark events per pixel and frame before the gain", 0)] = 0.0
+    dark_current_hz: Annotated[float, Option("Dark current of a pixel of the chip", 0, unit="electrons/s")] = 0.0
     frame_time_ms: Annotated[float, Option("Exposure of the chip for a frame", 0, unit="ms")] = 0.0
-    leakage: Annotated[
-        float, Option("Share of the daylight that is recorded while the gate is closed, during the frame", 0, 1)
-    ] = 0.0
-    pulses_per_exposure: Annotated[
-        int, Option("Pulses during which a pixel that counts has at most one count", 1, 10**9)
-    ] = 1
+    leakage: Annotated[float, Option("Share of the daylight recorded during the frame with closed gate", 0, 1)] = 0.0
+    pulses_per_exposure: Annotated[int, Option("Pulses in which a pixel counts at most one event", 1, 10**9)] = 1
     read_noise: Annotated[float, Option("Standard deviation of the read-out", 0, unit="electrons")] = 0.0
-    full_well: Annotated[
-        float, positive_option("Largest charge of a pixel, or of the register behind the gain", "electrons")
-    ] = np.inf
+    full_well: Annotated[float, positive_option("Largest charge of a pixel or register", "electrons")] = np.inf
     bits: Annotated[int, Option("Resolution of the converter, or size of the counter", 1, 24)] = 16
     electrons_per_dn: Annotated[float, positive_option("Charge per digital number", "electrons")] = 1.0
-    offset_dn: Annotated[
-        float, Option("Digital number without charge, at least 4 standard deviations of the read-out", 0, unit="DN")
-    ] = 0.0
+    offset_dn: Annotated[float, Option("Digital number without charge, at least 4 read-out noises", 0, unit="DN")] = 0.0
     response_spread: Annotated[float, Option("Standard deviation of the pixels' response over its mean", 0, 1)] = 0.0
     offset_spread_dn: Annotated[float, Option("Standard deviation of the pixels' offset", 0, unit="DN")] = 0.0
     hot_pixels: Annotated[float, Option("Share of hot pixels", 0, 1)] = 0.0
-    hot_factor: Annotated[float, Option("Dark current, or dark counts, of a hot pixel over those of others", 1)] = 1.0
+    hot_factor: Annotated[float, Option("Dark current or dark counts of a hot pixel over those of others", 1)] = 1.0
     pattern_seed: Annotated[int, Option("Seed of the fixed pattern: one for each camera", 0, 2**53)] = 0
-    optics_mtf: Annotated[
-        float, Option("MTF of the optics before the detector at half a cycle per pixel", 0, 1, above=True)
-    ] = 1.0
-    intensifier_mtf: Annotated[
-        float,
-        Option("MTF of the intensifier behind its gain at half a cycle per pixel, 1 for no blur", 0, 1, above=True),
-    ] = 1.0
+    optics_mtf: Annotated[float, Option("MTF of the optics at half a cycle per pixel", 0, 1, above=True)] = 1.0
+    intensifier_mtf: Annotated[float, Option("The same of the intensifier, behind its gain", 0, 1, above=True)] = 1.0
     gate_jitter_ns: Annotated[float, Option("Standard deviation of the gate's time in a pulse", 0, unit="ns")] = 0.0
-    insertion_delay_ns: Annotated[
-        float, Option("Earliest gate after the pulse, by the delay of its generator", 0, unit="ns")
-    ] = 0.0
+    insertion_delay_ns: Annotated[float, Option("Earliest gate after the pulse", 0, unit="ns")] = 0.0
     shortest_gate_ns: Annotated[float, Option("Width of the shortest gate", 0, unit="ns")] = 0.0
     wavelength_nm: Annotated[float, positive_option("Vacuum wavelength of the light", "nm")] = 532.0
     source: Annotated[str, Option("Sources of the numbers, and which of them are assumed", form="a text")] = ""
@@ -166,7 +141,7 @@ class Camera(Plan):
         return Pattern(response, offset, np.where(random.random(pixels) < self.hot_pixels, self.hot_factor, 1.0))
 
     def events(
-        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern = _ALIKE
     ) -> FloatArray:
         """Return the mean events of each pixel and gate, with dark events.
 
@@ -181,23 +156,18 @@ class Camera(Plan):
         pulses : int
             Pulses of a frame.
         pattern : Pattern, optional
-            Fixed pattern; without one, all pixels are alike.
+            Fixed pattern; by default all pixels are alike.
         """
-        light, opened = non_negative_array("energy", energy), self._opened(open_ns, pulses)
+        light, sky = non_negative_array("energy", energy), non_negative_array("background", background)
         if light.ndim not in (2, 3):
             raise UserError(f"energy of shape {light.shape} must have the axes (row, column, gate) or (pixel, gate)")
-        sky = non_negative_array("background", background)
         if sky.shape not in ((), light.shape[:-1]):
             raise UserError(f"background of shape {sky.shape} must be a number or have the shape {light.shape[:-1]}")
+        opened = 1e-9 * integer("pulses", pulses, 1, 10**9) * non_negative_array("open_ns", open_ns)
         light += (sky[..., np.newaxis] if sky.ndim else sky) * (opened + 1e-3 * self.leakage * self.frame_time_ms)
-        found = self._signal_events(light)
-        hot: FloatArray | float = 1.0
-        if pattern is not None:
-            found, hot = found * pattern.response[..., np.newaxis], pattern.dark[..., np.newaxis]
-        found = found + self.frame_dark + self.open_dark_hz * opened * (hot if self.kind == "counting" else 1.0)
-        if self.kind == "electron_multiplying":
-            found = found + 1e-3 * self.dark_current_hz * self.frame_time_ms * hot
-        return np.asarray(found)
+        hot, dark = pattern.dark[..., np.newaxis], self.open_dark_hz * opened
+        found = self._signal_events(light, pattern) + self.frame_dark + (hot if self.kind == "counting" else 1) * dark
+        return np.asarray(found + (self._dark(pattern) if self.kind == "electron_multiplying" else 0))
 
     def expected(
         self,
@@ -205,7 +175,7 @@ class Camera(Plan):
         open_ns: Values,
         background: Values = 0.0,
         pulses: int = 1,
-        pattern: Pattern | None = None,
+        pattern: Pattern = _ALIKE,
         slope: Values | None = None,
     ) -> Expected:
         """Return mean [DN] and variance [DN^2] of a frame and its probability of saturation, in the shape of `energy`.
@@ -213,14 +183,21 @@ class Camera(Plan):
         Parameters are those of `events`; `slope` is the derivative of the energy with respect to the gate's time
         [J/ns], of the same shape: without it, `gate_jitter_ns` has no effect.
         """
+        from scipy.special import bdtrc
+
         events = self.events(energy, open_ns, background, pulses, pattern)
         mean, variance, third = self._charge(events, pulses, pattern)
         if slope is not None:
-            variance = variance + (self._charge_slope(slope, events, pulses) * self._jitter_ns(pulses)) ** 2
+            steep = self._signal_events(np.asarray(slope, np.float64), pattern) * self.gate_jitter_ns
+            if self.kind == "counting":
+                steep = steep * np.exp(-events / self._exposures(pulses))
+            variance = variance + (self.gain * self.spread(steep)) ** 2 / pulses
         if self.kind == "counting":  # whose codes are counts, without rounding
-            return self._expected_counts(events, pulses, mean, variance, third)
-        offset = self._offset(pattern)
-        scale, read = self.electrons_per_dn, self.read_noise**2
+            most = self._exposures(pulses)
+            clipped = _clipped(mean, variance, third, self.top_dn if most > self.top_dn else np.inf, np.inf)
+            full = bdtrc(min(self.top_dn, most) - 1, most, -np.expm1(-events / most))
+            return Expected(clipped.mean, clipped.variance, np.asarray(full))
+        offset, scale, read = self._offset(pattern), self.electrons_per_dn, self.read_noise**2
         top = (self.top_dn - offset) * scale
         is_well = np.broadcast_to(top > self.full_well, mean.shape)  # before the read-out, whose noise stays
         limit = np.where(is_well, self.full_well, top)
@@ -230,22 +207,21 @@ class Camera(Plan):
         return Expected(offset + clipped.mean / scale, clipped.variance / scale**2 + rest, clipped.saturation)
 
     def noise(
-        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern | None = None
+        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern = _ALIKE
     ) -> Noise:
         """Return the parts of the noise without saturation and jitter; parameters are those of `events`."""
         events = self.events(energy, open_ns, background, pulses, pattern)
         variance = self._charge(events, pulses, pattern)[1] + self.read_noise**2
         shared = np.zeros_like(events)
-        if self.intensifier_mtf < 1 and events.ndim == 3:
+        if self.intensifier_mtf < 1:
             shared = (self.gain**2 * self.excess_noise - self.gain) * events
-            variance = variance - self._spread(shared, 2)
+            variance = variance - self.spread(shared, 2)
         scale = self.electrons_per_dn**2
-        rounding = 0.0 if self.kind == "counting" else 1 / 12
-        return Noise(shared / scale, variance / scale + rounding)
+        return Noise(shared / scale, variance / scale + (0 if self.kind == "counting" else 1 / 12))
 
-    def spread(self, values: Values) -> FloatArray:
-        """Return values, shape (row, column, ...), after the blur of the intensifier, a symmetric matrix B."""
-        return self._spread(np.asarray(values, np.float64), 1)
+    def spread(self, values: Values, power: int = 1) -> FloatArray:
+        """Return values, shape (row, column, ...), behind the intensifier: a symmetric matrix B of this power."""
+        return _blurred(np.asarray(values, np.float64), self.intensifier_mtf, power)
 
     def sample(
         self,
@@ -255,128 +231,77 @@ class Camera(Plan):
         seed: int | Sequence[int],
         background: Values = 0.0,
         pulses: int = 1,
-        pattern: Pattern | None = None,
+        pattern: Pattern = _ALIKE,
         slope: Values | None = None,
     ) -> Record:
         """Draw frames; parameters are those of `expected`, and the shift of a gate is that of all pixels of a frame."""
         events = self.events(energy, open_ns, background, pulses, pattern)
-        shifted = (
-            None if slope is None else self._signal_events(np.asarray(slope, np.float64)) * self._jitter_ns(pulses)
-        )
+        steep = 0.0 if slope is None else self._signal_events(np.asarray(slope, np.float64), pattern)
         shape = (integer("frames", frames, 1, 10**9), *events.shape)
         random = np.random.default_rng(seed)
         signal = np.empty(shape, np.uint16 if self.bits <= 16 else np.uint32)
         saturated = np.empty(shape, np.bool_)
-        offset, most = self._offset(pattern), self.top_dn
-        if self.kind == "counting":
-            most = min(self.top_dn, self._exposures(pulses)) - 1
+        most = min(self.top_dn, self._exposures(pulses)) - 1 if self.kind == "counting" else self.top_dn
         for frame in range(len(signal)):
-            mean = events
-            if shifted is not None:
-                mean = np.maximum(events + shifted * random.standard_normal(events.shape[-1]), 0)
-            charge = self._drawn(mean, pulses, pattern, random)
+            shift = random.normal(0, self.gate_jitter_ns / np.sqrt(pulses), events.shape[-1])
+            charge = self._drawn(np.maximum(events + steep * shift, 0), pulses, pattern, random)
             full = charge > self.full_well
-            charge = np.minimum(charge, self.full_well)
-            if self.read_noise:
-                charge += random.normal(0, self.read_noise, charge.shape)
-            codes = np.rint(offset + charge / self.electrons_per_dn)
+            charge = np.minimum(charge, self.full_well) + random.normal(0, self.read_noise, charge.shape)
+            codes = np.rint(self._offset(pattern) + charge / self.electrons_per_dn)
             saturated[frame] = full | (codes > most)
             signal[frame] = np.clip(codes, 0, self.top_dn)
         return Record(signal, saturated)
 
-    def _expected_counts(
-        self, events: FloatArray, pulses: int, mean: FloatArray, variance: FloatArray, third: FloatArray
-    ) -> Expected:
-        """Return the moments of counts, which are saturated where the counter or all exposures are full."""
-        from scipy.special import bdtrc
-
-        exposures = self._exposures(pulses)
-        full = bdtrc(min(self.top_dn, exposures) - 1, exposures, -np.expm1(-events / exposures))
-        if exposures > self.top_dn:
-            mean, variance, _ = _clipped(mean, variance, third, self.top_dn, self.top_dn)
-        return Expected(mean, variance, np.asarray(full))
-
-    def _drawn(
-        self, events: FloatArray, pulses: int, pattern: Pattern | None, random: np.random.Generator
-    ) -> FloatArray:
+    def _drawn(self, events: FloatArray, pulses: int, pattern: Pattern, random: np.random.Generator) -> FloatArray:
         """Draw the charge of a frame without full well [electrons]."""
         if self.kind == "counting":
             exposures = self._exposures(pulses)
             return random.binomial(exposures, -np.expm1(-events / exposures)).astype(np.float64)
-        blurred = self.intensifier_mtf < 1 and events.ndim == 3
+        blurred = self.intensifier_mtf < 1
         spread = self.excess_noise - 1 - (1 / self.gain if blurred else 0)
         charge = multiplied(random.poisson(events), self.gain, spread, random)
         if blurred:
-            charge = random.poisson(self._spread(charge, 1)).astype(np.float64)
-        if dark := self._dark(pattern, events):
-            charge += random.poisson(*dark, charge.shape)
+            charge = random.poisson(self.spread(charge)).astype(np.float64)
+        if self.kind != "electron_multiplying" and self.dark_current_hz * self.frame_time_ms:
+            charge += random.poisson(np.broadcast_to(self._dark(pattern), charge.shape))
         return charge
 
-    def _charge(
-        self, events: FloatArray, pulses: int, pattern: Pattern | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _charge(self, events: FloatArray, pulses: int, pattern: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the first three cumulants of the charge of a frame without full well [electrons]."""
         if self.kind == "counting":
             exposures = self._exposures(pulses)
-            silent = np.exp(-events / exposures)
-            mean = exposures * -np.expm1(-events / exposures)
+            silent, mean = np.exp(-events / exposures), exposures * -np.expm1(-events / exposures)
             return mean, mean * silent, mean * silent * (2 * silent - 1)
-        gain, noise = self.gain, self.excess_noise
         # Of gamma-distributed charges, the mean cube is that of the mean times F (2 F - 1).
-        mean, variance, third = gain * events, gain**2 * noise * events, gain**3 * noise * (2 * noise - 1) * events
-        if self.intensifier_mtf < 1 and events.ndim == 3:
-            bunched = noise - 1 / gain
-            mean, pairs = self._spread(mean, 1), gain**2 * bunched * self._spread(events, 2)
-            variance = pairs + mean
-            third = gain**3 * bunched * (2 * bunched - 1) * self._spread(events, 3) + 3 * pairs + mean
-        if dark := self._dark(pattern, events):
-            mean, variance, third = mean + dark[0], variance + dark[0], third + dark[0]
-        return mean, variance, third
+        gain, noise = self.gain, self.excess_noise - (1 / self.gain if self.intensifier_mtf < 1 else 0)
+        mean, pairs = gain * self.spread(events), gain**2 * noise * self.spread(events, 2)
+        triples = gain**3 * noise * (2 * noise - 1) * self.spread(events, 3)
+        dark = 0.0 if self.kind == "electron_multiplying" else self._dark(pattern)
+        if self.intensifier_mtf < 1:  # a Poisson distribution about each of them
+            return mean + dark, pairs + mean + dark, triples + 3 * pairs + mean + dark
+        return mean + dark, pairs + dark, triples + dark
 
-    def _dark(self, pattern: Pattern | None, events: FloatArray) -> tuple[FloatArray] | tuple[()]:
-        """Return the mean charge on the chip that is not multiplied, broadcast to the events, or nothing."""
-        if self.kind == "electron_multiplying" or self.dark_current_hz * self.frame_time_ms == 0:
-            return ()
-        hot = 1.0 if pattern is None else pattern.dark[..., np.newaxis]
-        return (np.broadcast_to(1e-3 * self.dark_current_hz * self.frame_time_ms * hot, events.shape),)
+    def _dark(self, pattern: Pattern) -> FloatArray:
+        """Return the mean dark charge of the chip in a frame, to broadcast to pixels and gates."""
+        return 1e-3 * self.dark_current_hz * self.frame_time_ms * pattern.dark[..., np.newaxis]
 
-    def _signal_events(self, light: FloatArray) -> FloatArray:
+    def _signal_events(self, light: FloatArray, pattern: Pattern) -> FloatArray:
         """Return the mean events of energies [J] behind the optics."""
-        if light.ndim == 3:
-            light = _blurred(light, self.optics_mtf, 1)
-        return self.quantum_efficiency * photons_per_joule(self.wavelength_nm) * light
+        factor = self.quantum_efficiency * photons_per_joule(self.wavelength_nm)
+        return factor * _blurred(light, self.optics_mtf, 1) * pattern.response[..., np.newaxis]
 
-    def _charge_slope(self, slope: Values, events: FloatArray, pulses: int) -> FloatArray:
-        """Return the derivative of the mean charge with respect to the gate's time [electrons/ns]."""
-        changed = self._signal_events(np.asarray(slope, np.float64))
-        if self.kind == "counting":
-            return np.asarray(changed * np.exp(-events / self._exposures(pulses)))
-        return self.gain * (self._spread(changed, 1) if events.ndim == 3 else changed)
-
-    def _jitter_ns(self, pulses: int) -> float:
-        """Return the deviation of the mean time of a gate's pulses [ns]."""
-        return float(self.gate_jitter_ns / np.sqrt(pulses))
-
-    def _opened(self, open_ns: Values, pulses: int) -> FloatArray:
-        """Return the open time of all pulses [s]."""
-        return 1e-9 * integer("pulses", pulses, 1, 10**9) * non_negative_array("open_ns", open_ns)
-
-    def _offset(self, pattern: Pattern | None) -> FloatArray:
+    def _offset(self, pattern: Pattern) -> FloatArray:
         """Return the digital numbers without charge, to broadcast to pixels and gates."""
-        return np.asarray(self.offset_dn + (0.0 if pattern is None else pattern.offset[..., np.newaxis]))
+        return self.offset_dn + pattern.offset[..., np.newaxis]
 
     def _exposures(self, pulses: int) -> int:
         """Return in how many exposures the pulses are counted."""
         return -(-pulses // self.pulses_per_exposure)
 
-    def _spread(self, values: FloatArray, power: int) -> FloatArray:
-        """Return values behind the intensifier, whose weights have a power."""
-        return _blurred(values, self.intensifier_mtf, power)
-
 
 def _blurred(values: FloatArray, mtf: float, power: int) -> FloatArray:
     """Return values, shape (row, column, ...), blurred along rows and columns with a power of the weights."""
-    if mtf == 1:
+    if mtf == 1 or values.ndim < 3:
         return values
     for axis in (0, 1):
         moved = np.moveaxis(values, axis, 0)
@@ -408,7 +333,7 @@ def _clipped(mean: FloatArray, variance: FloatArray, third: FloatArray, limit: V
     """
     deviation = np.sqrt(variance)
     limit, over = np.broadcast_to(limit, mean.shape), np.broadcast_to(over, mean.shape)
-    found = Expected(mean.copy(), variance.copy(), np.asarray(mean > over, np.float64))
+    found = Expected(np.array(mean), np.array(variance), np.asarray(mean > over, np.float64))
     near = mean + _FAR * deviation + third / np.maximum(variance, 1e-300) * _FAR > limit
     found.mean[near & (deviation == 0)] = limit[near & (deviation == 0)]
     near &= deviation > 0

@@ -202,8 +202,8 @@ def waveform_receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverCha
     """Return a receiver of waveforms; raise `UserError` as `receiver` does, and for a camera."""
     if isinstance(found := receiver(name), Camera):
         raise UserError(
-            f"receiver = {shown(found.name)} is a camera, which needs gates, but this needs waveforms and one of "
-            f"{', '.join(RECEIVERS)}, an instrument, or a .toml file of a chain"
+            f"receiver = {shown(found.name)} is a camera, which records gates: waveforms need one of "
+            f"{', '.join(RECEIVERS)}, an instrument, or a .toml file"
         )
     return found
 

@@ -34,7 +34,8 @@ def usual(name, kind, option):
     if {int, float} & {*parts(kind)}:
         low, high = (option.low or 0, option.low + 1 if option.high is None else option.high) if option.low else (0, 1)
         return low if int in parts(kind) else (low + high) / 2
-    return "a"
+    words = [one for one in parts(kind) if isinstance(one, str)]
+    return words[-1] if words else "a"
 
 
 def table(kind):
