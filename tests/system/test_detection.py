@@ -56,7 +56,7 @@ def test_best_weighting_of_strips_needs_less_still(strips):
 def test_drawn_shots_are_detected_as_wanted(squares):
     """The share of 0.9 was found in closed form: drawn shots, whose noise is not normal, must not miss it by much."""
     at = squares.sel(combination="best", false_alarm=squares.attrs["pfa"])
-    assert abs(at["drawn_detection"] - 0.9) < 0.03 + largest_z(2000) * np.sqrt(0.09 / 2000)
+    assert abs(at["drawn_detection"] - 0.9) < 0.01 + largest_z(2000) * np.sqrt(0.09 / 2000)
     assert 2000 * at["drawn_false_alarm"] <= binom.isf(FALSE_ALARM, 2000, 0.003)
 
 
@@ -98,5 +98,5 @@ def test_rates_of_drawn_images_are_those_predicted_from_other_renders(wind):
             values = np.tensordot(drawn - maps["background"], maps["filter_weight"], 3)
             rates.append(float(np.mean(values > expected.threshold(0.05))))
         low, value, high = (found[f"detection{end}"][1][0] for end in ("_low", "", "_high"))
-        assert abs(rates[0] - 0.05) < 0.03 + largest_z(2000) * np.sqrt(0.05 * 0.95 / 2000)
-        assert abs(rates[1] - value) < 0.03 + (high - low) + largest_z(2000) * np.sqrt(value * (1 - value) / 2000)
+        assert abs(rates[0] - 0.05) < 0.01 + largest_z(2000) * np.sqrt(0.05 * 0.95 / 2000)
+        assert abs(rates[1] - value) < 0.01 + (high - low) + largest_z(2000) * np.sqrt(value * (1 - value) / 2000)
