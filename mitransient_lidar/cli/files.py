@@ -101,7 +101,8 @@ PAGE_MB = 200.0
 class GateFiles:
     """Files of a gate stack in a folder, with the beginning of their names.
 
-    Kinds in addition to the EXR stack: ``drawings`` (of gates and depths), ``sequence``, ``gif``, ``mp4``, ``html``.
+    Kinds in addition to the EXR stack: ``drawings`` (of gates and depths), ``sequence``, ``tiff``, ``images`` (PNG),
+    ``gif``, ``mp4``, ``html``.
     """
 
     folder: Path
@@ -121,12 +122,15 @@ class GateFiles:
         """Check that the files can be written."""
         numbered = f"{glob.escape(self.stem)}_gate[0-9]*.exr"
         sequence = sorted(self.folder.glob(numbered)) if "sequence" in self.wanted else []
+        if "images" in self.wanted:
+            sequence += sorted(self.folder.glob(f"{glob.escape(self.stem)}_*gate[0-9]*.png"))
         check_targets(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
         """Return the paths of the files, without those of a sequence."""
         endings = ["_gates.exr", *(["_gates.png", "_depth.png"] if "drawings" in self.wanted else [])]
         endings += [f"_gates.{kind}" for kind in ("gif", "mp4", "html") if kind in self.wanted]
+        endings += ["_gates.tif"] * ("tiff" in self.wanted)
         return [self.folder / f"{self.stem}{ending}" for ending in endings]
 
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
@@ -135,15 +139,19 @@ class GateFiles:
         from mitransient_lidar.plots.gates import images
         from mitransient_lidar.plots.viewer import view
         from mitransient_lidar.results import exr
-        from mitransient_lidar.results.gate_stack import check_stack
+        from mitransient_lidar.results.gate_stack import as_stack, check_stack, has_frames
 
+        frames = has_frames(stack)
+        drawn = as_stack(stack)
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):
-                images.check_animation(stack, path)
+                images.check_animation(drawn, path)
         self.folder.mkdir(parents=True, exist_ok=True)
         with announced():
             for path in self.names():
-                if path.suffix == ".exr":
+                if path.suffix == ".tif" or (path.suffix == ".exr" and frames):
+                    results.save(stack, path)
+                elif path.suffix == ".exr":
                     results.save(check_stack(stack), path)
                 elif path.suffix == ".html":
                     record = result if result is not None and "waveform" in result else None
@@ -154,8 +162,10 @@ class GateFiles:
                     images.plot_gates(stack, path)
                 else:
                     _draw_depths(stack, path, quiet)
+            if "images" in self.wanted:
+                results.save(stack, self.folder / f"{self.stem}.png")
             if "sequence" in self.wanted:
-                exr.write_sequence(check_stack(stack), self.folder, self.stem)
+                exr.write_sequence(drawn if frames else check_stack(stack), self.folder, self.stem)
 
 
 def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:

@@ -20,13 +20,21 @@ if TYPE_CHECKING:
 
 def _gates(
     call: Call,
-    stack: Annotated[Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result that kept its histogram.")],
+    stack: Annotated[
+        Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result, a gate stack or frames of a camera.")
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the files; by default that of STACK.")
     ] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw all gates, and the depths seen in them.")] = True,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
+    ] = False,
+    tiff: Annotated[
+        bool, typer.Option("--tiff", help="Also write a TIFF file of 16 bits, a page for each frame and gate.")
+    ] = False,
+    images: Annotated[
+        bool, typer.Option("--images", help="Also write numbered PNG files of 16 bits, one for each frame and gate.")
     ] = False,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
     mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie, by ffmpeg.")] = False,
@@ -35,6 +43,7 @@ def _gates(
 ) -> None:
     """Cut the gates of a train, or take those that are there, and write and draw them."""
     from mitransient_lidar.analysis.gates import cut as gating
+    from mitransient_lidar.results.gate_stack import has_frames
 
     count = call.arguments["count"]
     starts = [call.arguments[name] for name in ("start_ns", "start_depth_m", "start_range_m")]
@@ -42,15 +51,26 @@ def _gates(
     given["--count"] = None if count == 1 else count
     with reporting(quiet):
         result = _open(stack)
-        has_gates = "gate_energy" in result
+        is_record = has_frames(result)
+        has_gates = is_record or "gate_energy" in result
         is_cut = not has_gates or any(one is not None for one in starts)
         stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")
         files = GateFiles.of(
-            output or stack.parent, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html
+            output or stack.parent,
+            stem,
+            drawings=plot,
+            sequence=sequence,
+            tiff=tiff,
+            images=images,
+            gif=gif,
+            mp4=mp4,
+            html=html,
         )
         if not is_cut:
             draws_again(stack)
         files.check()
+        if is_record and is_cut:
+            raise UserError(f"{stack} holds frames of a camera: cut the gates of the result, and record these")
         if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
                 raise UserError(
@@ -67,10 +87,10 @@ def _gates(
 
 
 def _open(path: Path) -> xr.Dataset:
-    """Open a result or a gate stack."""
+    """Open a result, a gate stack or frames of a camera."""
     from mitransient_lidar import results
 
-    return results.dataset_of("FILE", path, "result", "gates")
+    return results.dataset_of("FILE", path, "result", "gates", "frames")
 
 
 COMMANDS = {
@@ -81,7 +101,8 @@ COMMANDS = {
         """Cut gates from a result.
 
         Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths; <stack>_cut_gates.exr and so on
-        of a STACK that has gates already. Without a start, the gates that it has are written and drawn.
+        of a STACK that has gates already. Without a start, the gates that it has, or the frames of a camera, are
+        written and drawn. TIFF and PNG images have the digital numbers of frames, or energies from 0 to 65535.
         """,
     ),
 }

@@ -63,12 +63,18 @@ def _view(
     from mitransient_lidar import results
     from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_components, plot_waveforms
+    from mitransient_lidar.results.files import kinds_of
 
-    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
+    of_gates = () if layout or components else ("gates", "frames")
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals", *of_gates)
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     with announced():
-        if layout:
+        if not {"waveforms", "signals"} & kinds_of(dataset):
+            from mitransient_lidar.plots.gates.images import plot_gates
+
+            plot_gates(dataset, target, log=log and not linear)
+        elif layout:
             plot_layout(dataset, target)
         elif components:
             plot_components(dataset, target)
@@ -86,7 +92,7 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
     from mitransient_lidar.plots.viewer import view as page_of
 
     with reporting(quiet):
-        dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates")
+        dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates", "frames")
         page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -139,10 +145,10 @@ COMMANDS = {
         """Show a result in the browser, or draw its waveforms or layout.
 
         The page is a map of the pixels at each time, and the waveforms of those that are clicked; it needs no network.
-        Gates are shown where FILE has them. With --plot, --components, --layout or a drawing as --output, a PNG, PDF or
-        SVG file is written instead, by default in the folder of FILE. Both print the path. With --layout, the command
-        also prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths
-        and the bottom: x, y, z.
+        Gates are shown where FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a
+        drawing as --output, a PNG, PDF or SVG file is written instead, by default in the folder of FILE. Both print the
+        path. With --layout, the command also prints where the axes of receiver and laser, refracted by a level sea,
+        meet the sea level, targets' depths and the bottom: x, y, z.
         """,
     ),
     "compare": Command(

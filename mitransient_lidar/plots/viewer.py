@@ -82,7 +82,7 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
     Parameters
     ----------
     result : xarray.Dataset
-        A result, a record of a receiver or a gate stack: see `plots.gate_viewer.page.page_text`.
+        A result, a record of a receiver or camera, or a gate stack: see `plots.gate_viewer.page.page_text`.
     waveforms : xarray.Dataset, optional
         A render of the pixels of a gate stack.
     height : int
@@ -95,7 +95,7 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
     UserError
         If the result has neither gates nor a record in time, or `limit_mb` is too small for it.
     """
-    result = dataset_of("result", result, "waveforms", "signals", "gates")
+    result = dataset_of("result", result, "waveforms", "signals", "gates", "frames")
     if waveforms is not None:
         waveforms = dataset_of("waveforms", waveforms, "waveforms")
     name = scene_name(result.attrs) or "result"

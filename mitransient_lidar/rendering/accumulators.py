@@ -36,8 +36,8 @@ logger = logging.getLogger(__name__)
 
 #: Memory of a bin [bytes] for the means and errors over the passes, of energy and power, and their computation.
 _BYTES_PER_KEPT_BIN = 96
-#: Memory of a bin when a pass is converted to gates, and of a gate that is kept, with its weights in the film.
-_BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE = 8, 64
+#: Memory of a bin when a pass is converted to gates, of a gate that is kept then, and of one that is summed directly.
+_BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE = 8, 64, 18
 #: Memory of a bin of a batch of passes: its sum, and the mean in the result.
 _BYTES_PER_BATCH = 16
 
@@ -159,7 +159,7 @@ class PassAccumulator:
         """Add the histogram of a pass, and that of its gates if they were accumulated beside it."""
         pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
         if self._kept == "direct":
-            self.gates.add(histogram.energy().reshape(pixels, -1))
+            self.gates.add_parts((pixels, histogram.record_length), histogram.energy_of)
             return
         if self._kept == "gates":
             assert self._weights is not None
@@ -325,7 +325,7 @@ def choose_accumulator(
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
         logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
         return PassAccumulator(scene, window, train, kept="gates")
-    each = (per_bin + _BYTES_PER_KEPT_GATE) * pixels
+    each = (per_bin + _BYTES_PER_DIRECT_GATE) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
         room = f"room for {fitting} of them" if fitting else "less than one gate needs"

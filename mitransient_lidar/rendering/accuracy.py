@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 #: Pixels darker than this fraction of the median are excluded from the errors of radiance.
 _DARK_PIXEL = 1e-2
+
+#: Values of an array that are added at a time.
+_PART = 2**17
 
 #: Most blocks of bins, and about as many pixels, that the correlation of errors is measured over.
 _BLOCKS, _CORRELATED_PIXELS = 512, 1024
@@ -36,12 +39,23 @@ class PassStatistics:
 
     def add(self, values: FloatArray) -> None:
         """Add the result of one pass."""
+        self.add_parts(np.shape(values), lambda part: values[part])
+
+    def add_parts(self, shape: tuple[int, ...], part_of: Callable[[Any], FloatArray]) -> None:
+        """Add the result of one pass of a shape, of which a function returns parts of the first axis.
+
+        Parts fit the processor's cache, and no further arrays of the whole shape exist.
+        """
         if self.count == 0:
-            self.mean, self._squares = np.zeros_like(values), np.zeros_like(values)
+            self.mean, self._squares = np.zeros(shape), np.zeros(shape)
         self.count += 1
-        deviation = values - self.mean
-        self.mean += deviation / self.count
-        self._squares += deviation * (values - self.mean)
+        step = max(_PART // max(int(np.prod(shape[1:])), 1), 1)
+        for start in range(0, shape[0], step) if shape else [0]:
+            part = slice(start, start + step) if shape else ()
+            values = part_of(part)
+            deviation = values - self.mean[part]
+            self.mean[part] += deviation / self.count
+            self._squares[part] += deviation * (values - self.mean[part])
 
     @property
     def stderr(self) -> FloatArray:
@@ -52,7 +66,8 @@ class PassStatistics:
         """Return the standard error of the mean of part of the first axis; NaN before the second pass."""
         if self.count < 2:
             return np.full_like(self._squares[part], np.nan)
-        return np.asarray(np.sqrt(self._squares[part] / (self.count - 1) / self.count))
+        found = self._squares[part] / (self.count - 1)
+        return np.asarray(np.sqrt(np.divide(found, self.count, out=np.asarray(found)), out=np.asarray(found)))
 
 
 class LightStatistics:

@@ -4,8 +4,10 @@
   ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs, beyond
   1024 channels of several parts, named by their first channel.
 - Gates, and frames by daylight, are one part each, named ``gate000`` (four digits from 1000 gates on) or ``frame0000``,
-  with the channels ``Y`` and ``Y.stderr``. Every part has the header attributes ``gateStartNs``, ``gateWidthNs`` and,
-  if known, ``gateDepthM``, or ``timeS``. A sequence is a folder of files with one gate each, numbered like the parts.
+  with the channels ``Y`` and ``Y.stderr``. Gates of a camera have the moments of their frames (``Y``, their mean,
+  ``Y.deviation``, ...), and the digital numbers of each frame (``frame0000.Y``, ``frame0000.saturated``). Every part
+  has the header attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is
+  a folder of files with one gate each, numbered like the parts.
 
 Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice: OpenEXR
 supports only integers and floats of 32 bits and no empty list, so a JSON string (header attribute ``mitransientLidar``)
@@ -21,7 +23,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,8 +77,16 @@ _IMAGES = {
         {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"},
         {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"},
     ),
+    "frames": _Images(
+        "gate", 3, {}, {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
+    ),
     "radiance": _Images("frame", 4, {"radiance": "Y", "radiance_stderr": "Y.stderr"}, {"time_s": "timeS"}),
 }
+
+#: Channels of the moments of frames, and component of what each frame has.
+_MOMENTS = {"signal_mean": "Y", "signal_mean_stderr": "Y.stderr", "signal_deviation": "Y.deviation"}
+_MOMENTS |= {"snr": "Y.snr", "saturation": "Y.saturation", "dark_level": "Y.dark"}
+_OF_FRAMES = {"signal": "Y", "saturated": "saturated"}
 
 
 class Part(NamedTuple):
@@ -95,13 +105,18 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     UserError
         If the dataset has variables that the file cannot store, or so many channels do not fit into the memory.
     """
-    variables = _LAYERS if content == "waveforms" else _IMAGES[content].channels
+    types = {name: dataset[name].dtype.name for name in _OF_FRAMES if name in dataset}
+    if content == "frames":
+        dataset = _split_frames(dataset, path)
+    kind = _kind(content, dataset.data_vars)
+    variables = _LAYERS if kind is None else kind.channels
     if extra := [str(name) for name in dataset.data_vars if name not in variables]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     dataset = dataset.assign_attrs({str(name): attribute(str(name), value) for name, value in dataset.attrs.items()})
     exact = {
         "content": content,
         "is_sequence": sequence,
+        **({"types": types} if types else {}),
         "dims": list(next(iter(dataset.data_vars.values())).dims),
         "attributes": dataset.attrs,
         "variables": {name: dataset[name].attrs for name in variables},
@@ -118,10 +133,55 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     readable = {f"lidar.{name}": value for name, value in shown(dataset.attrs).items() if name != "scene_xml"}
     if "pixel" in dataset.coords:
         readable["pixelNames"] = [str(name) for name in dataset["pixel"].values]
-    if content == "waveforms":
+    if kind is None:
         readable |= {"timeStartNs": dataset.attrs["time_start_ns"], "binWidthNs": dataset.attrs["bin_width_ns"]}
         return _layers(dataset, exact, readable)
-    return _images(dataset, exact, readable, _IMAGES[content])
+    return _images(dataset, exact, readable, kind)
+
+
+def _kind(content: str, variables: Iterable[Any]) -> _Images | None:
+    """Return how the images of a content are stored, None for waveforms."""
+    if content != "frames":
+        return _IMAGES.get(content)
+    names = [str(name) for name in variables]
+    frames = {
+        name: f"frame{name.removeprefix(of)}.{component}"
+        for of, component in _OF_FRAMES.items()
+        for name in names
+        if name.removeprefix(of).isdigit()
+    }
+    moments = {name: channel for name, channel in _MOMENTS.items() if name in names}
+    return _IMAGES["frames"]._replace(channels=moments | frames)
+
+
+def _split_frames(dataset: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
+    """Return the frames of a camera with a variable for each frame, all over the pixels and gates."""
+    if "frame" in dataset["signal_mean"].dims or 2 * dataset.sizes["frame"] > _MOST_CHANNELS - len(_MOMENTS):
+        raise UserError(
+            f"cannot write {path}: an EXR file holds up to {(_MOST_CHANNELS - len(_MOMENTS)) // 2} frames of one sea; "
+            "use a .nc or .tif file."
+        )
+    like = dataset["signal_mean"]
+    values: dict[str, xr.DataArray] = {name: dataset[name] for name in map(str, dataset) if name not in _OF_FRAMES}
+    if "dark_level" in values:
+        values["dark_level"] = values["dark_level"].broadcast_like(like).assign_attrs(dataset["dark_level"].attrs)
+    for name in _OF_FRAMES:
+        for number, frame in enumerate(dataset[name]):
+            values[f"{name}{number:04d}"] = frame.drop_vars("frame").assign_attrs(dataset[name].attrs)
+    values = {name: one.transpose(*like.dims) for name, one in values.items()}
+    return xr.Dataset(values, dataset.coords, dataset.attrs)
+
+
+def _joined_frames(dataset: xr.Dataset, types: Mapping[str, str]) -> xr.Dataset:
+    """Return frames of `_split_frames` as they were; `types` are those of their values."""
+    found = {}
+    for name in _OF_FRAMES:
+        parts = [dataset[f"{name}{number:04d}"] for number in range(dataset.sizes["frame"])]
+        found[name] = xr.concat(parts, dataset["frame"]).astype(types[name]).assign_attrs(parts[0].attrs)
+    rest = dataset.drop_vars([name for name in dataset if str(name) not in _MOMENTS])
+    if "dark_level" in rest:
+        rest["dark_level"] = rest["dark_level"].isel(gate=0)
+    return rest.assign(found)
 
 
 def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any]) -> list[Part]:
@@ -246,9 +306,10 @@ def read(path: Path) -> xr.Dataset:
         raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}.")
     exact = exact_metadata(path, parts[0].attributes)
     try:
-        kind = _IMAGES.get(exact.get("content", ""))
+        kind = _kind(exact.get("content", ""), exact["variables"])
         images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)
-        return _labelled(images, exact)
+        found = _labelled(images, exact)
+        return found if exact["content"] != "frames" else _joined_frames(found, exact["types"])
     except UserError:
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:

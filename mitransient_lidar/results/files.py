@@ -16,10 +16,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path, open_file, replacing
 from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.results import exr, netcdf, sum_errors
+from mitransient_lidar.results import exr, image_files, netcdf, sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import LIGHT, check_axes
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
 #: What a kind of dataset is called, and the variables that one has.
 _KINDS = {
@@ -78,7 +78,8 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         Any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images by
         daylight for an EXR file.
     path : path
-        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR. Without a suffix, a gate stack becomes a
+        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; of gates and frames ``.tif`` and ``.png`` are
+        images of 16 bits, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
         sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
 
     Raises
@@ -92,8 +93,11 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     if not path.suffix:
         exr.write_sequence(check_stack(dataset), path.parent, path.name)
         return
-    if (suffix := path.suffix.lower()) not in (".exr", ".nc"):
-        raise UserError(f"cannot write {path}: the file name must end in .exr or .nc.")
+    if (suffix := path.suffix.lower()) in image_files.SUFFIXES:
+        image_files.write(dataset, path)
+        return
+    if suffix not in (".exr", ".nc"):
+        raise UserError(f"cannot write {path}: the file name must end in .exr, .nc, .tif or .png.")
     with replacing(path) as temporary:
         if suffix == ".nc":
             try:
@@ -116,10 +120,12 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
         return exr.parts_of(dataset.drop_dims(sum_errors.DIMS, errors="ignore"), path, "waveforms")
     if "gates" in found:
         return exr.parts_of(check_stack(dataset).drop_dims("parameter", errors="ignore"), path, "gates")
+    if "frames" in found:
+        return exr.parts_of(dataset, path, "frames")
     if "radiance" in found:
         images = dataset.drop_vars(["etendue", "background_power"], errors="ignore")
         return exr.parts_of(images, path, "radiance")
-    stored = _listed(("result", "gates", "radiance"))
+    stored = _listed(("result", "gates", "frames", "radiance"))
     raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file.")
 
 
@@ -135,7 +141,7 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
 def kinds_of(dataset: xr.Dataset) -> set[str]:
     """Return the kinds of a dataset: ``result``, ``waveforms``, ``signals``, ``frames``, ``gates``, ..."""
     found = {kind for kind, (_, variables) in _KINDS.items() if all(name in dataset for name in variables)}
-    return found - {"signals"} if "frames" in found else found
+    return found - {"signals" if has_frames(dataset) else "frames"}
 
 
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:

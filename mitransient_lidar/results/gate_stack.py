@@ -262,3 +262,40 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
     if "gate_energy_derivative" not in stack:
         stack = stack.drop_dims("parameter", errors="ignore")
     return stack.transpose(..., *pixels, "gate")
+
+
+def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
+    """Return gates to draw and to analyse as a gate stack, with a name and unit of ``gate_energy`` in its attributes.
+
+    Frames of a camera become their mean above the dark level [DN], with the standard error of this mean; a stack with
+    a sea for each frame becomes the mean over the frames.
+
+    Raises
+    ------
+    UserError
+        As of `check_stack`.
+    """
+    if not has_frames(dataset):
+        stack = check_stack(dataset, place)
+        stack["gate_energy"].attrs |= {"long_name": "energy in the gate", "units": "J"}
+        return stack
+    mean = dataset["signal"].mean("frame")
+    deviation = np.sqrt((dataset["signal_deviation"] ** 2).mean("frame" if "frame" in dataset["snr"].dims else ()))
+    stack = _without_frames(dataset).assign(
+        gate_energy=mean - dataset["dark_level"], gate_energy_stderr=deviation / math.sqrt(dataset.sizes["frame"])
+    )
+    stack = check_stack(stack.assign_attrs(dataset.attrs), place)
+    stack["gate_energy"].attrs |= {"long_name": "signal above the dark level", "units": "DN"}
+    return stack
+
+
+def has_frames(dataset: xr.Dataset) -> bool:
+    """Return whether a dataset has frames of a camera: a signal over gates. A record in time may have gates beside."""
+    return "signal" in dataset and "gate" in dataset["signal"].dims
+
+
+def _without_frames(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the coordinates and attributes of a dataset over frames, of which those over the gates are means."""
+    coords = {name: one for name, one in dataset.coords.items() if name != "frame"}
+    means = {name: one.mean("frame") if "frame" in one.dims else one for name, one in coords.items()}
+    return xr.Dataset(coords=means, attrs=dataset.attrs)

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.detection import trials
+from mitransient_lidar.analysis.detection import images, trials
+from mitransient_lidar.analysis.detection.images import ImageTrial
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
-from mitransient_lidar.analysis.receiver import chain_of
+from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
-    RECEIVERS,
+    RECEIVERS_OR_CAMERAS,
     BackgroundPower,
     Instrument,
     Numbers,
@@ -27,21 +28,29 @@ from mitransient_lidar.core.options import (
     checked,
     positive_option,
 )
-from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.core.validation import in_range, require_memory, shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.target_signal import find_target, target_signal
+from mitransient_lidar.studies.target_signal import find_target, target_gates, target_signal
 
 if TYPE_CHECKING:
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
+
+#: Numbers of frames for which the detection is given, and those that are printed.
+_FRAMES, _SHOWN_FRAMES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000), 8
+
+_MOST_ADJOINING = 6  # gates that are tried as one wide gate
+_BYTES_PER_GATE = 32  # memory of the light of a pixel in a gate of a render, with and without the target
 
 
 @checked
@@ -51,7 +60,7 @@ def detect(
     params: Mapping[str, Any] | None = None,
     *,
     instrument: Instrument = None,
-    receiver: Annotated[ReceiverChain | str, Option(RECEIVERS)] = "apd",
+    receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS_OR_CAMERAS)] = "apd",
     pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
@@ -59,13 +68,16 @@ def detect(
     depths: Annotated[
         Numbers, Option("Further depths of the target", 0, unit="m", above=True, ascending=True, form="N,N,...")
     ] = (),
-    shots: Annotated[int, Option("Number of simulated shots with and without the target", 100, 100_000)] = 10_000,
+    shots: Annotated[
+        int, Option("Number of simulated shots with and without the target, none for a camera", 100, 100_000)
+    ] = 10_000,
     clutter: Annotated[
         int, Option("Number of seas whose differences count as noise, at least 4, or 0 for one known sea", 0, 1000)
     ] = 0,
     renders: Annotated[int, Option("Renders of one sea, whose spread gives the intervals", 3, 1000)] = 4,
     target_id: TargetId = "target",
     background_power_w: BackgroundPower = 0.0,
+    frames: Annotated[int, Option("Frames of each gate of a camera that are averaged", 1, 1_000_000)] = 1,
     passes: Annotated[int, Option("Number of independent passes of each render", 16, 100_000)] = 16,
     max_time: Annotated[
         float | None,
@@ -80,16 +92,22 @@ def detect(
 ) -> xr.Dataset:
     """Simulate the detection of a target with one pixel, and with sums and the best weighting of pixels.
 
+    With a camera as the receiver: simulate it in the images of the scene's gates, of any number of pixels, also by the
+    target's shadow.
+
     Parameters
     ----------
     scene, params, instrument, integrator
-        As for `target_signal.target_signal`, with at most 16 pixels.
+        As for `target_signal.target_signal`, with at most 16 pixels, or gates for a camera.
     receiver
-        Detector and electronics of every pixel, or a name in `physics.receiver.receiver_files.RECEIVERS`.
+        Detector and electronics of every pixel, or a camera, or the name of one in `physics.receiver.receiver_files`.
     depths
         Further depths of the target to render [m], increasing: values of the parameter ``target_depth`` of the scene.
     shots
-        Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it.
+        Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it. A camera
+        needs none.
+    frames
+        Frames of each gate of a camera that are averaged, with the same sea in all.
     clutter
         Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or
         4 to 1000.
@@ -115,6 +133,14 @@ def detect(
         ``pixel`` and ``time`` [ns] the means of ``background`` and ``difference`` [W] over the renders. Attributes
         ``gain_pixels`` and ``gain_single``: factors of the transimpedance that keep the echo in range.
 
+
+        With a camera: over (row, column, gate) or (pixel, gate) the maps of `images.ImageTrial.maps`; ``detection``
+        over ``frames`` (averaged numbers) and ``frames_needed``, and with `depths` ``detection_at_depth`` and
+        ``frames_needed_at_depth``, all with limits; ``gate_detection`` and ``gate_deflection`` of a single gate as
+        wide as some that adjoin, over ``adjoining`` (their number) and ``gate`` (`images.single_gates`). Digital
+        numbers x are filtered as sum(``filter_weight`` (x - ``background``)), which is 1 on average with the target,
+        and with `frames` exceeds the attribute ``threshold`` by chance with the probability `pfa`.
+
     Raises
     ------
     UserError
@@ -133,8 +159,14 @@ def detect(
     would saturate it, for ``single`` independently. With clutter, the weights for each sea are estimated from the other
     seas, and the statistic is taken as normally distributed. Intervals are Student's from a jackknife over at most 10
     groups of renders or seas, and exact binomial ones for rates of random shots, given the rendered light and seas.
+
+    Images: all pixels and gates are weighted by difference over variance, behind the covariance of pixels that share
+    the noise of an intensifier, and of the images of seas. The level without the target, or its mean over the seas, is
+    known. Each render is filtered with the weights of the others, so that the errors of renders lower the probability
+    and never raise it.
     """
-    chain = chain_of("receiver", receiver).default.chain
+    device = receiver_of("receiver", receiver)
+    camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
     if clutter != 0 and not 4 <= clutter <= 1000:
         raise UserError(f"clutter = {clutter} must be 0 or lie between 4 and 1000")
@@ -151,16 +183,21 @@ def detect(
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
     lidar = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
     lidar.transmitter.pose.require_above_sea()
-    if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
+    if camera is None and (grid := lidar.receiver.pixels.grid) is not None:
+        raise UserError(
+            f"receiver = {shown(receiver)} records waveforms of at most 16 pixels, and the scene is an image of "
+            f"{grid[0]}x{grid[1]}: it needs gates and a camera ({', '.join(CAMERAS)}, or a TOML file)"
+        )
+    if lidar.receiver.optics.response_time_ns > 0 and chain is not None and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render
         find_target(open_scene(scene, {**(params or {}), "target_depth": depth}, instrument).scene, target_id)
-    experiments: list[Experiment] = []
+    experiments: list[Any] = []
     first: list[xr.Dataset] = []
     cases = Cases((None, *depths), "depths", steps=renders, max_time=max_time, progress=progress)
     for place in cases:
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
-        fixed = session.scene if place is None else open_scene(scene, moved, instrument).scene if clutter == 0 else None
+        sea = open_scene(scene, moved, instrument) if place is not None and clutter == 0 else session
         found: list[xr.Dataset] = []
         axis: TimeAxis | None = None
         for i in range(renders):
@@ -170,32 +207,16 @@ def detect(
                 # The records of all seas have the bins of the first one.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
             own = pass_seed(seed, i) >> 1  # seeds of a render are signed
-            options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator}
-            found.append(cases.keep(target_signal(sea if clutter else fixed, seed=own, axis=axis, **options)))
+            options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator, "seed": own}
+            one = target_signal(sea, axis=axis, **options) if camera is None else target_gates(sea, **options)
+            found.append(cases.keep(one))
             cases.step()
         first = first or found
-        experiments.append(_experiment(found, bool(clutter), chain, lidar, sky))
+        build: Any = _image_trial if chain is None else _experiment
+        experiments.append(build(found, bool(clutter), camera or chain, lidar, sky))
     left_out = ", ".join(f"{depth:g}" for depth in depths[cases.begun - 1 :])
     depths = depths[: cases.begun - 1]
     called = receiver if isinstance(receiver, str) else "custom"
-    try:
-        data = trials.needs(experiments[0], pfa, pd)
-    except ValueError as error:
-        raise UserError(
-            f"receiver {called} does not see the target, for example because of the dead time after the surface echo: "
-            "reduce the pulse energy"
-        ) from error
-    data |= trials.detected(experiments[0], pfa)
-    share = float(data["needed_target"][1][-1])
-    share = share if math.isfinite(share) else 1.0
-    data |= trials.drawn(experiments[0], share, pfa, shots, seed)
-    pulse_fwhm_ns = lidar.transmitter.pulse.fwhm_ns
-    geometry = LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index)
-    data |= trials.depth_errors(experiments[0], shots, seed, pulse_fwhm_ns, geometry.depth_per_ns)
-    if depths:
-        data |= trials.by_depth(experiments[1:], list(depths), pfa, pd)
-    for key in ("background", "difference"):
-        data[key] = xr.concat([one[key] for one in first], "render").mean("render").assign_attrs(units="W")
     attributes = session.attributes(
         target=target_id,
         receiver=called,
@@ -209,13 +230,88 @@ def detect(
         background_power_w=sky,
         confidence=trials.CONFIDENCE,
         depths_left_out=left_out,
-        drawn_share=share,
-        gain_pixels=experiments[0].gain(False),
-        gain_single=experiments[0].gain(True),
-        brightest=str(first[0]["pixel"].values[experiments[0].brightest]),
-        pulse_fwhm_ns=pulse_fwhm_ns,
+        pulse_fwhm_ns=lidar.transmitter.pulse.fwhm_ns,
     )
+    if camera is not None:
+        return _in_images(experiments, first[0], depths, frames, lidar, attributes)
+    data = _in_waveforms(experiments, depths, lidar, attributes)
+    for key in ("background", "difference"):
+        data[key] = xr.concat([one[key] for one in first], "render").mean("render").assign_attrs(units="W")
+    attributes["brightest"] = str(first[0]["pixel"].values[experiments[0].brightest])
     return label(xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes), "detection")
+
+
+def _in_waveforms(
+    experiments: Sequence[Experiment], depths: Sequence[float], lidar: LidarScene, attributes: dict[str, Any]
+) -> trials.Variables:
+    """Return the variables of a result of waveforms, and add its attributes."""
+    own, pfa, pd, shots, seed = experiments[0], *(attributes[name] for name in ("pfa", "pd", "shots", "seed"))
+    try:
+        data = trials.needs(own, pfa, pd)
+    except ValueError as error:
+        raise UserError(
+            f"receiver {attributes['receiver']} does not see the target, for example because of the dead time after "
+            "the surface echo: reduce the pulse energy"
+        ) from error
+    data |= trials.detected(own, pfa)
+    share = float(data["needed_target"][1][-1])
+    share = share if math.isfinite(share) else 1.0
+    data |= trials.drawn(own, share, pfa, shots, seed)
+    geometry = LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index)
+    data |= trials.depth_errors(own, shots, seed, attributes["pulse_fwhm_ns"], geometry.depth_per_ns)
+    if depths:
+        data |= trials.by_depth(experiments[1:], list(depths), pfa, pd)
+    attributes |= {"drawn_share": share, "gain_pixels": own.gain(False), "gain_single": own.gain(True)}
+    return data
+
+
+def _image_trial(
+    renders: Sequence[xr.Dataset], seas: bool, camera: Camera, lidar: LidarScene, sky: float
+) -> ImageTrial:
+    """Return the light of the renders in the gates of a camera."""
+    assert lidar.gates is not None
+    shape, size = lidar.gates.train.shape, renders[0]["gate_light"].size
+    require_memory(
+        f"gates of {len(renders)} renders", _BYTES_PER_GATE * len(renders) * size, "take fewer or smaller ones"
+    )
+    light = np.moveaxis(np.stack([one["gate_light"].values for one in renders]), 1, 0)
+    return ImageTrial(light, seas, camera, float(shape.open_time(shape.span_ns[1])), lidar.gates.train.pulses, sky)
+
+
+def _in_images(
+    experiments: Sequence[ImageTrial],
+    stack: xr.Dataset,
+    depths: Sequence[float],
+    frames: int,
+    lidar: LidarScene,
+    attributes: dict[str, Any],
+) -> xr.Dataset:
+    """Return the result of gates of a camera."""
+    pfa, pd, numbers = attributes["pfa"], attributes["pd"], sorted({*_FRAMES, frames})
+    trial, dims = experiments[0], stack["gate_energy"].dims
+    if not trial.products.products.any():
+        raise UserError("target: it changes no light in the gates; check its place, and the start of the gates")
+    data: trials.Variables = {name: (dims, values) for name, values in trial.maps(frames).items()}
+    data |= images.detected(trial.products, numbers, pfa, pd)
+    assert lidar.gates is not None
+    train = lidar.gates.train
+    apart, most = round(train.width_ns / train.step_ns), 1
+    # Edges of adjoining gates add up to 1 where they are alike.
+    if math.isclose(apart * train.step_ns, train.width_ns) and train.rise_ns == train.fall_ns and train.profile is None:
+        most = min(_MOST_ADJOINING, 1 + (train.count - 1) // apart)
+    data |= images.single_gates(trial, range(1, most + 1), apart, frames, pfa)
+    for key in ("detection", "frames_needed") if depths else ():
+        dims = ("depth", "frames") if key == "detection" else ("depth",)
+        found = [images.detected(one.products, numbers, pfa, pd) for one in experiments[1:]]
+        for end in ("", "_low", "_high"):
+            data[f"{key}_at_depth{end}"] = dims, [one[f"{key}{end}"][1] for one in found]
+    data |= {"depth": ("depth", list(depths))} if depths else {}
+    built = stack.drop_vars(["gate_energy", "gate_energy_stderr", "gate_light"]).assign(data)
+    for name, units in (("background", "count"), ("difference", "count")):
+        built[name].attrs["units"] = units
+    statistic = trial.products.statistic(frames)
+    attributes |= {"frames": frames, "threshold": math.inf if statistic is None else float(statistic.threshold(pfa))}
+    return label(built.assign_attrs({**stack.attrs, **attributes}), "detection")
 
 
 def _experiment(
@@ -254,16 +350,28 @@ def describe_detected(found: xr.Dataset) -> str:
     """Return a sentence on whether the target of the scene is detected, from a result of `detect`."""
     attributes = found.attrs
     best = found.sel(combination="best")
-    value, low, high = (float(best[f"detection{end}"]) for end in ("", "_low", "_high"))
-    verdict = "detected" if low >= attributes["pd"] else "not detected" if high < attributes["pd"] else "undecided"
     others = {"one pixel for all light": "single", "the sum of the pixels": "sum"}
     parts = [f"{text} {_rate(float(found['detection'].sel(combination=name)))}" for text, name in others.items()]
     alone = [f"{name} {_rate(float(found['pixel_detection'].sel(pixel=name)))}" for name in found["pixel"].values]
     return (
-        f"{verdict}: P_d = {_rate(value)} ({_rate(low)} .. {_rate(high)}) with the best weighting of the pixels at "
-        f"P_fa = {attributes['pfa']:g}, P_d = {attributes['pd']:g} is required; {', '.join(parts)}; "
+        f"{_verdict(best, attributes, ' with the best weighting of the pixels')}; {', '.join(parts)}; "
         f"single pixels: {', '.join(alone)}"
     )
+
+
+def _verdict(one: xr.Dataset, attributes: Mapping[str, Any], how: str) -> str:
+    """Return whether the target is detected, from one probability with its interval."""
+    value, low, high = (float(one[f"detection{end}"]) for end in ("", "_low", "_high"))
+    verdict = "detected" if low >= attributes["pd"] else "not detected" if high < attributes["pd"] else "undecided"
+    return (
+        f"{verdict}: P_d = {_rate(value)} ({_rate(low)} .. {_rate(high)}){how} at "
+        f"P_fa = {attributes['pfa']:g}, P_d = {attributes['pd']:g} is required"
+    )
+
+
+def _noise(attributes: Mapping[str, Any]) -> str:
+    """Return what hides the target."""
+    return f"noise and {attributes['clutter']} seas" if attributes["clutter"] else "noise"
 
 
 def _rate(probability: float) -> str:
@@ -276,13 +384,14 @@ def describe_detection(found: xr.Dataset) -> list[str]:
 
     The tables are those of required levels, random shots, and depths if any.
     """
+    if "gate" in found.dims:
+        return _describe_images(found)
     attributes = found.attrs
-    noise = f"noise and {attributes['clutter']} seas" if attributes["clutter"] else "noise"
     needed = (("needed_target", 26, 100), ("gain_target", 24), ("needed_energy", 30, 100), ("gain_energy", 24))
     errors = (("depth_bias", 32, 1e3), ("depth_spread", 24, 1e3), ("depth_gain", 24))
     lines = [
         describe_detected(found),
-        f"{attributes['scene']}, receiver {attributes['receiver']}, {noise}; intervals of "
+        f"{attributes['scene']}, receiver {attributes['receiver']}, {_noise(attributes)}; intervals of "
         f"{100 * attributes['confidence']:g} %; gain {attributes['gain_pixels']:.3g} of the pixels, "
         f"{attributes['gain_single']:.3g} of one pixel for all light",
         f"needed for P_d = {attributes['pd']:g} at P_fa = {attributes['pfa']:g}, brightest pixel: "
@@ -300,6 +409,44 @@ def describe_detection(found: xr.Dataset) -> list[str]:
         for row in _rows(found, ("detectable_depth", 24)):
             needs = found["needed_at_depth"].sel(combination=row.split()[0]).values
             lines.append(f"{row[:11]}{''.join(f'{100 * float(value):>12.3g}' for value in needs)}{row[11:]}")
+    return lines
+
+
+def _describe_images(found: xr.Dataset) -> list[str]:
+    """Return the lines on a result of gates: the verdict, the strongest pixels, the best gates, frames, and depths."""
+    attributes, frames = found.attrs, found.attrs["frames"]
+    own, pixels = found.sel(frames=frames), [str(found.sizes[dim]) for dim in found["snr"].dims if dim != "gate"]
+    each = f"{frames} frame{'s' * (frames > 1)} of each of {found.sizes['gate']} gates"
+    lines = [
+        f"{_verdict(own, attributes, f' with the best weighting of pixels and gates, {each},')}; frames needed: "
+        f"{_interval(found, 'frames_needed', 0)}",
+        f"{attributes['scene']}, receiver {attributes['receiver']}, {_noise(attributes)}; intervals of "
+        f"{100 * attributes['confidence']:g} %; {'x'.join(pixels)} pixels",
+    ]
+    ratio = found["contrast_to_noise"]
+    for name, places in (("brighter", ratio.argmax(ratio.dims)), ("darker", ratio.argmin(ratio.dims))):
+        one = found.isel(places)
+        where = ", ".join(f"{dim} {one[dim].item()}" for dim in ratio.dims)
+        lines.append(
+            f"{name} by the target, most clearly in {where} ({float(one['gate_depth']):.2f} m): contrast "
+            f"{float(one['contrast']):.3g}, contrast-to-noise ratio of a frame {float(one['contrast_to_noise']):.3g} "
+            f"+- {float(one['contrast_to_noise_stderr']):.1g}"
+        )
+    lines.append(f"{'best single gate':<18}{'width (ns)':>12}{'from (ns)':>12}{'middle (m)':>12}{'P_d':>9}")
+    start, width, depth = (found[f"gate_{name}"].values for name in ("start", "width", "depth"))
+    for row, count in enumerate(found["adjoining"].values):
+        best = int(np.nanargmax(found["gate_deflection"].values[row]))
+        last = best + (count - 1) * round(width[0] / attributes["gate_step_ns"])
+        detected = _rate(float(found["gate_detection"].values[row, best]))
+        middle = 0.5 * (depth[best] + depth[last])
+        lines.append(f"{'':<18}{count * width[0]:>12.3g}{start[best]:>12.1f}{middle:>12.2f}{detected:>9}")
+    counts = found["frames"].values[:_SHOWN_FRAMES]
+    lines.append(f"{'P_d with frames':<18}{''.join(f'{count:>9}' for count in counts)}{'frames needed':>24}")
+    at_depths = found["depth"].values.tolist() if "depth" in found.dims else []
+    rows = [(f"{place:g} m", found.sel(depth=place), "_at_depth") for place in at_depths]
+    for name, one, end in [("", found, ""), *rows]:
+        rates = "".join(f"{_rate(float(one[f'detection{end}'].sel(frames=count))):>9}" for count in counts)
+        lines.append(f"{name:<18}{rates}{_interval(one, f'frames_needed{end}', 24)}")
     return lines
 
 

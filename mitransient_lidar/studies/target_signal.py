@@ -15,13 +15,17 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.accuracy import PassStatistics
+from mitransient_lidar.rendering.accumulators import PassAccumulator
+from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.describe import describe_scene
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.gate_stack import check_train
 from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.studies.cases import Cases
+from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.solids import shape_groups
 
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
@@ -100,10 +104,7 @@ def target_signal(
         options |= {"instrument": instrument, "max_time": max_time, "axis": axis, "progress": progress}
         return target_map(scene, params, offsets, offsets, **options)
     session = open_scene(scene, params, instrument)
-    bare = _without(session.scene, target_id)
-    chosen = choose_integrator(session.scene, integrator)
-    with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)
-    without = chosen.prepare(bare, session.sensor, layout_of=with_target, connections=False)
+    chosen, with_target, without = _pair(session, target_id, integrator, axis)
     lidar = with_target.scene
     pixels, pulse = lidar.receiver.pixels, lidar.transmitter.pulse
     if pixels.grid is not None:
@@ -161,6 +162,64 @@ def target_map(
     lines = [xr.concat(row, "target_y", combine_attrs="drop_conflicts") for row in rows]
     maps = xr.concat(lines, "target_x", combine_attrs="drop_conflicts")
     return maps.assign_coords(target_x=places[0], target_y=places[1])
+
+
+def target_gates(
+    session: LoadedScene,
+    *,
+    target_id: str = "target",
+    passes: int = 64,
+    seed: int = 0,
+    integrator: Any = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render the gates of a scene with and without a target, on the same random numbers, for any number of pixels.
+
+    Returns
+    -------
+    xarray.Dataset
+        A gate stack of the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
+        without), ``half`` (of the passes), and its dimensions.
+
+    Raises
+    ------
+    UserError
+        If the scene has no gates, or as for `target_signal`.
+    """
+    chosen, *renderers = _pair(session, target_id, integrator, None)
+    lidar = renderers[0].scene
+    if lidar.gates is None:
+        raise UserError(
+            f"scene {session.name} has no gates, which a camera needs: give its film gate_width_ns and gate_start_depth"
+        )
+    train, window = lidar.gate_train(lidar.gates), ErrorWindow.of_probe(renderers[0].probe)
+    check_train(train, {}, lidar.axis)
+    halves = [[PassAccumulator(lidar, window, train, kept="direct") for _ in renderers] for _ in range(2)]
+
+    def render_pass(number: int, seed: int) -> float:
+        for gates, renderer in zip(halves[number % 2], renderers, strict=True):
+            received = renderer.render_pass(seed, gates=gates.gate_weights)
+            gates.add(received.histogram)
+        return received.edge_loss
+
+    log = run_passes(render_pass, Goal(passes=passes), seed=seed, smallest=_GROUPS, progress=progress)
+    warn_of_edge_loss(log.edge_loss_share(sum(one[1].received for one in halves)))
+    geometry = describe_scene(renderers[0].probe, window, renderers[0].focusing)
+    stack = halves[0][0].dataset(
+        session.attributes(lidar, chosen, target=target_id, **log.attributes(seed), **geometry)
+    )
+    energy = stack["gate_energy"]
+    light = [[half[kind].gates.mean.reshape(energy.shape) for half in halves] for kind in (0, 1)]
+    return stack.assign(gate_light=(("kind", "half", *energy.dims), np.array(light, np.float32)))
+
+
+def _pair(
+    session: LoadedScene, target_id: str, integrator: Any, axis: TimeAxis | None
+) -> tuple[LidarIntegrator, PassRenderer, PassRenderer]:
+    """Return the integrator, and renderers of the scene with and without the target, of the same layout."""
+    bare, chosen = _without(session.scene, target_id), choose_integrator(session.scene, integrator)
+    with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)
+    return chosen, with_target, chosen.prepare(bare, session.sensor, layout_of=with_target, connections=False)
 
 
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:

@@ -34,7 +34,7 @@ CONFIDENCE = 0.95
 
 _LEVELS = (1e-8, 1e4)  # smallest and largest fraction of the target's signal, or of the pulse energy
 _DELAYS = 41  # of the matched filter
-_GROUPS, _MOST_GROUPS = 20, 10  # jackknife groups of shots of one scene, and largest number of groups of renders
+_GROUPS, MOST_GROUPS = 20, 10  # jackknife groups of shots of one scene, and largest number of groups of renders
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Level:
         log, changes = self.log, self.changes
         if other is not None:
             log, changes = other.log - log, other.changes - changes
-        value, low, high = _interval(log, changes)
+        value, low, high = interval(log, changes)
         return math.exp(value), math.exp(low), math.exp(high)
 
 
@@ -74,7 +74,7 @@ class Experiment:
     @property
     def groups(self) -> int:
         """Number of groups of renders for the jackknife."""
-        return min(len(self.background), _MOST_GROUPS)
+        return min(len(self.background), MOST_GROUPS)
 
     def light(self, share: float, energy: float, left_out: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Return powers [W] without and with a fraction of the target's signal, shape (cases, pixels, time).
@@ -172,8 +172,8 @@ def needs(trial: Experiment, pfa: float, pd: float) -> Variables:
     data: Variables = {"deflection": ("combination", deflections)}
     for kind in ("target", "energy"):
         levels = [trial.needed(name, kind, pfa, pd) for name in COMBINATIONS]
-        data |= _with_limits(f"needed_{kind}", [level.limits() for level in levels])
-        data |= _with_limits(f"gain_{kind}", [level.limits(levels[0]) for level in levels])
+        data |= with_limits(f"needed_{kind}", [level.limits() for level in levels])
+        data |= with_limits(f"gain_{kind}", [level.limits(levels[0]) for level in levels])
     return data
 
 
@@ -193,12 +193,12 @@ def detected(trial: Experiment, pfa: float) -> Variables:
     def limits(name: str | int) -> FloatArray:
         value = quantile(name)
         changes = np.array([quantile(name, i) for i in range(trial.groups)]) - value
-        return np.asarray(ndtr(_interval(value, changes)))
+        return np.asarray(ndtr(interval(value, changes)))
 
     pixels = range(trial.background.shape[1])
     return {
-        **_with_limits("detection", [limits(name) for name in COMBINATIONS]),
-        **_with_limits("pixel_detection", [limits(pixel) for pixel in pixels], dims=("pixel",)),
+        **with_limits("detection", [limits(name) for name in COMBINATIONS]),
+        **with_limits("pixel_detection", [limits(pixel) for pixel in pixels], dims=("pixel",)),
     }
 
 
@@ -234,10 +234,10 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
         "false_alarm": ("false_alarm", nominal),
         "expected_detection": (along, rates["expected_detection"]),
         "expected_area": ("combination", rates["expected_area"]),
-        **_with_limits("area", rates["area"]),
+        **with_limits("area", rates["area"]),
     }
     for key in ("drawn_false_alarm", "drawn_detection"):
-        data |= _with_limits(key, np.moveaxis(np.array(rates[key]), 1, -1), dims=along)
+        data |= with_limits(key, np.moveaxis(np.array(rates[key]), 1, -1), dims=along)
     return data
 
 
@@ -268,11 +268,11 @@ def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float,
     for name in COMBINATIONS:
         groups = list(depths[name]) if count > 1 else np.array_split(depths[name][0], _GROUPS)
         levels[name] = Level(*_jackknife(groups, lambda errors: math.log(np.std(errors, ddof=1))))
-        bias.append(_interval(*_jackknife(groups, lambda errors: float(np.mean(errors)))))
+        bias.append(interval(*_jackknife(groups, lambda errors: float(np.mean(errors)))))
     return {
-        **_with_limits("depth_bias", bias),
-        **_with_limits("depth_spread", [levels[name].limits() for name in COMBINATIONS]),
-        **_with_limits("depth_gain", [levels[name].limits(levels["single"]) for name in COMBINATIONS]),
+        **with_limits("depth_bias", bias),
+        **with_limits("depth_spread", [levels[name].limits() for name in COMBINATIONS]),
+        **with_limits("depth_gain", [levels[name].limits(levels["single"]) for name in COMBINATIONS]),
         "depth_bound": ("combination", [bounds[name] for name in COMBINATIONS]),
     }
 
@@ -283,17 +283,17 @@ def by_depth(trials: Sequence[Experiment], places: Sequence[float], pfa: float, 
     reached = []
     for row in table:
         left_out = range(len(row[0].changes))
-        changes = [_crossing(places, [level.log + level.changes[i] for level in row]) for i in left_out]
-        reached.append(_interval(_crossing(places, [level.log for level in row]), np.array(changes)))
+        changes = [crossing(places, [level.log + level.changes[i] for level in row]) for i in left_out]
+        reached.append(interval(crossing(places, [level.log for level in row]), np.array(changes)))
     needed = [[level.limits() for level in row] for row in table]
     return {
         "depth": ("depth", list(places)),
-        **_with_limits("needed_at_depth", needed, dims=("combination", "depth")),
-        **_with_limits("detectable_depth", reached),
+        **with_limits("needed_at_depth", needed, dims=("combination", "depth")),
+        **with_limits("detectable_depth", reached),
     }
 
 
-def _crossing(places: Sequence[float], logs: Sequence[float]) -> float:
+def crossing(places: Sequence[float], logs: Sequence[float]) -> float:
     """Return the first place where logarithms rise through 0, NaN if there is none."""
     for i in range(len(places) - 1):
         if logs[i] <= 0 < logs[i + 1]:
@@ -325,7 +325,7 @@ def _jackknife(groups: Sequence[FloatArray], measure: Callable[[FloatArray], flo
     return value, np.array(rest) - value
 
 
-def _interval(value: float, changes: FloatArray) -> tuple[float, float, float]:
+def interval(value: float, changes: FloatArray) -> tuple[float, float, float]:
     """Return a value and the limits of its confidence interval from a jackknife's changes, by Student's t."""
     from scipy.stats import t
 
@@ -333,7 +333,7 @@ def _interval(value: float, changes: FloatArray) -> tuple[float, float, float]:
     return value, value - reach, value + reach
 
 
-def _with_limits(name: str, values: npt.ArrayLike, dims: tuple[str, ...] = ("combination",)) -> Variables:
+def with_limits(name: str, values: npt.ArrayLike, dims: tuple[str, ...] = ("combination",)) -> Variables:
     """Return a variable and the limits of its interval, the last axis of the values."""
     table = np.array(values, dtype=np.float64)
     return {f"{name}{end}": (dims, table[..., i]) for i, end in enumerate(("", "_low", "_high"))}

@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
-from mitransient_lidar.results.gate_stack import average_frames
+from mitransient_lidar.results.gate_stack import as_stack, average_frames, has_frames
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
@@ -122,7 +122,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack of at least 3 gates, of which the last dimension is ``gate``.
+        A gate stack of at least 3 gates, of which the last dimension is ``gate``; or frames of a camera, whose mean
+        above the level without light counts, with the noise of frames and the error of the render.
     reach : int, optional
         As for `range_from_gates`.
 
@@ -144,7 +145,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
     axis's scale of depth.
     """
-    stack = average_frames(dataset_of("stack", stack, "gates"))
+    stack = dataset_of("stack", stack, "gates", "frames")
+    stack = _light_of_frames(stack) if has_frames(stack) else average_frames(stack)
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
@@ -174,6 +176,14 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     return DepthImage(depth, found.sigma * per_ns, method, found.confidence)
 
 
+def _light_of_frames(frames: xr.Dataset) -> xr.Dataset:
+    """Return the mean of frames as a gate stack, whose errors are those of the noise and of the render [DN]."""
+    stack, rendered = as_stack(frames), frames["signal_mean_stderr"]
+    if "frame" in rendered.dims:  # of as many seas
+        rendered = (rendered**2).mean("frame") ** 0.5 / math.sqrt(frames.sizes["frame"])
+    return stack.assign(gate_energy_stderr=(stack["gate_energy_stderr"] ** 2 + rendered**2) ** 0.5)
+
+
 def _column(
     stack: xr.Dataset, found: RangeImage, lines: LinesOfSight, geometry: LidarGeometry, pulse_ns: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -197,8 +207,9 @@ def _column(
         return unknown, unknown
     # The sum of the pixels' columns from their surfaces on has this logarithm at time 0.
     gathered = np.log(np.sum(lines.beam_share * np.exp(-slope * (lines.surface_time - middles[0]))))
+    in_joules = stack["gate_energy"].attrs.get("units") != "DN"  # as of frames, whose level is no power
     open_s = 1e-9 * float(width[0]) * float(stack.attrs.get("pulses", 1))
-    level = math.exp(start + slope * middles[0] - gathered) / open_s
+    level = math.exp(start + slope * middles[0] - gathered) / open_s if in_joules else math.nan
     return np.full(unknown.size, -0.5 * slope / geometry.metres_per_ns), lines.beam_share * level
 
 
@@ -274,8 +285,15 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
         depth = np.sum(weight * place, axis=1) / total
         lever = np.where(inside, place - depth[:, None], 0) / total[:, None]
         variance = np.sum((lever * np.take_along_axis(s, window, 1)) ** 2, axis=1)
-        shift = np.sum(np.where(limited | (weight == 0), 0, lever * level), axis=1)
-        variance += shift**2 * np.take_along_axis(background_variance, at_peak, 1)[:, 0]
+        # The column's error moves all its gates, and that of its slope those more that are farther behind its gates.
+        shift = np.where(limited | (weight == 0), 0, lever * level)
+        own, tilt = shift.sum(axis=1, keepdims=True), np.sum(shift * away, axis=1, keepdims=True)
+        falls, ends = (np.take_along_axis(one, at_peak, 1) for one in (slope < 0, before < between))
+        weights = np.where(ends, column.between.T[peak], column.mean.T[peak])
+        turned = np.where(falls, tilt + np.where(ends, 0, own * column.lever[at_peak]), 0)
+        variance += np.sum((own * weights + turned * column.slope.T[peak]) ** 2 * log_variance, axis=1)
+        behind = np.sum(np.where(limited & (weight > 0) & (deep > 0), lever, 0), axis=1, keepdims=True)
+        variance += np.sum((behind * column.deep.T[peak] * s) ** 2, axis=1)
     found = known & (z_peak > 0)
     confidence = ndtr(z_peak) ** (column.mid.size - column.first)
     return np.stack(

@@ -29,7 +29,7 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gate_viewer.time_bins import RECORDS, one_record, time_bins
 from mitransient_lidar.plots.gates.images import known_depths
 from mitransient_lidar.results.dataset import time_axis
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import as_stack, has_frames
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,10 +70,11 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
         the map shows one time bin; of a series of shots, the page shows the mean. Pixels with outlines
         (``pixel_outlines``) have their shapes.
 
-        Or a gate stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with
-        the coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of
-        the surface echo is known, ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along
-        them, and those of gates and times are on the receiver's axis.
+        Or frames of a camera, of which the page shows the mean above the dark level, or a gate stack: ``gate_energy``
+        and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start``
+        and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of the surface echo is known,
+        ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along them, and those of gates and
+        times are on the receiver's axis.
     result : xarray.Dataset, optional
         A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms the
         record of a pixel is its energy in the gates.
@@ -88,11 +89,12 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None
-    if is_record := "gate_energy" not in stack and bool({*RECORDS} & {*stack.data_vars}):
+    gated_already = "gate_energy" in stack or has_frames(stack)
+    if is_record := not gated_already and bool({*RECORDS} & {*stack.data_vars}):
         record = one_record(stack)
         gated = time_bins(record)
     else:
-        gated = check_stack(stack)
+        gated = as_stack(stack)
         record = _record(gated, stack if result is None and "waveform" in stack else result)
         gated = drawing.as_seen(gated)
     frame = _frame()
@@ -104,7 +106,7 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     for note in notes:
         _LOG.warning("the page: %s", note)
     metadata = _metadata(gated, record, gates, waveforms) | {"notes": notes}
-    metadata |= _words(record if is_record else None)
+    metadata |= _words(record if is_record else None, gated)
     filled = {
         "policy": _POLICY,
         "title": html.escape(metadata["title"]),
@@ -262,10 +264,12 @@ def _quantity(record: xr.Dataset) -> dict[str, str]:
     return {"name": str(about.get("long_name", "received power")), "unit": "" if unit == "1" else unit}
 
 
-def _words(record: xr.Dataset | None) -> dict[str, Any]:
-    """Return names and units of what the page shows: energies in gates, or the values of a record in its time bins."""
+def _words(record: xr.Dataset | None, gated: xr.Dataset) -> dict[str, Any]:
+    """Return names and units of what the page shows: values of gates, or those of a record in its time bins."""
     if record is None:
-        return {"slice": "gate", "quantity": {"name": "energy in the gate", "unit": "J"}, "sum": 1.0}
+        about = gated["gate_energy"].attrs
+        quantity = {"name": about["long_name"], "unit": about["units"]}
+        return {"slice": "gate", "quantity": quantity, "sum": 1.0 if about["units"] == "J" else None}
     quantity = _quantity(record)
     # The energy after a time is the sum of powers times the width of a bin.
     total = 1e-9 * time_axis(record).bin_width_ns if quantity["unit"] == "W" else None

@@ -14,7 +14,7 @@ from mitransient_lidar.analysis.gates.range_images import DepthImage, depth_imag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import known_depths, reached_by_surface
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import optional_number
 
 _NAMED_PIXELS = 16  # on an axis
@@ -39,7 +39,7 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
         If the dataset is no gate stack, has no depths, or fewer than three gates are left.
     """
     figure = drawing.new_figure(path, 9.6, 4.3)
-    stack = check_stack(dataset)
+    stack = as_stack(dataset)
     depths = known_depths(stack)
     if depths is None:
         raise UserError("the stack has no gate_depth, since the time of its surface echo is unknown.")

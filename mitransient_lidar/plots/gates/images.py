@@ -24,7 +24,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.gate_stack import check_stack
+from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import optional_number
 
 _LIT = 0.01  # share of the beam in a lit pixel, relative to the brightest
@@ -62,7 +62,9 @@ class ColourScale(NamedTuple):
 
 
 def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: bool = False) -> Figure:
-    """Draw a contact sheet of a gate stack on one common scale; of pixels without an image, their energy against depth.
+    """Draw a contact sheet of gates on one common scale; of pixels without an image, their energy against depth.
+
+    Of frames of a camera, their mean above the dark level is drawn (`results.gate_stack.as_stack`).
 
     Of more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the surface
     (at its 99th percentile), so that the surface echo does not darken the rest; the label of the colour bar gives the
@@ -74,7 +76,7 @@ def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: b
         If the dataset is no gate stack.
     """
     figure = drawing.new_figure(path, 9.6, 4.6)
-    stack = check_stack(dataset)
+    stack = as_stack(dataset)
     (_draw_pixel_gates if "pixel" in stack.dims else _draw_sheet)(figure, stack, log=log)
     return drawing.save(figure, path)
 
@@ -118,7 +120,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
         raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4.")
-    stack = check_stack(dataset)
+    stack = as_stack(dataset)
     check_animation(stack, path)
     figure, show = _animated_figure(stack, log=log)
     # The layout is computed once, so that frames do not shift against each other.
@@ -154,18 +156,26 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
     if top <= 0:
         top = float(finite.max()) if finite.max() > 0 else 1.0
     brighter = np.count_nonzero(finite > top) / finite.size
-    factor, prefix = drawing.si_prefix(top)
-    label = f"energy in the gate ({prefix}J)"
+    factor, unit = unit_of(stack, top)
+    label = f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit})"
     if brighter:
         surface = "" if below.all() else ", including the surface echo,"
         label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
     if not log:
-        return ColourScale(factor, f"{prefix}J", Normalize(0.0, top / factor), label, "max" if brighter else "neither")
+        return ColourScale(factor, unit, Normalize(0.0, top / factor), label, "max" if brighter else "neither")
     significant = finite[(finite > SIGNIFICANT * stderr) & (finite > 0)]
     bottom = max(top * 10.0**-_DECADES, float(np.percentile(significant, 1)) if significant.size else 0.0)
     # Clipped, so that values of 0 and below are dark and not missing.
     norm = LogNorm(min(bottom, 0.5 * top) / factor, top / factor, clip=True)
-    return ColourScale(factor, f"{prefix}J", norm, label, "both" if brighter else "min")
+    return ColourScale(factor, unit, norm, label, "both" if brighter else "min")
+
+
+def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
+    """Return factor and name of the unit in which values of `as_stack` up to the largest one are drawn."""
+    if (unit := stack["gate_energy"].attrs.get("units", "J")) != "J":
+        return 1.0, str(unit)
+    factor, prefix = drawing.si_prefix(largest)
+    return factor, f"{prefix}J"
 
 
 def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
@@ -277,7 +287,7 @@ def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
     names = [str(name) for name in stack["pixel"].values]
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     top = float(np.nanmax(energy, initial=0.0))
-    factor, prefix = drawing.si_prefix(top)
+    factor, unit = unit_of(stack, top)
     significant = energy[energy > SIGNIFICANT * stderr]
     floor = max(0.5 * float(significant.min(initial=top)), top * 10.0**-_PIXEL_DECADES) / factor
     depths = known_depths(stack)
@@ -293,6 +303,6 @@ def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
     if len(names) <= drawing.LISTED_PIXELS:
         ax.legend(title="pixel", frameon=False)
     ax.set_xlabel("start of the gate (ns)" if depths is None else "depth of the gate's middle (m)")
-    ax.set_ylabel(f"energy in the gate ({prefix}J)")
+    ax.set_ylabel(f"{stack['gate_energy'].attrs['long_name']} ({unit})")
     drawing.add_grid(ax)
     ax.set_title(_title(stack, stack.sizes["gate"]))

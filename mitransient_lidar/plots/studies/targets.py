@@ -101,8 +101,11 @@ _GAINS = {
 def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
 
-    `found` is a result of `studies.detection.detect`.
+    `found` is a result of `studies.detection.detect`. Of gates: the gates in which the target is brightest and darkest
+    against the noise, the weights of their sum, and the detection with frames and single gates.
     """
+    if "gate" in found.dims:
+        return _plot_image_detection(found, path)
     figure = drawing.new_figure(path, 12.5, 7.6)
     light, characteristic, required, gains, errors, depths = figure.subplots(2, 3).flat
     _draw_light(light, found)
@@ -129,6 +132,54 @@ def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     figure.suptitle(
         f"{attributes['scene']}, receiver {attributes['receiver']}: detection in {noise}, "
         f"{100 * attributes['confidence']:g} % confidence intervals"
+    )
+    return drawing.save(figure, path)
+
+
+def _plot_image_detection(found: xr.Dataset, path: drawing.FilePath | None) -> Figure:
+    """Draw the detection in gates."""
+    figure = drawing.new_figure(path, 12.5, 7.6)
+    axes, ratio = list(figure.subplots(2, 3).flat), found["contrast_to_noise"]
+    best = [int(ratio[place]["gate"]) for place in (ratio.argmax(ratio.dims), ratio.argmin(ratio.dims))]
+    shown = [(gate, "contrast_to_noise", "contrast-to-noise ratio of a frame") for gate in best]
+    for ax, (gate, name, label) in zip(axes, [*shown, (best[0], "filter_weight", "weight (1/DN)")], strict=False):
+        values, depth = found[name].sel(gate=gate), float(found["gate_depth"].sel(gate=gate))
+        reach = float(np.abs(found[name]).max()) or 1.0
+        style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -reach, "vmax": reach}
+        if "row" in found.dims:
+            image = drawing.draw_image(ax, values.transpose("row", "column").values, found, **style)
+            figure.colorbar(image, ax=ax, label=label, shrink=0.8)
+        else:
+            ax.bar([str(pixel) for pixel in found["pixel"].values], values)
+            ax.set_ylabel(label)
+        ax.set_title(f"gate {gate}, {depth:.2f} m", fontsize="medium")
+    frames, single, depths, pd = *axes[3:], found.attrs["pd"]
+    rates = {"": found} | {f" at {depth:g} m": found.sel(depth=depth) for depth in found.get("depth", xr.DataArray([]))}
+    for name, one in rates.items():
+        value, low, high = (one[f"detection{'_at_depth' if name else ''}{end}"].values for end in ("", "_low", "_high"))
+        line: dict[str, Any] = {"label": f"target{name}", "marker": ".", "linewidth": 1.3}
+        drawing.draw_band(frames, found["frames"].values, value, np.array([value - low, high - value]), **line)
+    finish(frames, "all gates", zero=pd, xscale="log", ylim=(0, 1.02), xlabel="frames of each gate", ylabel="$P_d$")
+    frames.legend(frameon=False, fontsize="small")
+    width = float(found["gate_width"][0])
+    for count in found["adjoining"].values:
+        rate = found["gate_detection"].sel(adjoining=count).values
+        single.plot(found["gate_start"], rate, marker=".", linewidth=1.3, label=f"{count * width:.3g} ns")
+    of_frames = f"{found.attrs['frames']} frame{'s' * (found.attrs['frames'] > 1)}"
+    finish(
+        single, f"a single gate, {of_frames}", zero=pd, ylim=(0, 1.02), xlabel="start of the gate (ns)", ylabel="$P_d$"
+    )
+    single.legend(title="width", frameon=False, fontsize="small")
+    if "depth" in found.dims:
+        value, low, high = (found[f"frames_needed_at_depth{end}"].values for end in ("", "_low", "_high"))
+        seen = np.isfinite(value)
+        bars = [(value - low)[seen], np.where(np.isfinite(high), high - value, 0)[seen]]
+        depths.errorbar(found["depth"].values[seen], value[seen], bars, marker="o", linewidth=1.3)
+        finish(depths, f"for $P_d$ = {pd:g}", yscale="log", xlabel="depth of the target (m)", ylabel="frames needed")
+    else:
+        depths.axis("off")
+    figure.suptitle(
+        drawing.titled(found.attrs, f"receiver {found.attrs['receiver']}, $P_{{fa}}$ = {found.attrs['pfa']:g}")
     )
     return drawing.save(figure, path)
 

@@ -46,10 +46,17 @@ _POINTS_OF_LIGHT = 0.8
 #: Capacity for segments and hits over the need of the last pass.
 _CAPACITY_MARGIN = 1.25
 
+#: Of this many paths of an image, the points in the water of one are merged: half of its time was theirs, and bottoms
+#: and targets need more paths. Where they are few, passes have more, as their light takes time, too.
+_EVERY_IN_IMAGES, _PATHS_PER_IMAGE_PIXEL, _PATHS_OF_IMAGE = 2, 32, 2**20
+
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
     """Return the number of sensor paths of a pass for a number of pixels."""
-    return options.paths_per_pass or min(max(_PATHS, _PATHS_PER_PIXEL * pixels), _MOST_PATHS)
+    paths = min(max(_PATHS, _PATHS_PER_PIXEL * pixels), _MOST_PATHS)
+    if pixels >= IMAGE_PIXELS:
+        paths = max(min(_PATHS_PER_IMAGE_PIXEL * pixels, _PATHS_OF_IMAGE), paths)
+    return options.paths_per_pass or paths
 
 
 class MergingRenderer(PassRenderer):
@@ -133,7 +140,7 @@ class MergingRenderer(PassRenderer):
 
         def size(light: float, sensor: float) -> float:
             of_light = self.photons * memory_of_path(light, points, sums, layout.hits)
-            return count * (of_light + paths * memory_of_path(sensor, points, sums))
+            return count * (of_light + paths // self._every(paths) * memory_of_path(sensor, points, sums))
 
         needed, wanted = layout.least_segments, (layout.light_segments, layout.sensor_segments)
         least, most = size(*needed), size(*wanted)
@@ -142,6 +149,11 @@ class MergingRenderer(PassRenderer):
         if taken < most:
             share = (taken - least) / (most - least)
             layout.light_segments, layout.sensor_segments = np.add(needed, share * np.subtract(wanted, needed)).tolist()
+
+    def _every(self, paths: int) -> int:
+        """Return of how many paths of the receiver one is merged in the water."""
+        is_image = self.scene.receiver.pixels.count >= IMAGE_PIXELS
+        return _EVERY_IN_IMAGES if is_image and paths % _EVERY_IN_IMAGES == 0 else 1
 
     def _trace_light(
         self, received: ReceivedLight, shots: Shots, patches: SolidPatches, rates: ConnectionRates
@@ -205,8 +217,10 @@ class MergingRenderer(PassRenderer):
         scene, patches_of_paths, rates_of_paths = lanes.pick((self.scene, patches, rates))
         rng = shots.streams(_SENSOR_STREAM, lanes)
         start = self.sampler.sample_shots(lanes, paths, rng)
+        every = self._every(paths)
+        count //= every
         capacity = int(layout.sensor_segments * count)
-        segments = SegmentBuffer(scene, self.classes, layout.spacing, paths, capacity, shots.count)
+        segments = SegmentBuffer(scene, self.classes, layout.spacing, paths, capacity, shots.count, every)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.walking(scene, scene.receiver_pose, start.angles, start.weight, offset)
         path.pixel = start.pixel

@@ -44,18 +44,26 @@ _FIELDS = {
 class SegmentBuffer:
     """Segments in the water of `paths` paths of each shot, with points at equal distances `spacing` [m] along them.
 
-    At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path.
+    At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path. Of each
+    `every` neighbouring paths, one in turn is stored, and stands for all of them.
     """
 
     def __init__(
-        self, scene: LidarScene, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
+        self,
+        scene: LidarScene,
+        classes: PathClasses,
+        spacing: float,
+        paths: int,
+        capacity: int,
+        shots: int = 1,
+        every: int = 1,
     ) -> None:
         self._water, self._perturbations, self._classes = scene.required_water, scene.perturbations, classes
-        self.paths, self._shots = paths, shots
+        self.paths, self._shots, self._every = paths // every, shots, every
         self.spacing = opaque(spacing)
         self.capacity, self._capacity = capacity, opaque_index(capacity)
         self._stored = dr.zeros(mi.UInt32, 1)
-        self._of_path = dr.zeros(mi.UInt32, shots * paths)
+        self._of_path = dr.zeros(mi.UInt32, shots * self.paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
         self._segments = PackedStore(capacity, {**_FIELDS, "sums": self._perturbations.count})
         self._end = mi.UInt32()
@@ -65,13 +73,19 @@ class SegmentBuffer:
     def add(self, path: RandomWalkPath, length: mi.Float, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path, of a length [m]; return the offset of the first point beyond it [m]."""
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
+        lane, throughput = path.lane, mi.Float(path.throughput)
+        if self._every > 1:
+            lane = path.lane // self._every
+            active &= path.lane - lane * self._every == lane % self._every
+            throughput *= self._every
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
         keep = (number > 0) & (slot < self._capacity)
-        dr.scatter(self._place, mi.Point2u(path.lane, path.points), slot, keep)
-        self._segments.write({**vars(path), "label": self._classes.pack(path)}, slot, keep)
+        dr.scatter(self._place, mi.Point2u(lane, path.points), slot, keep)
+        values = {**vars(path), "throughput": throughput, "label": self._classes.pack(path)}
+        self._segments.write(values, slot, keep)
         path.points += number
-        dr.scatter(self._of_path, path.points, path.lane, number > 0)
+        dr.scatter(self._of_path, path.points, lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def finalize(self) -> tuple[int, int]:

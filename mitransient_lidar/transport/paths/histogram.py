@@ -196,6 +196,17 @@ class TransientHistogram:
         """Return the energy [J] as float64, shape `shape`; NaN where a value was added that is not finite."""
         return np.asarray(self._channels(slice(0, 1))[0])
 
+    def energy_of(self, pixels: slice) -> np.ndarray:
+        """Return `energy` of some pixels of a row of them, shape (pixels, bins), without other arrays of all."""
+        shape = (-1, self.record_length)
+        coarse, fine = (
+            self._sums.numpy()[first : first + self._each].reshape(shape)[pixels] * unit
+            for first, unit in zip((0, self._count + 1), self._units, strict=True)
+        )
+        found = np.asarray(coarse + fine)
+        found[self._invalid.numpy()[: self._each].reshape(shape)[pixels] > 0] = np.nan
+        return found
+
     def perturbed(self) -> np.ndarray:
         """Return the derivatives of the energy, or the perturbed energies, shape (perturbation, *shape)."""
         return self._channels(slice(1, None))

@@ -26,8 +26,8 @@ PUBLISHED_NAMES = ("red", "green", "blue", "black")
 #: Layouts of more pixels than this are imagers by default.
 _LARGEST_LAYOUT = 16
 
-#: Largest number of pixels of a receiver.
-MOST_PIXELS = 2**20
+#: Largest number of pixels of a receiver, and of one of rows and columns.
+MOST_PIXELS, _MOST_OF_LAYOUT = 2**20, 2**22
 
 #: Points in each pixel that find overlaps.
 _OVERLAP_POINTS = 4096
@@ -295,12 +295,12 @@ def parse_layout(layout: str) -> tuple[int, int]:
     Raises
     ------
     UserError
-        When the text is not two positive integers with an x between them, or has more than 2^20 pixels.
+        When the text is not two positive integers with an x between them, or has more than 2^22 pixels.
     """
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", layout)
     if not match:
         raise UserError(f"layout = {layout!r} must be rows x columns, such as 1x1, 2x2, 1x4 or 128x128, or hex7")
     rows, columns = int(match.group(1)), int(match.group(2))
-    if rows * columns > MOST_PIXELS:
-        raise UserError(f"layout = {layout!r} has {rows * columns} pixels; allowed are at most {MOST_PIXELS}")
+    if rows * columns > _MOST_OF_LAYOUT:
+        raise UserError(f"layout = {layout!r} has {rows * columns} pixels; allowed are at most {_MOST_OF_LAYOUT}")
     return (4, 1) if (rows, columns) == (1, 4) else (rows, columns)

@@ -63,7 +63,7 @@ TABLE1 = {
     ("4e7", "must lie between -1e+07 and 1e+07"): "aim_x aim_y",
     ("2by2", "must be rows x columns"): "layout",
     ("0x2", "layout"): "layout",
-    ("9999x9999", "at most 1048576"): "layout",
+    ("9999x9999", "at most 4194304"): "layout",
     ("hex8", "hexagons"): "layout",
     ("swell", "must be one of"): "spectrum",
     ("mie", "must be one of"): "phase_function",

@@ -119,7 +119,7 @@ REFUSED = {
     "multipixel_receiver": [
         ({"layout": "2by2"}, "layout = '2by2' must be rows x columns"),
         ({"layout": "0x2"}, "layout = '0x2'"),
-        ({"layout": "9999x9999"}, "at most 1048576"),
+        ({"layout": "9999x9999"}, "at most 4194304"),
         ({"layout": "2x2", "a": CIRCLE}, "layout = '2x2' and a nested sensor describe"),
         ({"a": {"type": "perspective"}}, "nested sensors must be pixel_fov"),
         ({"a": {"type": "layered_water"}}, "multipixel_receiver: a medium inside it would"),

@@ -316,6 +316,71 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     assert "noise and 4 seas" in detection.describe_detection(found)[1]
 
 
+GATES = {"layout": "8x8", "gate_start_depth": 4, "gate_width_ns": 6, "gate_step_ns": 3, "gate_count": 5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clutter", [0, 4])
+def test_images_of_a_camera_are_filtered(monkeypatch, tmp_path, clutter):
+    """A target of a pixel that shines in gate 1 and darkens gate 3, at its depth and at 5 m, where it is brighter."""
+    asked, random = [], np.random.default_rng(4)
+
+    def gates(session, **options):
+        own = session.parameters
+        asked.append((own["surface_seed"], own["target_depth"], options["seed"]))
+        change = np.zeros((8, 8, 5))
+        change[2, 5] = [0, 0.6, 0, -0.9, 0]
+        light = 2e-17 * random.uniform(0.99, 1.01, (2, 8, 8, 5))
+        both = np.stack([light * (1 + (3 if own["target_depth"] == "5" else 1) * change), light])
+        dims = ("row", "column", "gate")
+        data = {"gate_light": (("kind", "half", *dims), np.maximum(both, 0)), "gate_energy": (dims, both[0, 0])}
+        start, depth = 1450 + 3.0 * np.arange(5), 4.33 + 0.33 * np.arange(5)
+        coords = {
+            **dict.fromkeys(dims[:2], np.arange(8)),
+            "gate": np.arange(5),
+            "gate_start": ("gate", start),
+            "gate_depth": ("gate", depth),
+        }
+        angles = {name: (dims[:2], random.normal(size=(8, 8))) for name in ("angle_x", "angle_y")}
+        stack = xr.Dataset(data, {**coords, "gate_width": ("gate", np.full(5, 6.0)), **angles}, {"gate_step_ns": 3.0})
+        return stack.assign(gate_energy_stderr=0 * stack["gate_energy"])
+
+    monkeypatch.setattr(detection, "target_gates", gates)
+    coarse = {"surface_size": 40, "surface_cell_size": 0.5, **GATES}
+    options = {"receiver": "icmos", "clutter": clutter, "renders": 4, "pfa": 0.01, "frames": 3}
+    found = detection.detect("fig02_mine", coarse, depths=(5,), **options)
+    assert [one[:2] for one in asked] == [(str(2 + i if clutter else 1), d) for d in ("9", "5") for i in range(4)]
+    assert found["snr"].dims == ("row", "column", "gate")
+    assert found["frames"].values[:4].tolist() == [1, 2, 3, 5]
+    place = found["contrast_to_noise"].argmax(...)
+    assert {name: int(one) for name, one in place.items()} == {"row": 2, "column": 5, "gate": 1}
+    assert float(found["contrast"].min()) < -0.1  # behind the blur of optics and intensifier
+    # One pixel: every second gate adjoins, and three at most; an echo beside its shadow is no better.
+    assert found["adjoining"].values.tolist() == [1, 2, 3]
+    assert found["frames_needed_at_depth"] < found["frames_needed"]
+    lines = detection.describe_detection(found)
+    assert "3 frames of each of 5 gates, at P_fa = 0.01" in lines[0]
+    assert lines[1].startswith(f"fig02_mine, receiver icmos, noise{' and 4 seas' * bool(clutter)};")
+    assert "most clearly in row 2, column 5, gate 1 (4.66 m)" in lines[2]
+    assert "most clearly in row 2, column 5, gate 3 (5.32 m)" in lines[3]
+    figure = plot_detection(found, tmp_path / "images.png")
+    np.testing.assert_allclose(figure.axes[3].lines[0].get_ydata(), found["detection"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "params", "receiver", "message"),
+    [
+        ("fig02_mine", GATES, "apd", "the scene is an image of 8x8: it needs gates and a camera (iccd, "),
+        ("fig02_mine", {}, "icmos", "scene fig02_mine has no gates, which a camera needs"),
+    ],
+)
+def test_cameras_and_gates_go_together(scene, params, receiver, message):
+    with pytest.raises(UserError) as refused:
+        detection.detect(scene, params, receiver=receiver)
+    assert message in str(refused.value)
+
+
 @pytest.mark.slow
 def test_blind_receiver_is_reported(monkeypatch):
     """A counter with a dead time of 30 ns, which the first of a million photons starts, counts no echo at 20 ns."""

@@ -8,6 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import binom, chi2
 
 from mitransient_lidar.analysis.gates.range_images import depth_image, range_from_gates
+from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results.geometry import LinesOfSight
 
@@ -125,3 +126,34 @@ def test_gates_with_gaps_give_no_depths():
     )
     with pytest.raises(UserError, match="the gates leave gaps of 8 ns"):
         depth_image(stack)
+
+
+@pytest.mark.parametrize("frames", [1, 16])
+def test_errors_of_depths_are_those_of_a_cameras_frames(frames):
+    """Depths of drawn frames about those of their mean, in standard errors: rms 1, within what is not linear."""
+    time = 1000 + 2.5 * np.arange(24)
+    echo = 1032 + np.linspace(-2, 2, 24)[:, None, None] + np.zeros((24, 24, 1))
+    column = np.exp(-0.05 * (time - 1000)) * ndtr((echo - time) / 2.2)
+    shape = column + 6 * np.exp(-0.05 * (echo - 1000) - 0.5 * ((time - echo) / 2.2) ** 2)
+    energy = (("row", "column", "gate"), 1e-15 * shape)
+    made = xr.Dataset(
+        {"gate_energy": energy, "gate_energy_stderr": (energy[0], 0 * shape)},
+        {
+            "gate_start": ("gate", time),
+            "gate_width": ("gate", np.full(24, 5.0)),
+            "gate_depth": ("gate", 0.1 * time),
+            "angle_x": (("row", "column"), np.zeros((24, 24))),
+            "angle_y": (("row", "column"), np.zeros((24, 24))),
+        },
+        {"pulses": 500, "pulse_fwhm_ns": 5.0, "gate_step_ns": 2.5},
+    )
+    recorded = detect_waveforms(made, "gated_cmos", shots=4 * frames, seed=3)
+    first = recorded.isel(frame=[0])
+    quiet = first.assign(signal=0 * first["signal"] + first["signal_mean"])
+    known, z = depth_image(quiet).depth, []
+    for start in range(0, 4 * frames, frames):
+        found = depth_image(recorded.isel(frame=slice(start, start + frames)))
+        assert np.median(found.confidence) > 0.999
+        z.append((found.depth - known) / found.sigma)
+    assert 0.93 < np.sqrt(np.mean(np.square(z))) < 1.1
+    np.testing.assert_allclose(np.median(found.sigma) * np.sqrt(frames), np.median(depth_image(quiet).sigma), rtol=0.05)

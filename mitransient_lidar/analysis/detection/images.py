@@ -1,0 +1,265 @@
+"""Detection of a target in the images of a gated camera, by the best weighted sum of its pixels and gates.
+
+The mean images of renders with and without the target are vectors x of digital numbers. With the covariance D of the
+camera's noise, every matched filter, also behind the clutter of seas, is D^-1 times a sum of these vectors. So all
+filters follow from scalar products of the vectors, `FilterProducts`. A shadow counts as an echo does: its difference is
+negative, and so are its weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from mitransient_lidar.analysis.detection.statistics import Statistic
+from mitransient_lidar.analysis.detection.trials import MOST_GROUPS, Variables, crossing, interval, with_limits
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.receiver.camera import Camera, Noise
+from mitransient_lidar.physics.receiver.electronics import Expected
+
+_TOLERANCE, _MOST_STEPS = 1e-4, 200  # of weights in noise that pixels share; what they detect is exact for any weights
+_ROUNDING = 1e-9
+
+
+class GateImages(NamedTuple):
+    """What a camera records in one gate; pixels have the shape (row, column) or (pixel,)."""
+
+    #: Means [DN] of the target's difference and of the images without it, shape (*pixels, 4 renders), in the order
+    #: (difference or background, render, half).
+    vectors: FloatArray
+    filters: FloatArray  #: D^-1 times the vectors.
+    noises: list[Noise]  #: Without and with the target, each of shape (*pixels, 1).
+    expected: Expected  #: Moments of the mean light without and with the target, shape (*pixels, 2).
+
+
+@dataclass(frozen=True)
+class FilterProducts:
+    """Scalar products of the vectors of renders.
+
+    `products` has the shape (3, gate, vector, vector): x D^-1 y, and x D^-1 C D^-1 y with the covariance C without and
+    with the target. Renders are those of different `seas`, whose differences are clutter, or of one.
+    """
+
+    seas: bool
+    products: FloatArray
+
+    @property
+    def renders(self) -> int:
+        """Number of renders."""
+        return int(self.products.shape[-1]) // 4
+
+    def of(self, gate: int) -> FilterProducts:
+        """Return the products of a gate alone."""
+        return replace(self, products=self.products[:, [gate]])
+
+    def coefficients(self, frames: int, renders: Sequence[int]) -> FloatArray:
+        """Return the sum of filters that is best behind the clutter of some renders, and scaled to their difference.
+
+        It is 0 if the target changes nothing.
+        """
+        product, first = self.products[0].sum(axis=0), 2 * self.renders
+        halves = 2 * np.array(renders)[:, None] + [0, 1]
+        template = np.zeros(2 * first)
+        template[halves] = 0.5 / len(renders)
+        found = template
+        if self.seas:
+            clutter = np.zeros((2 * first, len(renders)))
+            clutter[first + halves, np.arange(len(renders))[:, None]] = 0.5
+            clutter = (clutter - clutter.mean(axis=1, keepdims=True)) / np.sqrt(len(renders) - 1)
+            # Woodbury: the inverse of D / frames and the outer products of the clutter.
+            inner = clutter.T @ product @ clutter + np.eye(len(renders)) / frames
+            found = template - clutter @ np.linalg.solve(inner, clutter.T @ product @ template)
+        scale = float(template @ product @ found)
+        return found / scale if scale > 0 else np.zeros_like(found)
+
+    def statistic(self, frames: int, left_out: Sequence[int] = ()) -> Statistic | None:
+        """Return the filter of the mean of some frames, and its distribution; None if the target changes nothing.
+
+        Each render is filtered with the weights of the others, without those that are left out. The clutter is the
+        covariance of the halves of its passes over the seas, which is free from the noise of the renders.
+        """
+        renders = np.setdiff1d(np.arange(self.renders), left_out)
+        product, *noises = self.products.sum(axis=1)
+        weights = np.array([self.coefficients(frames, renders[renders != case]) for case in renders])
+        if not weights.any(axis=1).all():
+            return None
+        answers = (weights @ product).reshape(len(renders), 2, -1, 2)[:, :, renders]
+        rise, level = (answers[np.arange(len(renders)), kind, np.arange(len(renders))] for kind in (0, 1))
+        others = (answers[:, 1].sum(axis=1) - level) / (len(renders) - 1)
+        null = level - others if self.seas else np.zeros_like(rise)
+        target = null + rise
+        variances = [np.einsum("ni,ij,nj->n", weights, noise, weights).mean() / frames for noise in noises]
+        if self.seas:
+            variances = [
+                own + max(np.cov(one.T)[0, 1], 0.0) for own, one in zip(variances, (null, target), strict=True)
+            ]
+        means = float(null.mean()), float(target.mean())
+        return Statistic(
+            weights, others.mean(axis=1), means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1])
+        )
+
+
+@dataclass(frozen=True)
+class ImageTrial:
+    """Light of a scene in the gates of a camera.
+
+    Parameters
+    ----------
+    light : ndarray
+        Energies [J] with and without the target in two halves of the passes of each render, shape (with or without,
+        render, half, *pixels, gate).
+    seas : bool
+        Whether renders are those of different seas.
+    open_ns : float
+        Integral of the transmission of a gate [ns].
+    pulses : int
+        Pulses of a frame.
+    sky : float
+        Power of the daylight on each pixel [W].
+    """
+
+    light: FloatArray
+    seas: bool
+    camera: Camera
+    open_ns: float
+    pulses: int
+    sky: float
+
+    def widened(self, count: int, apart: int) -> ImageTrial:
+        """Return the trial with gates that are sums of `count` gates, each `apart` steps after the former."""
+        last = self.light.shape[-1] - (count - 1) * apart
+        light = sum(self.light[..., number * apart : number * apart + last] for number in range(count))
+        return replace(self, light=np.asarray(light), open_ns=count * self.open_ns)
+
+    def images(self) -> Iterator[GateImages]:
+        """Return what the camera records in each gate."""
+        given = self.open_ns, self.sky, self.pulses
+        for light in np.moveaxis(self.light, -1, 0):
+            energy = np.moveaxis(light.reshape(-1, *light.shape[3:]), 0, -1).astype(np.float64)
+            target, null = np.split(self.camera.expected(energy, *given).mean, 2, axis=-1)
+            vectors = np.concatenate([target - null, null], axis=-1)
+            # Without the target first.
+            mean = np.stack([part.mean(axis=-1) for part in np.split(energy, 2, axis=-1)[::-1]], axis=-1)
+            noise, expected = self.camera.noise(mean, *given), self.camera.expected(mean, *given)
+            # Where pixels do not share noise, saturation reduces it.
+            own = noise.own if noise.shared.any() else expected.variance
+            noises = [Noise(noise.shared[..., [which]], own[..., [which]]) for which in (0, 1)]
+            yield GateImages(vectors, self._filters(vectors, noises), noises, expected)
+
+    def _filters(self, vectors: FloatArray, noises: Sequence[Noise]) -> FloatArray:
+        """Return D^-1 times vectors, D being the mean covariance of noises, by conjugate gradients."""
+        mean = Noise(*(0.5 * (one + other) for one, other in zip(*noises, strict=True)))
+        diagonal = mean.own + mean.shared
+        inverse = _ratio(np.ones_like(diagonal), diagonal)
+        found = vectors * inverse
+        if not mean.shared.any():
+            return found
+        pixels = tuple(range(vectors.ndim - 1))
+        rest = vectors - self._correlated(mean, found)
+        step = inverse * rest
+        size, enough = (np.sum(one * inverse * one, axis=pixels) for one in (rest, _TOLERANCE * vectors))
+        for _ in range(_MOST_STEPS):
+            if np.all(size <= enough):
+                break
+            turned = self._correlated(mean, step)
+            length = _ratio(size, np.sum(step * turned, axis=pixels))
+            found, rest = found + length * step, rest - length * turned
+            former, size = size, np.sum(rest * inverse * rest, axis=pixels)
+            step = inverse * rest + _ratio(size, former) * step
+        return found
+
+    def _correlated(self, noise: Noise, values: FloatArray) -> FloatArray:
+        """Return the covariance of a noise times values, shape (*pixels, vectors)."""
+        found = noise.own * values
+        return found + self.camera.spread(noise.shared * self.camera.spread(values)) if noise.shared.any() else found
+
+    @cached_property
+    def products(self) -> FilterProducts:
+        """Scalar products of each gate."""
+        found = []
+        for one in self.images():
+            size = one.vectors.shape[-1]
+            right = [one.vectors, *(self._correlated(noise, one.filters) for noise in one.noises)]
+            found.append([values.reshape(-1, size).T @ one.filters.reshape(-1, size) for values in right])
+        return FilterProducts(self.seas, np.moveaxis(np.array(found), 0, 1))
+
+    def maps(self, frames: int) -> dict[str, FloatArray]:
+        """Return what the camera sees in each pixel and gate, shape (*pixels, gate), of one frame.
+
+        ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for a number of
+        frames, ``snr`` and probability of ``saturation`` of the light with the target, ``contrast`` of the target (NaN
+        without light), and ``contrast_to_noise`` with its standard error over the renders.
+        """
+        renders = range(self.light.shape[1])
+        coefficients, found = self.products.coefficients(frames, renders), []
+        dark = self.camera.expected(np.zeros((1, 1)), self.open_ns, 0.0, self.pulses).mean.item()
+        for one in self.images():
+            values = one.vectors.reshape(*one.vectors.shape[:-1], 2, len(renders), 2).mean(axis=-1)
+            difference, background = np.moveaxis(values.mean(axis=-1), -1, 0)
+            light, noise = background - dark, np.sqrt(one.expected.variance.mean(axis=-1))
+            error = values[..., 0, :].std(axis=-1, ddof=1) / np.sqrt(len(renders))
+            gate = {
+                "background": background,
+                "difference": difference,
+                "filter_weight": one.filters @ coefficients,
+                "snr": _ratio(light + difference, np.sqrt(one.expected.variance[..., 1])),
+                "saturation": one.expected.saturation[..., 1],
+                "contrast": np.where(light > 0, _ratio(difference, light), np.nan),
+                "contrast_to_noise": _ratio(difference, noise),
+                "contrast_to_noise_stderr": _ratio(error, noise),
+            }
+            found.append(gate)
+        return {name: np.stack([gate[name] for gate in found], axis=-1) for name in found[0]}
+
+
+def detected(products: FilterProducts, frames: Sequence[int], pfa: float, pd: float) -> Variables:
+    """Return the probability of detection for numbers of frames, and the number that the required one needs.
+
+    Variables with limits: ``detection`` over ``frames``, and ``frames_needed``, infinite if none of these is enough.
+    """
+    from scipy.special import ndtr, ndtri
+
+    groups = np.array_split(np.arange(products.renders), min(products.renders, MOST_GROUPS))
+
+    def quantile(count: int, left_out: Sequence[int] = ()) -> float:
+        found = products.statistic(count, left_out)
+        return float(ndtri(pfa) if found is None else found.quantile(pfa))
+
+    values = [quantile(count) for count in frames]
+    changes = [np.array([quantile(count, group.tolist()) for group in groups]) for count in frames]
+    table = np.array([interval(value, rest - value) for value, rest in zip(values, changes, strict=True)])
+    # In one known sea, the quantile is linear in the root of the number of frames.
+    margins = np.concatenate([np.full((1, 3), ndtri(pfa)), table]) - ndtri(pd)
+    roots = [crossing(np.sqrt([0, *frames]).tolist(), list(column)) for column in margins.T[[0, 2, 1]]]
+    needed = [math.inf if math.isnan(root) else math.ceil(root**2 - _ROUNDING) for root in roots]
+    return {
+        "frames": ("frames", list(frames)),
+        **with_limits("detection", ndtr(table), dims=("frames",)),
+        **with_limits("frames_needed", needed, dims=()),
+    }
+
+
+def single_gates(trial: ImageTrial, counts: Sequence[int], apart: int, frames: int, pfa: float) -> Variables:
+    """Return the detection with the images of one gate alone, as it is and as wide as several gates that adjoin.
+
+    ``gate_detection`` and ``gate_deflection`` are over ``adjoining`` (`counts`, of gates `apart` steps from each other)
+    and ``gate``, the first of them; NaN where the train ends before the last.
+    """
+    table = np.full((2, len(counts), trial.light.shape[-1]), np.nan)
+    for row, count in enumerate(counts):
+        products = trial.widened(count, apart).products
+        for gate in range(products.products.shape[1]):
+            found = products.of(gate).statistic(frames)
+            table[:, row, gate] = (pfa, 0.0) if found is None else (found.detection(pfa), found.deflection)
+    own = {name: (("adjoining", "gate"), table[i]) for i, name in enumerate(("gate_detection", "gate_deflection"))}
+    return {"adjoining": ("adjoining", list(counts)), **own}
+
+
+def _ratio(part: FloatArray, total: FloatArray) -> FloatArray:
+    """Return a ratio, 0 where the total is 0."""
+    return np.asarray(np.divide(part, total, out=np.zeros_like(part), where=total > 0))

@@ -1,0 +1,136 @@
+"""Detection in gated images: predictions against drawn frames of cameras, and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.special import ndtr, ndtri
+from scipy.stats import norm
+from significance import largest_z
+
+from mitransient_lidar.analysis.detection.images import ImageTrial, detected, single_gates
+from mitransient_lidar.physics.receiver.camera import Camera
+
+PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # [J]
+SIZE, GATES, PULSES = 16, 6, 200
+#: Kind of camera, and photons of the first gate in a pixel for which the detection is neither 0 nor 1.
+CAMERAS = {
+    "intensified": (
+        Camera(
+            kind="intensified",
+            quantum_efficiency=0.2,
+            gain=100.0,
+            excess_noise=1.8,
+            intensifier_mtf=0.3,
+            read_noise=8.0,
+            electrons_per_dn=4.0,
+            offset_dn=100.0,
+        ),
+        30,
+    ),
+    "counting": (Camera(kind="counting", quantum_efficiency=0.3, open_dark_hz=1e3, bits=8), 12),
+    "direct": (Camera(kind="direct", quantum_efficiency=0.6, read_noise=5.0, offset_dn=100.0), 30),
+}
+
+
+def light(level, renders=1, seas=0.0, noise=0.0, seed=0, echo=0.12, shadow=0.2):
+    """Return energies of renders as of `ImageTrial`: a disc that shines in gate 2 and darkens gates 4 and 5.
+
+    Seas tilt the image at random, and change each pixel by half as much; `noise` is that of the renders.
+    """
+    random = np.random.default_rng(seed)
+    y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) / SIZE - 0.5
+    disc = (np.hypot(x, y) < 0.25)[..., None]
+    bare = level * PHOTON * np.exp(-0.3 * np.arange(GATES)) * np.ones((SIZE, SIZE, 1))
+    change = np.array([0, 0, echo, 0, -shadow, -shadow]) * disc
+    found = np.empty((2, renders, 2, SIZE, SIZE, GATES))
+    for render in range(renders):
+        tilts, own = random.normal(size=2), random.normal(size=(SIZE, SIZE, 1))
+        sea = 1 + seas * ((tilts[0] * x + tilts[1] * y)[..., None] + 0.5 * own)
+        for half in range(2):
+            error = 1 + noise * random.normal(size=bare.shape)
+            found[:, render, half] = np.array([bare * (1 + change), bare]) * np.maximum(sea * error, 0)
+    return found
+
+
+def trial(camera, level, renders=3, seas=0.0, **options):
+    return ImageTrial(light(level, renders, seas, **options), seas > 0, camera, 5.0, PULSES, 0.0)
+
+
+def quantile(own, frames, pfa=0.01):
+    return float(own.products.statistic(frames).quantile(pfa))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seas", [0.0, 0.4])
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_predicted_probabilities_are_the_rates_of_drawn_images(kind, seas):
+    """2000 images with and without the target, in one known sea or each in another one than the filter has seen.
+
+    The statistic is taken as normal: its skewness, at most 0.1 here, changes a rate of false alarms of 0.05 by 0.003.
+    """
+    camera, level = CAMERAS[kind]
+    own, count, pfa = trial(camera, level, 40 if seas else 3, seas), 2000, 0.05
+    expected, maps = own.products.statistic(1), own.maps(1)
+    found = []
+    for which in (1, 0):
+        lights = light(level, count if seas else 1, seas, seed=7 + which)[which]
+        frames = count // len(lights)
+        drawn = [camera.sample(one[0], 5.0, frames, (which, i), 0.0, PULSES).signal for i, one in enumerate(lights)]
+        values = np.concatenate([np.tensordot(one - maps["background"], maps["filter_weight"], 3) for one in drawn])
+        found.append(float(np.mean(values > expected.threshold(pfa))))
+    for rate, chance in zip(found, (pfa, float(expected.detection(pfa))), strict=True):
+        assert abs(rate - chance) < 0.003 + largest_z(count) * np.sqrt(chance * (1 - chance) / count), (rate, chance)
+    assert 0.3 < expected.detection(pfa) < 0.95
+
+
+def test_deflection_in_closed_form_grows_with_the_root_of_the_frames():
+    """A camera of Poisson counts and read-out noise in one known sea: sqrt(N sum(s^2 / v)), with shadows."""
+    camera, level = CAMERAS["direct"]
+    own = trial(camera, level)
+    target, null = 0.6 / PHOTON * own.light[:, 0, 0]
+    variance = 0.5 * (target + null) + 25 + 1 / 12
+    sharpness = np.sqrt(np.sum((target - null) ** 2 / variance))
+    null_share = np.sum((target - null) ** 2 / variance**2 * (null + 25 + 1 / 12)) / sharpness**2
+    for frames in (1, 9):
+        deflection = own.products.statistic(frames).deflection
+        assert deflection == pytest.approx(np.sqrt(frames / null_share) * sharpness, rel=1e-3)
+    # The quantile is linear in the root, from that of the false alarms without a frame.
+    steps = [quantile(own, frames) + norm.isf(0.01) * np.sqrt(null_share / (2 - null_share)) for frames in (1, 4, 100)]
+    np.testing.assert_allclose(np.array(steps) / steps[0], [1, 2, 10], rtol=1e-3)
+    found = detected(own.products, [1, 2, 5, 10, 20], 0.01, 0.9999)
+    needed = found["frames_needed"][1]
+    assert 2 < needed < 20
+    assert quantile(own, needed - 1) < ndtri(0.9999) <= quantile(own, needed)
+    assert found["detection"][1][0] == pytest.approx(float(ndtr(quantile(own, 1))))
+
+
+def test_a_shadow_alone_is_detected():
+    """A black target: the same deflection with the sign turned, and the best single gate is behind it."""
+    camera, level = CAMERAS["direct"]
+    own = trial(camera, level, echo=0.0)
+    assert own.products.statistic(1).deflection > 1.5
+    assert np.max(own.maps(1)["filter_weight"]) <= 1e-12
+    assert np.min(own.maps(1)["contrast"]) == pytest.approx(-0.2, abs=1e-3)
+    found = single_gates(own, [1, 2], 1, 1, 0.01)
+    deflection = found["gate_deflection"][1]
+    assert np.nanargmax(deflection[0]) == 4
+    assert np.nanargmax(deflection[1]) == 4
+    # The read-out adds its noise once to both gates.
+    assert deflection[0, 4] < np.hypot(*deflection[0, 4:]) < deflection[1, 4]
+    assert np.isnan(deflection[1, 5])
+
+
+def test_a_target_that_changes_nothing_raises_false_alarms():
+    found = detected(trial(*CAMERAS["direct"], echo=0.0, shadow=0.0).products, [1, 100], 0.01, 0.9)
+    np.testing.assert_allclose(found["detection"][1], 0.01)
+    assert found["frames_needed"][1] == np.inf
+
+
+def test_errors_of_renders_are_no_clutter():
+    """Pixels with errors of 7 % in each half of a render: clutter is that of the seas alone.
+
+    Taken as clutter, the errors would raise the deviation of the statistic without the target 1.6 times.
+    """
+    camera, level = CAMERAS["direct"]
+    exact, noisy = (trial(camera, level, 50, 0.1, noise=noise).products.statistic(25) for noise in (0.0, 0.07))
+    assert noisy.null_sd == pytest.approx(exact.null_sd, rel=0.2)
+    assert noisy.deflection == pytest.approx(exact.deflection, rel=0.25)
