@@ -276,7 +276,9 @@ def test_failed_save_leaves_no_file(tmp_path, suffix):
 def test_save_rejects_other_suffixes_and_datasets(tmp_path):
     with pytest.raises(UserError, match=r"holds gates or frames of a camera"):
         results.save(make(), tmp_path / "a.png")
-    with pytest.raises(UserError, match="an EXR file holds waveforms of a render, a gate stack, frames of a gated camera or"):
+    with pytest.raises(
+        UserError, match="an EXR file holds waveforms of a render, a gate stack, frames of a gated camera or"
+    ):
         results.save(make().drop_vars("waveform"), tmp_path / "a.exr")
     with pytest.raises(UserError, match="cannot store the variable depth"):
         results.save(make().assign(depth=1.0), tmp_path / "a.exr")
