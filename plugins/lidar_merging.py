@@ -40,6 +40,9 @@ class LidarMerging(PassIntegrator):
     look it up where the light at their points would meet that plane: along the beam as the facet above refracts it, at
     an offset that grows as ripples spread the beam. Narrow beams then do not blur, however waves refract them.
 
+    Of images from 4096 pixels on, every second path of the receiver is merged in the water, and stands for two; all are
+    merged on solids, whose pixels need more paths.
+
     Some points of the receiver's paths are connected, over any distance, with a random point of a light path, or with
     light on a solid, by a segment in the water. Light that is scattered into a narrow beam, or out of it, far from the
     axis rarely meets a small cell, and is found by connections (Georgiev et al. 2012, doi:10.1145/2366145.2366211).

@@ -126,6 +126,8 @@ class PassAccumulator:
         self._differences = differences
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
         self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
+        #: Memory of film, means and errors [bytes], 0 if it is unknown.
+        self.size = 0.0
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
         self._weights: FloatArray | None = None
@@ -308,7 +310,9 @@ def choose_accumulator(
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
-        return PassAccumulator(scene, window, train, origins, parameters, differences, batches)
+        chosen = PassAccumulator(scene, window, train, origins, parameters, differences, batches)
+        chosen.size = everything
+        return chosen
     cure = "take fewer of them"
     if origins:
         of_what, cure = f" x {len(origins)} components", "take fewer bins or pixels"
@@ -324,7 +328,9 @@ def choose_accumulator(
     is_narrow = train.width_ns < scene.axis.bin_width_ns
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
         logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
-        return PassAccumulator(scene, window, train, kept="gates")
+        chosen = PassAccumulator(scene, window, train, kept="gates")
+        chosen.size = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates
+        return chosen
     each = (per_bin + _BYTES_PER_DIRECT_GATE) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
@@ -334,7 +340,9 @@ def choose_accumulator(
             f"{1e-9 * each * train.count:.2g} GB, so allow that much, or fewer gates or pixels"
         )
     logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
-    return PassAccumulator(scene, window, train, kept="direct")
+    chosen = PassAccumulator(scene, window, train, kept="direct")
+    chosen.size = each * train.count
+    return chosen
 
 
 def placed_gates(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:

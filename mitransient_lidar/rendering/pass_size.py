@@ -79,6 +79,15 @@ def fit_to_time(
     return (renderer.scaled(share), share, None) if share > SMALLEST_SHARE else (trial, share, received)
 
 
+def describe_cost(renderer: PassRenderer, size: float, start_ns: float) -> str:
+    """Return memory of film, means and errors [bytes], and the longest time of a pass on two slow cores, in a line."""
+    pixels, rays = renderer.scene.receiver.pixels.count, renderer.path_count * _rays_per_path(renderer.scene, start_ns)
+    return (
+        f"{pixels} pixels: film, means and errors take {1e-9 * size:.2g} GB, and a pass of {renderer.path_count} paths "
+        f"at most about {rays / _RAYS_PER_SECOND:.2g} s on two cores"
+    )
+
+
 def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
     """Return the largest expected number of rays of a path: scattering events until the end of the record, and ends."""
     if scene.water is None:

@@ -225,7 +225,7 @@ def _render(
     if changes := perturbations(parameters):
         renderer = renderer.perturbed(changes)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.pass_size import fit_to_time
+    from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
     from mitransient_lidar.rendering.scene_checks import check_scene
 
     window = ErrorWindow.of_probe(renderer.probe)
@@ -240,6 +240,8 @@ def _render(
 
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
     fitted = renderer if share == 1 else renderer.scaled(share)
+    if lidar.receiver.is_imager:
+        logger.info("%s", describe_cost(fitted, accumulator.size, float(window.start_ns.min())))
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share

@@ -158,8 +158,8 @@ def test_gates_by_depth_need_an_axis_that_meets_the_sea(lidar_scene):
     [
         ({"gate_start_ns": 1391.0, "gate_count": 2}, 2.0, "before the surface"),
         ({"gate_start_ns": 1500.0, "gate_count": 20}, 2.0, "must lie within the record"),
-        ({}, 1e-9 * 4 * 84 * 0.5, "max_memory .* is less than one gate needs"),
-        ({}, 1e-9 * 4 * 84 * 3.5, "max_memory .* is room for 3 of them"),
+        ({}, 1e-9 * 4 * 38 * 0.5, "max_memory .* is less than one gate needs"),
+        ({}, 1e-9 * 4 * 38 * 3.5, "max_memory .* is room for 3 of them"),
         ({"gate_count": 0}, 1e-9 * HISTOGRAM * 0.5, r"more than max_memory .* take fewer bins or pixels, or gates"),
         ({}, 0.0, "max_memory = 0 must be greater than 0"),
     ],

@@ -8,6 +8,7 @@ from significance import assert_equal, largest_chi2, largest_error, largest_z, m
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.transport.merging import renderer as merging_renderer
 from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
@@ -424,3 +425,20 @@ def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, tw
     assert np.all(np.abs(z) < largest_z(8, z.size)), z
     assert np.median(errors[1] / means[1]) < largest_error(8, 0.02)
     assert np.median(errors[0] / means[0]) < largest_error(8, 0.03)
+
+
+@pytest.mark.slow
+def test_every_second_path_of_an_image_stands_for_two(monkeypatch):
+    """The light of water and bottom is that of all paths; without the weight, the water would have half of it."""
+    session = open_scene("fig09_2x2", {"layout": "64x64", "spectrum": "flat"})
+    sums = []
+    for every, seed in ((1, 0), (2, 100)):
+        monkeypatch.setattr(merging_renderer, "_EVERY_IN_IMAGES", every)
+        renderer = choose_integrator(session.scene, FEW).prepare(session.scene, session.sensor)
+        passes = [renderer.render_pass(seed + number).histogram.energy().sum(axis=(0, 1)) for number in range(10)]
+        # Water and bottom, and narrower parts of both.
+        sums.append(np.add.reduceat(np.array(passes), np.arange(0, len(passes[0]), 16), axis=1))
+    means, errors = zip(*map(mean_and_error, sums), strict=True)
+    lit = (means[0] > 0) & (means[1] > 0)
+    z = (means[1] - means[0])[lit] / np.hypot(*errors)[lit]
+    assert np.abs(z).max() < largest_z(10, lit.sum())

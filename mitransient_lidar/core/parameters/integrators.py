@@ -25,7 +25,7 @@ _SCATTERINGS = count("max_scatterings", -1, -1, 2**30, "Largest number of scatte
 LIDAR_MERGING = plugin(
     "lidar_merging",
     count("paths_per_pass", None, _FEWEST, _MOST, f"Paths from the receiver in one pass, {_UNLESS}",
-        otherwise="``32768``, or 16 a pixel up to 2^21"),
+        otherwise="``32768``, or 16 a pixel up to 2^21, from 4096 pixels on 32 a pixel up to 2^20"),
     count("photons_per_pass", None, _FEWEST, _MOST, "Paths from the laser in one pass",
         otherwise="``32768``, or ``65536`` from 4096 pixels on"),
     number("cell_size", 0.0, "m", 0, 1e4,

@@ -105,8 +105,8 @@ MULTIPIXEL_RECEIVER = plugin(
     text("layout", "2x2",
         "``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into R rows along range (row 0 is the far edge) "
         "and C columns (column 0 is the left edge). ``1x4`` is the published receiver of four strips across range, the "
-        "same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to 2^20: a hexagon and complete rings of hexagons "
-        "around it, in rows along angle_y"),
+        "same as ``4x1``. R times C is at most 2^22. ``hexN``, with N = 1, 7, 19, 37, ... up to 2^20: a hexagon and "
+        "complete rings of hexagons around it, in rows along angle_y"),
     number("fill_factor", 1.0, "1", 0.01, 1,
         "Share of each cell or hexagon of a layout that receives light; the gaps receive none"),
     switch("imager", None, "Result of shape (row, column, time) instead of (pixel, time)",

@@ -152,8 +152,8 @@ class MergingRenderer(PassRenderer):
 
     def _every(self, paths: int) -> int:
         """Return of how many paths of the receiver one is merged in the water."""
-        is_image = self.scene.receiver.pixels.count >= IMAGE_PIXELS
-        return _EVERY_IN_IMAGES if is_image and paths % _EVERY_IN_IMAGES == 0 else 1
+        is_imager = self.scene.receiver.is_imager
+        return _EVERY_IN_IMAGES if is_imager and paths % _EVERY_IN_IMAGES == 0 else 1
 
     def _trace_light(
         self, received: ReceivedLight, shots: Shots, patches: SolidPatches, rates: ConnectionRates

@@ -73,6 +73,11 @@ class Receiver:
     pixels: PixelArray
     blur: PointSpread | None = None
 
+    @property
+    def is_imager(self) -> bool:
+        """Whether it has so many pixels that paths suit an image."""
+        return self.pixels.count >= IMAGE_PIXELS
+
     def displacement(self, rng: mi.PCG32) -> tuple[mi.Float, mi.Float]:
         """Draw displacements on the detector; sharp optics use no random numbers."""
         if self.blur is None:

@@ -106,13 +106,13 @@ def fitted(monkeypatch, memory, **layout):
 
 
 def test_images_of_turbid_water_are_fitted_to_the_memory(monkeypatch):
-    """Half of 8 GiB was too little for the capacity of 64 segments a path, of which 11 are stored."""
-    layout = fitted(monkeypatch, 4.29e9).layout
+    """Less than the capacity of 64 segments a path takes, of which 11 are stored."""
+    layout = fitted(monkeypatch, 2.29e9).layout
     assert 11 < layout.light_segments < 64
     assert layout.light_segments == layout.sensor_segments
     # Until a pass has needed more.
-    with pytest.raises(UserError, match=r"65536 photons and 1048576 paths take 4\.3. GB of memory"):
-        fitted(monkeypatch, 4.29e9, least_segments=(62.0, 62.0))
+    with pytest.raises(UserError, match=r"65536 photons and 1048576 paths take 2\.3. GB of memory"):
+        fitted(monkeypatch, 2.29e9, least_segments=(62.0, 62.0))
 
 
 @pytest.mark.slow
