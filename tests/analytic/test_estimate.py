@@ -25,7 +25,7 @@ def by_origin(dataset, origin):
     [
         # The last one has these pixels, too.
         pytest.param({"layout": "2x2"}, 0.05, marks=pytest.mark.long),
-        ({"layout": "1x1", "field_of_view_mrad": 5, "divergence_mrad": 0.5}, 0.05),
+        pytest.param({"layout": "1x1", "field_of_view_mrad": 5, "divergence_mrad": 0.5}, 0.05, marks=pytest.mark.long),
         pytest.param(
             *({"layout": "1x4", "off_nadir_deg": 5, "wind_speed": 10, "wind_direction_deg": 60}, 0.11),
             marks=pytest.mark.long,
