@@ -35,15 +35,6 @@ def test_orders(scene, tmp_path):
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
 
 
-@pytest.mark.long
-def test_target_on_a_grid(scene, tmp_path):
-    plot = tmp_path / "map.svg"
-    done = run("target-signal", scene, *NEAR, "--passes", 16, "--grid", 2, "--max-offset", 1, "-o", plot, "-q")
-    assert done.exit_code == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 2 + 1 + 4
-    assert texts(plot) >= {"red (%)", "green (%)", "blue (%)", "black (%)", "SNR, best / sum", "target_x (m)"}
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
