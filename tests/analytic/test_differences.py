@@ -75,6 +75,7 @@ def test_bottom_depth_moves_its_echo_in_time():
     significance.assert_equal(moved[:, None], [2 * 1.364 / (C0 * 1e-9) / cosine], error=0.02, bias=0.01)
 
 
+@pytest.mark.long
 def test_light_just_above_a_dark_bottom_that_sinks():
     """The last light of the water, against the reference, which has no cells.
 
@@ -133,3 +134,19 @@ def test_geometry_against_scenes_beside_it(scene, params, name, step, integrator
     lit = np.hypot(da, db) > 0
     z = np.maximum(np.abs(a - b) - 0.03 * scale, 0)[lit] / np.hypot(da, db)[lit]
     assert z.max() < significance.largest_z(PASSES, z.size), z.max()
+
+
+@pytest.mark.long
+def test_mean_slope_of_the_sea_brightens_its_echo():
+    """Facets at b = 20 degrees less the slope return light, of which there are exp(-tan(b)^2 / a^2) / cos(b)^4.
+
+    With a^2 twice the variance along an axis, and the cosines of illumination and reflection, ln E grows by
+    2 tan(b) / (a cos(b))^2 - 5 tan(b) per radian. The beam of 1 mrad is seen whole.
+    """
+    variance, angle = 0.01, np.deg2rad(20)
+    sea = {"slope_variance": variance, "divergence_mrad": 1, "ripple_focusing": "false"}
+    dark = {"scattering": 0, "backscattering": 0, "bottom_reflectance": 0}
+    found, session = slopes("surface_slope_x_deg", {**sea, **dark})
+    wanted = 2 * np.tan(angle) / variance / np.cos(angle) ** 2 - 5 * np.tan(angle)
+    relative = np.rad2deg(found.sum(axis=1)) / energies(session).sum(axis=1).mean()
+    significance.assert_equal(relative[:, None], [wanted], error=0.02, bias=0.01)

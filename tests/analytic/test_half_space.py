@@ -83,7 +83,7 @@ def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degre
     [
         pytest.param("lidar_volpath", 0.5, 0.0, 0.1, 20.0, marks=pytest.mark.slow),
         pytest.param("lidar_volpath", 0.9, 60.0, 0.1, 40.0, marks=pytest.mark.long),
-        pytest.param("lidar_merging", 0.5, 0.0, 4.0, 14.0, marks=pytest.mark.slow),
+        pytest.param("lidar_merging", 0.5, 0.0, 4.0, 14.0, marks=pytest.mark.long),
         pytest.param("lidar_merging", 0.9, 60.0, 5.0, 22.0, marks=pytest.mark.long),
     ],
 )

@@ -15,7 +15,7 @@ def parts():
     return scattering_orders("fig09_2x2", PARAMS, orders=3, passes=2, seed=4, integrator=FEW)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parts_sum_to_the_whole(parts):
     """The classes split the same paths: same seed, same energy in every bin but for rounding of the sums."""
     whole = mitransient_lidar.render("fig09_2x2", params=PARAMS, passes=2, seed=4, integrator=FEW)

@@ -160,7 +160,7 @@ def test_a_level_scene_is_the_same_everywhere(integrator):
     np.testing.assert_allclose(total, total[0], rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_target_goes_with_the_shots():
     """On a level sea all shots are the same, those with a target that goes with them too, by the origin of the light.
 
