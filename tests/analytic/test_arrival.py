@@ -90,10 +90,7 @@ def test_echoes_reach_orbit_when_geometry_says(lidar_scene, passes, angle, integ
 
 @pytest.mark.slow
 def test_surface_echo_from_orbit_has_the_shape_of_the_beam(lidar_scene, passes):
-    """A Gaussian beam of 2.5 m on the sea at 20 degrees: the echo is the Gaussian of its ranges.
-
-    In single precision such lengths have steps of 6 cm, or 0.2 ns, the width of a bin here.
-    """
+    """A Gaussian beam of 2.5 m on the sea at 20 degrees: the echo is the Gaussian of its ranges."""
     altitude, theta, spread = 5e5, np.radians(20.0), 5e-6
     pose = {"altitude": altitude, "off_nadir_deg": 20.0}
     centre, width = float(surface_time_ns(altitude, theta)), 0.2

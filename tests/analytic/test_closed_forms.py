@@ -138,10 +138,7 @@ def per_pixel(energy_per_bin, case, *arguments):
 
 @both_in([name for name in CASES if name not in WATERS])
 def test_surface_of_gaussian_slopes(lidar_scene, passes, case, integrator):
-    """Cox and Munk's slopes at 6 m/s across the line of sight; axes of the wind exchanged are 13 to 30 % at 20 degrees.
-
-    The echo is evaluated, not sampled: what remains are shadows and light between facets.
-    """
+    """Cox and Munk's slopes at 6 m/s across the line of sight; exchanged axes of the wind are 13 to 30 % at 20 deg."""
     scene = lidar_scene(
         **case.scene,
         integrator={"type": integrator, "paths_per_pass": 2**14},

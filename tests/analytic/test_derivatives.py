@@ -85,10 +85,7 @@ def test_attenuation_follows_from_the_time_of_arrival(lidar, integrator):
 
 
 def test_attenuation_of_light_that_is_carried_on_within_cells(lidar):
-    """Bins of 2 cm below the surface have the lengths of their times, with the way of merged light within its cell.
-
-    A narrow beam at nadir: ways in the air are 400 m, and less than 3 mm more where light leaves the water 1 m away.
-    """
+    """Bins of 2 cm below the surface have the lengths of their times, with the way of merged light within its cell."""
     film = {"time_start_ns": 1334.2, "bin_width_ns": 0.1, "bin_count": 60}
     renderer, _ = lidar("lidar_merging", SHARED, tx={"divergence_mrad": 1.0}, film=film)
     # Of the water.
@@ -159,10 +156,7 @@ def test_reflectance_follows_from_the_number_of_reflections(lidar, integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_ripple_variance_of_an_echo_off_nadir(lidar, integrator):
-    """Gaussian slopes of variance v in all, seen at 20 degrees: d ln E / d ln v = tan(20 degrees)^2 / v - 1.
-
-    The beam of 0.1 mrad changes the angle by 5e-5, and that by the law of slopes at most by 2e-6 in the mean.
-    """
+    """Gaussian slopes of variance v in all, seen at 20 degrees: d ln E / d ln v = tan(20 degrees)^2 / v - 1."""
     options = {"pose": {"off_nadir_deg": 20.0}, "tx": {"divergence_mrad": 0.1}, "sea": {"slope_variance": "0.01"}}
     renderer, _ = lidar(integrator, SHARED, **options)
     energy, changes = (values[0].sum() for values in by_origin(renderer, "ripple_variance"))
@@ -171,10 +165,7 @@ def test_ripple_variance_of_an_echo_off_nadir(lidar, integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_divergence_of_a_beam_that_overfills_the_view(lidar, integrator):
-    """Of a bottom in water that only absorbs, E is in proportion to 1 - exp(-R^2 / (2 sigma^2)).
-
-    The view sees a half angle R of 15 mrad of a beam of sigma 15 mrad; cosines and lengths change that by 1e-3.
-    """
+    """Of a bottom in water that only absorbs, E is in proportion to 1 - exp(-R^2 / (2 sigma^2))."""
     water = {**FIXED, "attenuation": 0.3, "scattering": 0.0, "backscattering": 0.0}
     options = {"sea": {"slope_variance": "2e-5"}, "tx": {"divergence_mrad": 30.0}}
     renderer, parameters = lidar(integrator, SHARED, water=water, **options)

@@ -132,10 +132,7 @@ def test_beds_are_found_where_refracted_light_is(lidar_scene):
 @pytest.mark.parametrize("shift", [[0.3, 0.9, 0.99, 0.4]])
 @pytest.mark.parametrize("direction", [None, [-0.3, 0.2, 0.933]])
 def test_points_fall_into_cells_by_their_volume(wavy_sea, shift, direction):
-    """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included.
-
-    Whether they are moved to the plane of their layer along the beam or along lines of any direction.
-    """
+    """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included."""
     lidar, region = wavy_sea
     heights = SurfaceHeights(lidar, region, 8.0)
     rings = BeamRings(lidar.transmitter.pose, 0.5, 1.34)

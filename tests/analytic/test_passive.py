@@ -235,10 +235,7 @@ def test_light_scattered_once(zenith, view):
 @pytest.mark.slow
 @pytest.mark.parametrize("albedo", [0.9])
 def test_deep_water_under_an_even_sky(albedo):
-    """Remote-sensing reflectance of Fournier-Forand water, bb/b 0.0183, against discrete ordinates.
-
-    HydroLight 4.2 gives 8.1159e-3 and 1.1462e-3 /sr for its polar cap of 10 degrees, 1.5 % above and 0.3 % below.
-    """
+    """Remote-sensing reflectance of Fournier-Forand water, bb/b 0.0183, against discrete ordinates."""
     scene = build(
         sky={"irradiance": 1.0},
         water={"attenuation": 1.0, "scattering": albedo, "backscattering": 0.0183 * albedo},

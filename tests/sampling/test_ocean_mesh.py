@@ -157,10 +157,7 @@ def test_time_moves_the_sea_downwind():
 
 @pytest.mark.slow
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
-    """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies.
-
-    What ripples focus follows from a spectrum, which a file lacks.
-    """
+    """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
     sea = {
         "ripple_focusing": False,
         "spectrum": "elfouhaily",

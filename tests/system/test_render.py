@@ -147,10 +147,7 @@ def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     ],
 )
 def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator, count):
-    """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes.
-
-    One bright path may be a fifth of all, and rarely one slips through a seam of the large patch's triangles.
-    """
+    """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes."""
     engine = {"type": integrator, "paths_per_pass": 2**14}
     if integrator == "lidar_merging":
         engine |= {"paths_per_pass": 2**13, "photons_per_pass": 2**13}

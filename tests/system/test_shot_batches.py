@@ -36,8 +36,8 @@ def looking(place, azimuth_deg, off_nadir_deg, height, roll_deg):
     return KernelPose(np.array([*place, 0.0]) - axis * height / np.cos(angle), axis, *turned)
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
-@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
 def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     """Azimuths all round, other angles, heights and turned pixels, over waves, ripples of a wind and a sloping bottom.
 
@@ -162,10 +162,7 @@ def test_a_level_scene_is_the_same_everywhere(integrator):
 
 @pytest.mark.long
 def test_target_goes_with_the_shots():
-    """On a level sea all shots are the same, those with a target that goes with them too, by the origin of the light.
-
-    The sum of the parts is the whole to the bit.
-    """
+    """On a level sea all shots are the same, those with a target that goes with them too, by origin."""
     params = {"spectrum": "flat", "target_depth": 5, "target_x": 0.4, "layout": "2x2"}
     options = {"passes": 4, "pass_share": 0.05, "components": True}
     series = render_shots("fig13_2x2", params, positions=np.repeat(PLACES, 8, axis=0), move_target=True, **options)

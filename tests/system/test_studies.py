@@ -4,7 +4,7 @@ import re
 
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import run
 from few_paths import few_paths
 
 NEAR = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
@@ -33,17 +33,3 @@ def test_orders(scene, tmp_path):
     assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several", "reversals (%)"}
     with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as found:
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("scattering-orders", "fig09_2x2", "-o", "a.txt"), "must end in .png"),
-        (
-            ("target-signal", "fig09_2x2", "-q"),
-            "--target-id = 'target' must be the id of a shape of the scene: surface, bottom",
-        ),
-    ],
-)
-def test_invalid_options_end_with_one_sentence(arguments, message):
-    assert_refused(run(*arguments), message)

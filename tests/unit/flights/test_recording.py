@@ -60,11 +60,7 @@ def test_pulses_that_saturate_are_counted():
 
 
 def test_pooled_errors_are_those_of_counted_paths():
-    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights.
-
-    The root mean square of true error over pooled error is 1 less what the larger of two errors adds; with pooled
-    relative errors, which rise behind the echo, that of the peak would be 1.8 times the true one.
-    """
+    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights."""
     rng = np.random.default_rng(5 + significance.seed_shift)
     time = np.arange(120)
     paths = 4 + 400 * np.exp(-0.5 * ((time - 60) / 4) ** 2)

@@ -129,20 +129,6 @@ def test_invalid_records(times, yaw, message):
         _trajectory(times, yaw)
 
 
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        ([(0, 2), (1, 3)], "must increase"),
-        ([(2, 1)], "must increase"),
-        ([(0, 9)], "must lie in the trajectory, 0 to 4 s"),
-        ([0, 1], "must be pairs"),
-    ],
-)
-def test_invalid_lines(lines, message):
-    with pytest.raises(UserError, match=message):
-        _trajectory(np.arange(5), lines=lines)
-
-
 @each_row(
     ("given", "message"),
     [

@@ -45,10 +45,7 @@ def test_errors_that_go_together_over_a_few_bins_grow_that_far():
 
 @pytest.mark.parametrize("bins", [300, 1300])
 def test_errors_of_sums_over_any_bins_are_those_of_the_passes(bins):
-    """One pixel, whose later errors alone are shared by neighbours: the median curve of the record does not serve.
-
-    The stated error is exact, but for the blocks of 3 bins of a record of more than 512 bins.
-    """
+    """One pixel, whose later errors alone are shared by neighbours: the median curve of the record does not serve."""
     rng = np.random.default_rng(8)
     smooth = np.exp(-0.5 * (np.arange(-24, 25) / 8.0) ** 2)
     noise = rng.normal(size=(40, bins))

@@ -6,7 +6,6 @@ import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
 from significance import largest_z
 
 import mitransient_lidar
@@ -159,17 +158,6 @@ def test_daylight_does_not_touch_the_laser():
     # And the laser does not light a picture.
     dark = render({**day, "integrator": PASSIVE})
     np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["fig09_1x1", "-q"], "emitters: passive imaging needs a sun or a sky"),
-        (["passive_sea", "-q", "-D", "sun=3"], "parameter 'sun' is not one of scene passive_sea"),
-    ],
-)
-def test_invalid_options_end_with_one_sentence(arguments, message):
-    assert_refused(run("passive", *arguments), message)
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,7 @@ def test_bins_belong_to_their_block_at_the_end_of_a_record(bins):
 
 
 def test_two_passes_make_no_errors_of_nearly_nothing():
-    """The errors of neighbours of one pixel cancel by chance: means of 4 bins would have none, and all bins be echoes.
-
-    Many passes tell that they do cancel; but no noise is 0.
-    """
+    """The errors of neighbours of one pixel cancel by chance: means of 4 bins would have none, all bins be echoes."""
     time, deviation = 1385.5 + np.arange(400), 1e-9 * np.ones(400)
     cancel = (-1.0) ** np.add.outer(np.arange(400), np.arange(400))
     values = 2e-6 * norm.pdf(time, SURFACE, SIGMA) + 1e-7 * np.exp(-0.03 * (time - SURFACE)) * (time > SURFACE)

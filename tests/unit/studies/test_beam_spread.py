@@ -5,8 +5,6 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from command_line import run
-from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -112,24 +110,3 @@ def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     # Standard deviations of the footprint are 1.064 m across and 1.132 m along, erf(1/(sqrt(2) sigma)) in the patch.
     assert found.attrs["beam_outside_surface"] == pytest.approx(1 - 0.6526 * 0.6230, abs=0.01)
     assert "passes outside it and is left out" in caplog.text
-
-
-@each_row(
-    ("arguments", "message"),
-    [
-        (["--depths", "2;5"], "--depths = '2;5' must hold numbers only"),
-        (["--depths", "2,nan"], "depths holds nan"),
-        (["--depths", "9"], "depths = 9 m must not lie below the bottom, at 8 m"),
-        (["--depths", "2", "-o", "spread.txt"], "must end in .png, .pdf or .svg"),
-        (["--depths", "2", "-D", "wind=3"], "parameter 'wind' is not one of scene fig09_1x1"),
-    ],
-)
-def test_command_refuses(arguments, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run("beam-spread", "fig09_1x1", *arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    # A progress bar may have come and gone before.
-    assert message in result.stderr.replace("\n", " ")
-    assert "Traceback" not in result.stderr
-    assert not any(tmp_path.iterdir())

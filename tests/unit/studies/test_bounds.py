@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import run
 from differentiated import PHOTON, result
 from PIL import Image
 from rows import each_row
@@ -174,22 +174,3 @@ def test_invalid_input_is_refused_before_a_render(rendered, options, message):
     with pytest.raises(UserError, match=message):
         study.bounds("table1", SMALL, **{"free": ["attenuation"], **options})
     assert not rendered
-
-
-@each_row(
-    ("options", "message"),
-    [
-        (["--free", "attenuation,"], "--free = 'attenuation,' has an empty entry"),
-        (["--free", "attenuation", "--over", "layout"], "--over layout is not of the form name=value,value,..."),
-        (["--free", "attenuation", "--over", "layout=1x1,"], "--over layout=1x1, is not of the form"),
-        (["--free", "attenuation", "--over", "layout=1x1", "--over", "layout=2x2"], "--over names a parameter twice"),
-        (["--free", "attenuation", "--nuisance", "scale=wide"], "--nuisance scale = 'wide' must be a number"),
-        (["--free", "attenuation", "--gain", "most"], "--gain most must be a number or auto"),
-        (["--free", "attenuation", "-o", "bounds.txt"], "must end in .png"),
-        ([], "Missing option '--free'"),
-    ],
-)
-def test_command_refuses_invalid_options(options, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert_refused(run("bounds", "table1", *options), message)
-    assert not list(tmp_path.iterdir())

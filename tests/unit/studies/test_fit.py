@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TRUTH, closed_form, noisy
-from command_line import assert_refused, run
+from command_line import run
 from rows import each_row
 
 import mitransient_lidar
@@ -178,23 +178,3 @@ def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path
         assert np.abs((fitted["value"].values - truth) / fitted["stderr"].values).max() < 6
         assert fitted["low"].values[1] == 0.01
     assert (tmp_path / "out" / "fit.png").stat().st_size > 10_000
-
-
-@each_row(
-    ("options", "message"),
-    [
-        (["--free", "depth"], "parameter 'depth' is not one of the scene"),
-        (["--free", ""], "--free = '' has an empty entry"),
-        ([], "--free = [] must name one or more parameters"),
-        (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
-        (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
-        (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),
-        (["--free", "attenuation", "--receiver", "none"], "receiver = 'none' must be one of"),
-        (["--free", "attenuation,bandwidth_mhz", "--receiver", "apd"], "bandwidth_mhz and a receiver"),
-        (["--free", "attenuation", "--noise", "-1"], "noise = -1 must be greater than 0"),
-    ],
-)
-def test_the_command_refuses_invalid_options(options, message, table, tmp_path):
-    done = run("fit", table, "--scene", "table1", *options, "-o", tmp_path / "out", "-q")
-    assert_refused(done, message)
-    assert not (tmp_path / "out").exists()

@@ -83,10 +83,7 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
 
 @pytest.mark.slow
 def test_noise_of_the_model_widens_the_covariance():
-    """A model with the error of the data: the same for all values, as by common random numbers.
-
-    With the errors of the data alone, the mean squared distance was 6.
-    """
+    """A model with the error of the data: the same for all values, as by common random numbers."""
     random = np.random.default_rng(5)
     distances = []
     for _ in range(20):
@@ -128,10 +125,7 @@ def rendered(values, errors, stderr):
 
 @pytest.mark.slow
 def test_errors_of_all_bins_that_agree_are_in_the_covariance():
-    """A model of 16 passes whose errors are a common factor for the larger part, which only batches of passes show.
-
-    With errors of the model that are independent from bin to bin, the mean squared distance was 23.
-    """
+    """A model of 16 passes whose errors are a common factor for the larger part, which only batches of passes show."""
     random = np.random.default_rng(9)
     distances = []
     for _ in range(60):

@@ -20,10 +20,7 @@ def lidar(*outlines, beam=BEAM, height=HEIGHT):
 
 @pytest.mark.parametrize(("along", "across", "wind"), [(0, 0, 0), (0.15, 0, 0), (-0.1, 0.2, 0), (0.1, -0.1, 0.7)])
 def test_plane(along, across, wind):
-    """E = Q A F(0) D/(4 cos R^2) for a beam within the pixel, at the time of the plane on the axis.
-
-    Slopes of the ray against the facet are components of its tangent; the ripples' axes follow from their definition.
-    """
+    """E = Q A F(0) D/(4 cos R^2) for a beam within the pixel, at the time of the plane on the axis."""
     lines = np.linspace(-4, 4, 401)
     x, y = (one.ravel()[np.newaxis] for one in np.meshgrid(lines, lines))
     variances = (0.02, 0.03)

@@ -66,10 +66,7 @@ def test_standard_errors_are_those_of_noise():
 
 
 def test_uneven_light_counts_as_error():
-    """One facet anywhere in each pixel, drawn with a spread of 1 mrad on a level sea, alike by 0.4 side by side.
-
-    That estimates are steeper than the sea, and each states the error of its own slope, leaves 2 %.
-    """
+    """One facet anywhere in each pixel, drawn with a spread of 1 mrad on a level sea, alike by 0.4 side by side."""
     rng = np.random.default_rng(3)
     spread = np.full(4, 1e-3)
     draws = math.sqrt(0.6) * rng.normal(size=(1500, 4)) + math.sqrt(0.4) * np.repeat(rng.normal(size=(1500, 2)), 2, 1)

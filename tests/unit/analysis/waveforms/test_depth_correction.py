@@ -107,10 +107,7 @@ def test_unknown_water_is_all_waters_in_which_the_bottom_is_seen():
 
 
 def test_ripples_are_an_axis_of_level_seas():
-    """Biases of 1 and 7 cm with ripples of 3 and 6 m/s are linear in the inverse slope variance, as is their walk.
-
-    At 22 degrees the echo of a level surface has the same ratio from 2 to 2.9 m/s as from 3 to 6 m/s.
-    """
+    """Biases of 1 and 7 cm with ripples of 3 and 6 m/s are linear in the inverse slope variance, as is their walk."""
     made = xr.concat([table().isel(wind_speed=[0]), table()], "wind_speed")
     made = made.assign_coords(ripples=("wind_speed", [3.0, 6.0, 6.0]))
     made["bias"][:], made["spread"][:] = 0.0, 0.0

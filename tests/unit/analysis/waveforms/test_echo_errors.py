@@ -80,10 +80,7 @@ def test_saturated_echoes_are_flagged_by_mask_and_by_level():
 
 
 def test_errors_of_saturated_echoes_hold():
-    """Surface and bottom clipped at a tenth to a half of their height, with 1 % of noise of what is left.
-
-    Their samples counted as if they were the echo: with the noise alone as error, arrivals were off by 10 of them.
-    """
+    """Surface and bottom clipped at a tenth to a half of their height, with 1 % of noise of what is left."""
     rng = np.random.default_rng(11 + significance.seed_shift)
     power = echo(SURFACE, 3e-13) + echo(SURFACE + 25.0, 2e-13)
     for share in (0.1, 0.25, 0.5):

@@ -29,10 +29,7 @@ def depths(chain, depth_from):
 
 @pytest.mark.parametrize(("name", "density", "share"), [("apd", 1.9, 0.03), ("pmt_log", 1.1, 0.5)])
 def test_blocks_and_series_have_the_errors_of_whole_records(name, density, share):
-    """200 records of two shots: depths in blocks are those of whole records, the errors of both those of their noise.
-
-    About half of the samples are missing, behind the echoes and in the dark.
-    """
+    """200 records of two shots: depths in blocks are those of whole records, errors of both those of their noise."""
     chain = RECEIVERS[name]
     places = xr.concat([lake(60.0, 1.5e-5)] * 2, "shot", combine_attrs="override").assign_coords(shot=[0, 1])
     light = {"shots": 200, "seed": 3, "optical_density": density}

@@ -91,10 +91,7 @@ def test_scattering_shifts_and_delays_by_its_moments():
 
 
 def test_tilted_light_meets_more_water_and_the_bottom_the_same():
-    """Isotropic backscatter: 1/cos for each way; of a function of the angle, that between both directions.
-
-    Light that returns along its way down has moved in the opposite direction on its way up.
-    """
+    """Isotropic backscatter: 1/cos for each way; of a function of the angle, that between both directions."""
     water = WaterColumn(np.zeros(1), np.array([0.3]), np.array([0.2]), np.array([0.1]))
     even = PowerLawTable.from_function(lambda theta: np.full_like(theta, 1 / (4 * np.pi)))
     steep = PowerLawTable.from_function(lambda theta: henyey_greenstein(theta, -0.4))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import SinglePhotonDetector
 
 # Dead for the rest of its bin and 9.5 bins of 1 ns: 10 bins.
@@ -55,18 +54,3 @@ def test_moments_in_changing_light(dead_ns, channels):
         often = shots * (covariance + mean[: len(t) - lag] * mean[lag:]) > 100
         error = products.std(axis=0) / np.sqrt(shots)
         assert np.all(np.abs(products.mean(axis=0) - covariance)[often] < limit * error[often]), lag
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"afterpulse_probability": 0.1}, "afterpulse_decay_ns is required"),
-        (
-            {"afterpulse_probability": 0.1, "afterpulse_decay_ns": 9.0, "paralyzable": True},
-            "afterpulse_probability = 0.1 must be 0 for a paralyzable detector",
-        ),
-    ],
-)
-def test_invalid_afterpulses_are_refused(values, message):
-    with pytest.raises(UserError, match=message):
-        SinglePhotonDetector(0.5, 10.0, **values)

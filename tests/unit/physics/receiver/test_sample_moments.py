@@ -6,7 +6,6 @@ from differentiated import PHOTON
 from rows import each_row
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier
@@ -64,17 +63,3 @@ def test_derivatives_are_those_of_the_closed_forms(name):
         np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
     assert not moments.mean_derivatives[1].any()
     assert not moments.covariance_derivatives[1].any()
-
-
-@pytest.mark.parametrize(
-    ("power", "directions", "message"),
-    [
-        (-PULSE, PULSE[None], "power = -1 must not be negative"),
-        (PULSE[None], PULSE[None], r"power of shape \(1, 24\) must be one record"),
-        (PULSE, PULSE, r"directions of shape \(24,\) must have shape \(direction, 24\)"),
-        (PULSE, np.nan * PULSE[None], "directions holds nan"),
-    ],
-)
-def test_invalid_input(power, directions, message):
-    with pytest.raises(UserError, match=message):
-        sample_moments(RECEIVERS["ideal"], power, directions, 1.0)

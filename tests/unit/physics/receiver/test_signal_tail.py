@@ -8,15 +8,9 @@ from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.analysis.detection import statistics
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import sample_moments
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.detectors import (
-    LinearDetector,
-    SiliconPhotomultiplier,
-    SinglePhotonDetector,
-    photons_per_joule,
-)
+from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, photons_per_joule
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 FRACTIONS, DECAYS, DELAYS = (0.02, 0.05), (30.0, 90.0), (0.0, 24.5)
@@ -109,19 +103,3 @@ def test_afterpulses_of_cells_follow_those_that_fire():
     later = 0.05 * 1000 * (1 - np.exp(-3)) * (np.exp(-0.5 / 20) - np.exp(-1.5 / 20))
     assert events[21] == pytest.approx(later)
     assert events[21:].sum() == pytest.approx(0.05 * 1000 * (1 - np.exp(-3)) * np.exp(-0.5 / 20), rel=1e-4)
-
-
-@each_row(
-    ("values", "message"),
-    [
-        ({"tail_fractions": (0.1,)}, r"tail_decays_ns = \[\] must have as many numbers as tail_fractions, 1"),
-        ({"tail_fractions": (0.7, 0.6), "tail_decays_ns": (9.0, 8.0)}, "tail_fractions .* a sum of at most 1"),
-        (
-            {"tail_fractions": (0.1,), "tail_decays_ns": (9.0,), "tail_delays_ns": (1.0, 2.0)},
-            "tail_delays_ns = .* must have as many numbers as tail_fractions",
-        ),
-    ],
-)
-def test_invalid_tails_are_refused(values, message):
-    with pytest.raises(UserError, match=message):
-        SinglePhotonDetector(0.5, 10.0, **values)

@@ -27,10 +27,7 @@ def variance_of_long_waves(wind, shortest):
 @pytest.mark.parametrize("wind", [3.0, 6.0, 12.0])
 @pytest.mark.parametrize("shortest", [4.0, 1.5])
 def test_facets_have_the_slope_variance_of_the_waves_that_they_hold(wind, shortest):
-    """From the integral of the spectrum; a facet of size d loses k^2 d^2/12 to the ripples: little, and less if halved.
-
-    A wave in three cells, as before, would lose a quarter.
-    """
+    """From the integral of the spectrum; a facet of size d loses k^2 d^2/12 to the ripples, and less if halved."""
     expected = np.array(variance_of_long_waves(wind, shortest))
     lost = []
     for cells_per_wave in (12, 24):

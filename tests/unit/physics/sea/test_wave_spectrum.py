@@ -244,18 +244,3 @@ def test_matched_totals(kind, wind):
     if plain.peak_wavenumber < 2 * np.pi:
         total = sum(trapezoid(matched.omnidirectional(k) * k**3, np.log(k)) for k in (long, short))
         assert total == pytest.approx(sum(cox_munk(wind)), rel=1e-5 if kind is ElfouhailySpectrum else 1e-4)
-
-
-@each_row(
-    ("call", "message"),
-    [
-        (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
-        (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
-        (lambda: SeaState(()), "components must hold at least one"),
-        (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
-        (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
-    ],
-)
-def test_bad_parameters_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
