@@ -273,29 +273,14 @@ MIXED = "mirror and sphere in strata"
 #: Where merged light is what is noisy.
 NOISY = "beam of 2 rad over waves"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water, strata
-#: (the quick case) and orders (turbid water). Closed forms cover solids, plates in the air, masts, poses under water,
-#: beam and view of millimetres over ripples, and the opposition effect.
-LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
-LONG |= {"narrow view at 75 degrees", "mast, 1 m aside over waves", "from orbit over waves"}
-LONG |= {
-    "plates in the air",
-    "strata of other indices, by order",
-    "view as narrow as the beam",
-    "narrow beam in turbid, smooth water",
-}
-LONG |= {
-    "sand below bubbles of a windy sea",
-    "solids below an inclined sea",
-    "mast at 60 degrees",
-    "below a boat, at a target",
-    "narrow beam over waves",
-    NOISY,
-}
+#: (the quick case) and turbid water (the layers). Closed forms cover solids, plates in the air, masts, poses under
+#: water, beam and view of millimetres over ripples, and the opposition effect.
+SLOW = {"layers and bubbles under waves", "materials and bitmaps"}
 
 
 def tier_of(name):
     """Return the marks of a case."""
-    return [] if name == MIXED else pytest.mark.long if name in LONG else pytest.mark.slow
+    return [] if name == MIXED else pytest.mark.slow if name in SLOW else pytest.mark.long
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=tier_of(name)) for name in CASES])

@@ -93,7 +93,7 @@ def test_renders_have_the_bits_of_those_alone(alone, threads):
         assert_same_bits(expected, one)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_of_another_thread_has_the_bits_of_one_alone(alone):
     sessions = in_threads(4, lambda _: open_scene("table1", SCENE), range(4))
 
