@@ -86,6 +86,7 @@ def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_sea
         assert seen < size < 1.6 * seen
 
 
+@pytest.mark.slow
 def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsewhere(lidar_scene):
     """Waves of 10 m/s reach 1.5 m below the mean sea level somewhere on the sea, a bottom is at 1.25 m."""
     pose = {"altitude": 20.0, "off_nadir_deg": 0.0}

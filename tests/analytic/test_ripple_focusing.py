@@ -86,11 +86,10 @@ def test_a_switch_must_be_true_or_false(lidar_scene):
 @pytest.mark.parametrize(
     "parts",
     [
-        {"sea": {"spectrum": "flat"}},
         {"sea": SEA | {"ripple_focusing": "false"}},
         {"sea": SEA, "tx": {"altitude": -2.0}, "rx": {"altitude": -2.0}, "film": {"time_start_ns": 0.0}},
     ],
-    ids=["flat", "without", "under water"],
+    ids=["without", "under water"],
 )
 def test_seas_without_it(lidar_scene, parts):
     assert renderer_of(lidar_scene(**parts)).focusing is None

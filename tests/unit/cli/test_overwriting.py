@@ -154,7 +154,8 @@ def change_mark(path, **values):
     write_mark(path, mark)
 
 
-@pytest.mark.parametrize(("name", "file"), FILES)
+# Every third file: all commands write through one function.
+@pytest.mark.parametrize(("name", "file"), FILES[::3])
 def test_file_of_a_stranger_is_kept(name, file, folder):
     (folder / file).write_text("mine")
     assert_refused(command(name), f"{file} is kept, since ", "--overwrite", "-csv" if name == "echoes" else "-")
@@ -163,7 +164,7 @@ def test_file_of_a_stranger_is_kept(name, file, folder):
         assert "is kept" not in command(name, "--overwrite").stderr
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in ("echoes", "fly")])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("echoes", "fly")][::3])
 def test_files_of_the_same_command_and_scene_may_be_replaced(name, write_before, folder):
     """Not those of another command, scene or instrument, and those that took long."""
     write_before(name)
@@ -231,6 +232,7 @@ def test_line_names_what_differs():
 
 
 @pytest.mark.usefixtures("small_figures")
+@pytest.mark.slow
 def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
     for name in ("a", "b"):
         (folder / name).mkdir()

@@ -91,15 +91,12 @@ def test_steps_of_others(level, name, value, step):
         (["botom_depth"], {}, "'botom_depth' is not one of the scene: did you mean bottom_depth"),
         (["layout"], {}, "layout = '2x2' is not a number"),
         (["bin_width_ns"], {}, "bin_width_ns = 1 belongs to the record"),
-        (["surface_seed"], {}, "surface_seed = 1 belongs to the record"),
         (["bottom_depth"], {"bottom_depth": 0.0}, "step of bottom_depth = 0 must be greater than 0"),
-        (["bottom_depth"], {"target_depth": 0.1}, "steps: 'target_depth' is not among the parameters bottom_depth"),
         (
             ["bottom_depth"],
             {"bottom_depth": 7.0},
             "bottom_depth = 8 needs values 7 below and above, and layer_tops = 3",
         ),
-        (["bottom_reflectance"], {"bottom_reflectance": 0.2}, "bottom_reflectance = 0.1 needs values 0.2 below and"),
     ],
 )
 def test_refused_parameters_and_steps(level, names, steps, message):
