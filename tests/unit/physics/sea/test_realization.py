@@ -150,9 +150,6 @@ def test_facet_slopes_have_the_predicted_variance():
     assert unfiltered - expected[1] > 8 * error[1]
 
 
-G = 9.81
-
-
 def single_wave(wavelength, direction):
     """Return swell that is one wave of a period of 64 m."""
     return SwellSpectrum(0.5, wavelength, direction, relative_bandwidth=1e-3, directional_spread=1e-3)
