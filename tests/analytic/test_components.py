@@ -57,7 +57,7 @@ def test_too_many_solids_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
     """Ripples seen from above, water that scatters so little that no light is scattered twice, and a grey bottom."""
     scattering, variance, pose = 1e-4, 1e-3, {"off_nadir_deg": 0.0}

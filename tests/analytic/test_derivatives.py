@@ -124,7 +124,7 @@ def test_scattering_follows_from_the_number_of_events(lidar, integrator):
     assert (energy.sum(axis=(0, 1, 3)) > 0).all()
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_light_scattered_once_follows_from_the_phase_function(lidar, integrator):
     """E of one event is in proportion to b p(180 degrees), and bb/b decides the Fournier-Forand function p.
 
@@ -143,7 +143,7 @@ def test_light_scattered_once_follows_from_the_phase_function(lidar, integrator)
     np.testing.assert_allclose(changes / energy, wanted, rtol=3e-3)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_reflectance_follows_from_the_number_of_reflections(lidar, integrator):
     """Light that has not met the bottom does not change; nearly all other light has met it once."""
     renderer, _ = lidar(integrator, SHARED, rho=0.3)
@@ -163,7 +163,7 @@ def test_ripple_variance_of_an_echo_off_nadir(lidar, integrator):
     assert 0.01 * changes / energy == pytest.approx(np.tan(np.deg2rad(20)) ** 2 / 0.01 - 1, rel=1e-4)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_divergence_of_a_beam_that_overfills_the_view(lidar, integrator):
     """Of a bottom in water that only absorbs, E is in proportion to 1 - exp(-R^2 / (2 sigma^2))."""
     water = {**FIXED, "attenuation": 0.3, "scattering": 0.0, "backscattering": 0.0}

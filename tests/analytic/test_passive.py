@@ -71,7 +71,7 @@ def agrees(samples, expected, comparisons=1, bias=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (60.0, 0.0, 0.5), (40.0, 35.0, 0.9)])
+@pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (40.0, 35.0, 0.9)])
 def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
     """E cos(theta) T(theta) rho / pi, raised by what the sea's underside returns, times T(view) / n^2.
 

@@ -169,7 +169,8 @@ def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_pa
     assert "shard 1\n" in log
 
 
-@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("deaths", [2, 3])
 def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
     """Twice; it once ended the campaign."""
     path = planned_copy(quick, tmp_path / "early.zarr")

@@ -146,7 +146,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
         worker.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
     """The campaign once waited for ever, and later stored a run in which processes hung as failed."""
     path = planned_copy(quick, tmp_path / "hung.zarr")
