@@ -31,10 +31,7 @@ WAVES = {"wind_speed": 6, "bin_width_ns": 2}
 CASES = {
     "clear": ("table1", {**LEVEL, "attenuation": 0.12, "scattering": 0.05, "backscattering": 0.001}),
     "layered": ("fig15_2x2", {**LEVEL, "layout": "2x2", "bottom_depth": 6}),
-    "turbid": (
-        "table1",
-        {**LEVEL, "attenuation": 1.5, "scattering": 1.2, "backscattering": 0.03, "bottom_depth": 4},
-    ),
+    "turbid": ("table1", {**LEVEL, "attenuation": 1.5, "scattering": 1.2, "backscattering": 0.03, "bottom_depth": 4}),
     "absorbing": ("table1", {**LEVEL, "attenuation": 1.0, "scattering": 0.2, "bottom_depth": 4}),
     "hg": ("table1", {**LEVEL, "phase_function": "hg", "phase_g": 0.9, "backscattering": 0}),
     "waves": ("table1", WAVES, ["attenuation", "scattering", "backscattering", "bottom_reflectance"]),

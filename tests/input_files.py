@@ -404,9 +404,7 @@ KINDS = {
     "mesh.obj": Kind(mesh("a.obj"), load_part("obj", filename="FILE"), "text"),
     "texture": Kind(image(".png"), load_part("diffuse", reflectance={"type": "bitmap", "filename": "FILE"})),
     "spectrum": Kind(
-        written("a.spd", _SPECTRUM),
-        load_part("diffuse", reflectance={"type": "spectrum", "filename": "FILE"}),
-        "text",
+        written("a.spd", _SPECTRUM), load_part("diffuse", reflectance={"type": "spectrum", "filename": "FILE"}), "text"
     ),
     "result_nc": Kind(saved(shot, "a.nc"), analyse),
     "result_exr": Kind(saved(shot, "a.exr"), analyse),
@@ -428,11 +426,7 @@ KINDS = {
     "map.asc": Kind(height_map(".asc"), load_map, "text"),
     "profile": Kind(written("a.csv", _PROFILE), load_plugin(type="layered_water", profile="FILE"), "text"),
     "phase_function": Kind(written("a.csv", _PHASE), load_plugin(type="measured_phase", filename="FILE"), "text"),
-    "pulse": Kind(
-        written("a.csv", _PULSE),
-        load_plugin(type="lidar_transmitter", pulse_file="FILE"),
-        "text",
-    ),
+    "pulse": Kind(written("a.csv", _PULSE), load_plugin(type="lidar_transmitter", pulse_file="FILE"), "text"),
     "receiver": Kind(shipped("leica_hawkeye4x_deep.toml"), read_receiver, "text"),
     "corrections": Kind(shipped("leica_hawkeye4x_deep_depths.nc"), read_corrections),
     "measured": Kind(written("a.csv", _MEASURED), read_measured, "text"),

@@ -191,12 +191,7 @@ FAULTS = (
         "factor, bs",
         near="tests/analytic/test_agreement.py",
     ),
-    Fault(
-        *("far_row_below", f"{_G}/drawing.py"),
-        'origin="upper"',
-        'origin="lower"',
-        near=_FIGURES,
-    ),
+    Fault(*("far_row_below", f"{_G}/drawing.py"), 'origin="upper"', 'origin="lower"', near=_FIGURES),
     Fault(
         *("depth_below_the_laser", f"{_G}/waveforms.py"),
         "ax, -zero * metres_per_ns",
@@ -209,18 +204,8 @@ FAULTS = (
         "xlim=(low[0], high[0])",
         near=_FIGURES,
     ),
-    Fault(
-        *("even_bands", f"{_G}/drawing.py"),
-        "lowest), y + above",
-        "lowest), y + below",
-        near=_FIGURES,
-    ),
-    Fault(
-        *("black_for_blue", f"{_G}/drawing.py"),
-        '"#1f5fd6", "#111111")',
-        '"#111111", "#1f5fd6")',
-        near=_FIGURES,
-    ),
+    Fault(*("even_bands", f"{_G}/drawing.py"), "lowest), y + above", "lowest), y + below", near=_FIGURES),
+    Fault(*("black_for_blue", f"{_G}/drawing.py"), '"#1f5fd6", "#111111")', '"#111111", "#1f5fd6")', near=_FIGURES),
     Fault(
         *("share_of_lost_bottoms", f"{_G}/campaigns.py"),
         "(flags & _NO_ECHO) == 0",
@@ -305,12 +290,7 @@ FAULTS = (
         "ddof=1) / n + np.var(below, ddof=1) / m",
         near=f"{_UNIT}/analysis/detection",
     ),
-    Fault(
-        *("one_sided_limit", f"{_A}/comparison.py"),
-        "ndtri(-0.5 * np",
-        "ndtri(-np",
-        near=f"{_UNIT}/analysis",
-    ),
+    Fault(*("one_sided_limit", f"{_A}/comparison.py"), "ndtri(-0.5 * np", "ndtri(-np", near=f"{_UNIT}/analysis"),
     Fault(
         *("first_minus_second", f"{_A}/comparison.py"),
         "values[1] - values[0], np.nan",
@@ -330,10 +310,7 @@ FAULTS = (
         near=f"{_UNIT}/analysis",
     ),
     Fault(
-        *("bins_alone_twice", f"{_R}/sum_errors.py"),
-        "(1 - np.diagonal",
-        "(1 + np.diagonal",
-        near=f"{_UNIT}/results",
+        *("bins_alone_twice", f"{_R}/sum_errors.py"), "(1 - np.diagonal", "(1 + np.diagonal", near=f"{_UNIT}/results"
     ),
     Fault(
         *("area_without_the_spread_of_targets", f"{_A}/detection/statistics.py"),

@@ -38,10 +38,7 @@ PATHS = {"lidar_merging": 2**13, "lidar_volpath": 2**13}
 
 def render(scene, integrator="lidar_merging", passes=2, **options):
     return mitransient_lidar.render(
-        scene,
-        integrator={"type": integrator, "paths_per_pass": PATHS[integrator]},
-        passes=passes,
-        **options,
+        scene, integrator={"type": integrator, "paths_per_pass": PATHS[integrator]}, passes=passes, **options
     )
 
 

@@ -132,21 +132,6 @@ def _assert_close(found, wanted, error, bias, passes):
     assert z[worst] < limit[worst], f"value {worst} of {z.size}: {found[worst]} for {wanted[worst]}, z {z[worst]:.1f}"
 
 
-def assert_same_in_all(pairs, weights, *, error, bias=0.0):
-    """Assert that the totals of many pairs of sets of passes have ratios of mean 1, with weights that are given.
-
-    Weights that followed from the errors would favour sets that happen to lack large contributions.
-    """
-    weights = np.asarray(weights) / np.sum(weights)
-    totals = [[mean_and_error(samples.reshape(len(samples), -1).sum(axis=1)) for samples in pair] for pair in pairs]
-    ratios = np.array([a / b for (a, _), (b, _) in totals])
-    errors = ratios * [np.hypot(da / a, db / b) for (a, da), (b, db) in totals]
-    mean, own = weights @ ratios, float(np.linalg.norm(weights * errors))
-    fewest = min(len(samples) for pair in pairs for samples in pair)
-    assert own < largest_error(fewest, error), own
-    assert abs(mean - 1) < bias + largest_z(fewest) * own, (mean, own)
-
-
 def assert_distribution(test):
     """Assert that a ``mitsuba.chi2.ChiSquareTest`` finds no difference, with this suite's chance of a false alarm."""
     _count()

@@ -1,6 +1,5 @@
 """Light at depth against radiative-transfer benchmarks, exact moments, small-angle theory, and energy conservation."""
 
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -8,15 +7,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from oracles.beam_spread import BeamSpread
 from oracles.echo_times import layered_time_ns
-from scipy.integrate import quad, trapezoid
-from scipy.special import j1
 from significance import largest_error, largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.studies.beam_spread import beam_spread
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
@@ -76,15 +71,6 @@ def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
         assert error < largest_error(16, 0.0029)
 
 
-@pytest.mark.slow
-def test_light_that_leaves_for_ever_is_counted(system):
-    # No bottom: the last leg of nearly all light, through the clear water below, has no end.
-    water = {"layer_tops": "0, 1", "attenuation": "0.2, 0", "scattering": "0, 0"}
-    down, up = fluxes(system({**MATCHED, **water}, bottom=None), [0.5, 2.0, 30.0], 4096, 2)
-    np.testing.assert_allclose(down, np.tile(np.exp([-0.1, -0.2, -0.2]), (2, 1)), rtol=1e-4)
-    assert np.all(up == 0)
-
-
 #: Mean cosine of the scattering angle, depth of the source [m], and distance of the points [m] in `moments`, b = 1 /m.
 MEAN_COSINE, SOURCE_DEPTH, STEP = 0.924, 150.0, 10.0
 
@@ -139,74 +125,6 @@ def test_moments_of_an_infinite_medium(system, z_score):
     assert np.all(error < largest_error(passes, 0.006))
 
 
-#: Standard deviation of the narrow phase function along each axis [rad].
-NARROW = np.radians(1.5)
-
-
-@pytest.fixture
-def narrow(tmp_path):
-    """A phase function that is a narrow Gaussian, with nothing at large angles."""
-    degrees = np.concatenate(([0.0], np.geomspace(0.02, 8.0, 400) * np.degrees(NARROW), [170.0, 180.0]))
-    value = np.exp(-0.5 * (np.radians(degrees) / NARROW) ** 2) / (2 * np.pi * NARROW**2)
-    path = tmp_path / "narrow.txt"
-    np.savetxt(path, np.column_stack([degrees, np.maximum(value, 1e-12)]))
-    return {"particles": {"type": "measured_phase", "filename": str(path)}}
-
-
-def within_small_angle(radius, depth, scattering):
-    """Return the share of the light within a radius, exact for small angles and any number of scatterings.
-
-    Wells 1973 (in Optics of the Sea, AGARD Lecture Series 61): the spread function's Hankel transform is
-    exp(-b z (1 - q)) with q the mean along z of the phase function's at the spatial frequency k z', here a Gaussian.
-    Unscattered light does not decay with k: it is split off.
-    """
-    reach = NARROW * depth
-
-    def transform(k):
-        u = k * reach
-        mean = quad(lambda t: np.exp(-0.5 * (u * t) ** 2), 0, 1)[0]
-        return np.exp(-scattering * depth * (1 - mean)) - np.exp(-scattering * depth)
-
-    k = np.linspace(1e-6, 60 / reach, 6000)
-    values = np.array([transform(each) for each in k])
-    return np.exp(-scattering * depth) + radius * trapezoid(j1(k * radius) * values, k)
-
-
-@pytest.mark.parametrize(
-    ("absorption", "scattering"),
-    [pytest.param(0.05, 0.8, marks=pytest.mark.long), pytest.param(0.3, 1.5, marks=pytest.mark.long)],
-)
-def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
-    """Rationale: the theory of McLean, Freeman and Walker assumes what this phase function is.
-
-    Expectation: transmittance, mean square radius, and mean and variance of the delay (with the fourth moment of the
-    angle) are exact for small angles. Their density is a model: it draws light to the axis.
-    Tolerance: what the moments leave out is of the order x = b z <Theta^2>, at most 0.025; absorption removes late and
-    far light, which lowers them by about a v sigma^2/mean. The model's density is 0.1 off.
-    """
-    depths = [4.0, 8.0, 12.0]
-    water = {"attenuation": absorption + scattering, "scattering": scattering, "backscattering": 0.0}
-    scene = lidar_scene(tx=PENCIL, rx=VIEW, sea=LARGE_SEA, water={**MATCHED, **water, **narrow}, bottom=12.5, rho=0.0)
-    spread = beam_spread(scene, depths=depths, passes=8, photons=2**15)
-    assert spread.attrs["mean_cosine"] == pytest.approx(np.exp(-(NARROW**2)), abs=2e-6)
-    for number, depth in enumerate(depths):
-        row = spread.isel(depth=number)
-        drawn = BeamSpread(depth, absorption, scattering, np.exp(-(NARROW**2)), 1.0)
-        theory = replace(drawn, mean_fourth_angle=8 * NARROW**4)
-        total = theory.unscattered + theory.transmittance
-        thinned = absorption * theory.speed * theory.delay_variance / theory.mean_delay
-        tolerance = 0.01 + thinned
-        assert abs(row["transmitted"] / total - 1) < 5e-4
-        assert abs(row["unscattered"] - theory.unscattered) < largest_z(8) * row["unscattered_stderr"] + 1e-6
-        assert abs(row["shift_rms"] / theory.radius_rms - 1) < tolerance
-        assert abs(1e-9 * row["delay_mean"] / theory.mean_delay - 1) < tolerance
-        assert abs(1e-9 * row["delay_std"] / np.sqrt(theory.delay_variance) - 1) < tolerance + 0.02
-        for rank in np.searchsorted(spread["radius"], theory.radius_rms * np.array([0.5, 1.0, 2.0])):
-            radius, share = float(spread["radius"][rank]), float(row["within_shift"][rank])
-            assert abs(share - within_small_angle(radius, depth, scattering)) < 0.012
-            assert abs(share - (drawn.unscattered + drawn.encircled(radius)) / total) < 0.11
-
-
 @pytest.mark.slow
 def test_white_bottom_returns_all_light(system):
     # Water that does not absorb: what leaves upwards and what the surface reflects at once is what was sent.
@@ -231,17 +149,6 @@ def test_white_bottom_returns_all_light(system):
     assert abs(returned.mean() - 1) < 0.001 + largest_z(passes) * error
     assert error < largest_error(passes, 0.002)
     assert first.mean() == pytest.approx(float(fresnel(0.0, 1.34)[0]), abs=0.001)
-
-
-@pytest.mark.slow
-def test_no_crossing_is_lost_or_counted_twice(system):
-    # Without absorption each path crosses every plane once more downwards than upwards if it ends on the black bottom,
-    # and as often if it leaves through the surface: net fluxes agree pass by pass.
-    water = {"layer_tops": "0, 3", "attenuation": "1, 2", "scattering": "1, 2", "phase_function": "hg", "phase_g": 0.7}
-    indices = {"refractive_index": "1.3, 1.4", "group_index": "1.3, 1.4"}
-    down, up = fluxes(system({**water, **indices}, bottom=5.0, rho=0.0), [0.5, 2.9, 3.0, 3.1, 4.999], 2**14, 2)
-    assert np.all(up[:, :-1] > 0.1)
-    np.testing.assert_allclose(down - up, np.tile((down - up)[:, :1], (1, 5)), rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from oracles.lidar_equation import bottom_energy
-from significance import assert_equal, assert_same, largest_z
+from significance import assert_equal, largest_z
 
-import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -64,7 +63,7 @@ def cells(angle_x, angle_y):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["gaussian", "top_hat", "image"])
+@pytest.mark.parametrize("kind", ["gaussian", "image"])
 def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, tmp_path):
     """2x2 pixels of a view narrower than the beam's long axis; a mirrored turn would swap left and right pixels."""
     if kind == "image":
@@ -109,13 +108,10 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "variance", "depth", "spread"),
-    [
-        ("lidar_volpath", 5e-4, 0.48, 0.7e-3),
-        *(("lidar_merging", *case) for case in ((5e-4, 0.48, 0.7e-3), (1e-5, 0.48, 0.7e-3), (1e-5, 2.0, 3e-3))),
-    ],
+    [("lidar_volpath", 5e-4, 0.48, 0.7e-3), ("lidar_merging", 1e-5, 0.48, 0.7e-3)],
 )
 def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator, variance, depth, spread):
-    """Patches that grew with depth as broad light does, from a millimetre, lost 74, 88 and 58 % of it.
+    """Patches that grew with depth as broad light does, from a millimetre, lost 88 % of it.
 
     Slopes of the variance s^2 in each direction turn light and lines of sight by D s, D = 1 - 1/n, so that a share
     1 - exp(-R^2 / 2 (sigma^2 + 2 D^2 s^2 z^2)) of the light at the depth z lies within the view of radius R.
@@ -142,54 +138,3 @@ def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator,
     # The surface's light is in the first bins.
     begin = int(2 * (height + index * depth) / C0 * 1e9 - 74.0)
     assert_equal(found[:, begin - 1 : begin + 2].sum(axis=1), expected, error=0.02, bias=8e-3)
-
-
-@pytest.mark.slow
-def test_obscured_aperture_receives_its_open_share(lidar_scene, passes):
-    """The same seed gives the same paths: the exact ratio in 32 bits, of areas, not of diameters or of squares."""
-    scenes = [lidar_scene(rx={"obscuration": share}, water=CLEAR) for share in (0.0, 0.3)]
-    whole, obscured = (passes(scene, 2) for scene in scenes)
-    np.testing.assert_allclose(obscured, 0.7 * whole, rtol=1e-4, atol=1e-6 * whole.max())
-    results = [mitransient_lidar.render(scene, passes=2) for scene in scenes]
-    assert [result.attrs["obscuration"] for result in results] == [0.0, 0.3]
-
-
-@pytest.mark.long
-def test_echoes_below_waves_that_are_shorter_than_the_beam(lidar_scene, passes, tmp_path):
-    """Waves of 15 cm below a beam of 20 cm focus light at 0.3 m.
-
-    Light and lines of sight through several facets meet at a point, so that layers of equal thickness, 0.9 m in this
-    record, had 1.8 times the light of the first two decimetres, and 0.82 of that around the focus.
-    """
-    side, cells, steepness, ripples = 10.24, 1024, 0.3, 0.002
-    number = 2 * np.pi / 0.15
-    line = (np.arange(cells) + 0.5) * side / cells - side / 2
-    inside = np.minimum(1, side / 2 - np.abs(line))
-    waves = [steepness / number * np.sin(number * line + phase) for phase in (0.0, 1.0)]
-    np.save(tmp_path / "sea.npy", (waves[0][:, None] + waves[1]) * inside[:, None] * inside)
-    found = {}
-    # A record of 200 ns: points, and with them layers, are as far apart as it is long.
-    for plugin, paths, count, bins in (("lidar_merging", 2**17, 64, 400), ("lidar_volpath", 2**17, 32, 80)):
-        scene = lidar_scene(
-            integrator={"type": plugin, "paths_per_pass": paths},
-            tx={"altitude": 100.0, "off_nadir_deg": 0.0, "divergence_mrad": 2.0},
-            rx={"altitude": 100.0, "off_nadir_deg": 0.0, "field_of_view_mrad": 6.0, "layout": "1x1"},
-            film={"time_start_ns": 665.1, "bin_width_ns": 0.5, "bin_count": bins},
-            sea={
-                "spectrum": "height_map",
-                "filename": str(tmp_path / "sea.npy"),
-                "map_size": side,
-                "slope_variance": str(steepness**2 + ripples),
-            },
-            water={
-                "attenuation": 0.1,
-                "scattering": 1e-3,
-                "backscattering": 5e-4,
-                "phase_function": "hg",
-                "phase_g": 0.0,
-            },
-            bottom=None,
-        )
-        # The surface, then 0.2, 0.9, 1.3 and 4.5 m below it.
-        found[plugin] = np.add.reduceat(passes(scene, count)[:, 0], [5, 8, 16, 28, 68], axis=1)[:, :4]
-    assert_same(found["lidar_merging"], found["lidar_volpath"], error=0.02, bias=0.03)

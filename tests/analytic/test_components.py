@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from oracles.beam_average import echo_energies
 from oracles.phase import henyey_greenstein
-from significance import largest_error, largest_z
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.plots.waveforms import plot_components
 from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 
@@ -52,29 +51,13 @@ def test_parts_survive_a_netcdf_file_and_a_second_render(parts, tmp_path):
     np.testing.assert_array_equal(again["waveform_by_origin_stderr"], parts["waveform_by_origin_stderr"])
 
 
-@pytest.mark.slow
-def test_parts_are_drawn(parts, tmp_path):
-    figure = plot_components(parts, tmp_path / "parts.png")
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ORIGINS
-    with pytest.raises(UserError, match="no variable waveform_by_origin: render it with components"):
-        plot_components(parts.drop_dims("origin"))
-
-
-@pytest.mark.slow
-def test_memory_of_the_parts_is_limited():
-    with pytest.raises(
-        UserError, match=r"4 pixels x \d+ bins x 4 components takes .* more than max_memory = 0.0001 GB"
-    ):
-        mitransient_lidar.render("fig13_2x2", passes=2, components=True, max_memory=1e-4)
-
-
 def test_too_many_solids_are_refused():
     with pytest.raises(UserError, match="the scene has 31 solids; allowed are at most 30"):
         PathClasses.by_origin([None] * 31)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
     """Ripples seen from above, water that scatters so little that no light is scattered twice, and a grey bottom."""
     scattering, variance, pose = 1e-4, 1e-3, {"off_nadir_deg": 0.0}
@@ -105,28 +88,3 @@ def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
     assert np.all(error < limits), error
     # The closed form neglects that ripples bend light.
     assert np.all(np.abs(z) * error < largest_z(count, 3) * error + 1e-3), (z, error)
-
-
-@pytest.mark.long
-def test_part_of_a_target_is_what_its_reflectance_adds():
-    """Before light from it can meet the bottom, a grey target differs from a black one by its part."""
-    params = {"time_start_ns": 1400, "bin_count": 120, "layout": "1x1"}
-    grey, black = (
-        mitransient_lidar.render(
-            "fig13_2x2", params={**params, "target_reflectance": rho}, passes=12, seed=seed, components=True
-        )
-        for rho, seed in ((0.3, 3), (0.0, 4))
-    )
-    assert float(black["impulse_response_by_origin"].sel(origin="target").sum()) == 0
-    gate = slice(1478, 1502)
-
-    def gated(one, name):
-        part = one[name].sel(time=gate).sum(("pixel", "time"))
-        inflated = one[f"{name}_stderr"].sel(time=gate).sum(("pixel", "time"))
-        return float(part), float(inflated)
-
-    (whole, whole_error), (dark, dark_error) = (gated(one, "impulse_response") for one in (grey, black))
-    own = grey["impulse_response_by_origin"].sel(origin="target", time=gate).sum()
-    error = np.hypot(whole_error, dark_error)
-    assert error < largest_error(12, 0.042) * own
-    assert abs(whole - dark - own) < largest_z(12) * error

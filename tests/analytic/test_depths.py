@@ -1,13 +1,11 @@
 """Depths of every pixel against the point where its refracted line of sight meets the bottom, for planes and steps."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns
 from scipy.special import ndtr
 from significance import largest_chi2
 
-import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.range_images import depth_image
 from mitransient_lidar.analysis.waveforms import echo_table
@@ -15,7 +13,6 @@ from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.gate_stack import build_gates
-from mitransient_lidar.results.geometry import LinesOfSight
 
 N, GROUP, DEPTH = 1.34, 1.364, 8.0
 ANGLE = np.radians(20.0)
@@ -60,7 +57,7 @@ def arrivals(rise, angle_x, angle_y):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bottom", BOTTOMS)
-@pytest.mark.parametrize("count", [8, 32, 128])
+@pytest.mark.parametrize("count", [8, 32])
 def test_gates_of_an_imager_give_the_depth_of_each_pixel(bottom, count):
     """On the axis's scale, the level bottom would fall by 1.1 m from the near row to the far one."""
     angle_x, angle_y = grid(count)
@@ -84,8 +81,7 @@ def test_gates_of_an_imager_give_the_depth_of_each_pixel(bottom, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bottom", ["level", "falls", "rises"])
-@pytest.mark.parametrize("count", [1, 2, 8])
-@pytest.mark.parametrize("depth_from", ["echo", "mean"])
+@pytest.mark.parametrize(("count", "depth_from"), [(1, "mean"), (2, "echo"), (8, "mean")])
 def test_waveforms_give_the_depth_of_each_pixel(bottom, count, depth_from):
     """Echoes of surface and bottom with noise, 24 shots: depths deviate by their stated errors."""
     axis = TimeAxis(1395.0, 0.5, 240)
@@ -114,73 +110,3 @@ def test_waveforms_give_the_depth_of_each_pixel(bottom, count, depth_from):
     z = np.concatenate(z)
     most = np.sqrt(largest_chi2(z.size) / z.size)
     assert 2 - most - 0.05 < np.sqrt(np.mean(z**2)) < most + 0.05
-
-
-def plate(x, z, rise=0.0, size=60.0, reflectance=0.2):
-    turned = mi.ScalarTransform4f().translate([x, 0, z]).rotate([0, 1, 0], -np.degrees(np.arctan(rise))).scale(size)
-    diffuse = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": reflectance}}
-    return {"type": "rectangle", "to_world": turned, "bsdf": diffuse}
-
-
-def shoot(lidar_scene, layout, bottom, paths, passes, film=None):
-    """Render a level sea with ripples over a bottom."""
-    rise = BOTTOMS[bottom]
-    # Mitsuba would merge shapes of one material.
-    step = {"far": plate(0, -DEPTH, size=200.0), "near": plate(-60, -6.5, reflectance=0.21)}
-    scene = lidar_scene(
-        integrator={"type": "lidar_merging", "paths_per_pass": paths, "photons_per_pass": 2**13},
-        rx={"layout": layout, "field_of_view_mrad": 15.0},
-        film={"time_start_ns": 1400.0, "bin_width_ns": 1.0, "bin_count": 150, **(film or {})},
-        sea={"slope_variance": "0.02"},
-        water={"attenuation": 0.2, "scattering": 0.1, "backscattering": 0.002, "group_index": GROUP},
-        bottom=None,
-        extra=step if rise is None else {"plane": plate(0, -DEPTH, rise, 200.0)},
-    )
-    return mitransient_lidar.render(scene, passes=passes, seed=5)
-
-
-def truth_and_light(dataset, bottom):
-    """True depths of the pixels, NaN across a step, and which hold more than a tenth of the brightest's light."""
-    lines = LinesOfSight.from_dataset(dataset)
-    truth = depth_seen(BOTTOMS[bottom], lines.sight_x, lines.sight_y)
-    return truth, (lines.beam_share > 0.1 * lines.beam_share.max()) & np.isfinite(truth)
-
-
-@pytest.mark.parametrize(
-    ("layout", "depth_from", "bottoms"),
-    [
-        pytest.param("2x2", "echo", ("falls", "rises"), marks=pytest.mark.slow),
-        *(
-            pytest.param(layout, depth_from, ("level", "falls", "rises"), marks=pytest.mark.long)
-            for layout in ("1x1", "2x2", "hex7", "8x8")
-            for depth_from in ("echo", "mean")
-        ),
-    ],
-)
-def test_rendered_waveforms_give_the_depth_of_each_pixel(lidar_scene, layout, depth_from, bottoms):
-    """Over level, falling and rising planes, depths deviate by the errors of noise and method together."""
-    z = []
-    for bottom in bottoms:
-        dataset = shoot(lidar_scene, layout, bottom, 2**14, 8)
-        truth, lit = truth_and_light(dataset, bottom)
-        found = echo_table.extract(dataset, depth_from=depth_from).sel(echo="bottom")
-        stated = np.hypot(found["depth_m_stderr"], found["depth_m_method_error"]).values.ravel()
-        z.extend(((found["depth_m"].values.ravel() - truth) / stated)[lit])
-    assert np.max(np.abs(z)) < 5
-    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.25
-
-
-@pytest.mark.parametrize(
-    "bottom", [pytest.param(name, marks=pytest.mark.slow if name == "falls" else pytest.mark.long) for name in BOTTOMS]
-)
-def test_rendered_gates_give_the_depth_of_each_pixel(lidar_scene, bottom):
-    """Depths of 256 pixels do not fall or rise with the row; on the axis's scale the level bottom falls by 0.8 m."""
-    film = {"gate_start_ns": 1452.0, "gate_width_ns": 5.0, "gate_step_ns": 2.0, "gate_count": 30, "bin_width_ns": 0.5}
-    dataset = shoot(lidar_scene, "16x16", bottom, 2**15, 8, {**film, "bin_count": 250})
-    truth, lit = truth_and_light(dataset, bottom)
-    found = depth_image(dataset.transpose(..., "gate"), reach=4)
-    off = (found.depth.ravel() - truth)[lit]
-    stated = np.hypot(found.sigma, found.method_error).ravel()[lit]
-    assert abs(np.median(off)) < 0.06
-    # 0.53 to 0.55 over a falling bottom.
-    assert 0.4 < np.sqrt(np.mean((off / stated) ** 2)) < 1.5

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis.gates import cut as gating
@@ -183,53 +182,3 @@ def test_gates_that_cannot_be(lidar_scene, film, gigabytes, words):
 def test_parameters_of_gates_out_of_range(film, words):
     with pytest.raises(Exception, match=words):
         mi.load_dict({"type": "time_gated_film", **GATES, **film})
-
-
-@pytest.mark.long
-def test_images_do_not_show_the_cells_of_the_sea(lidar_scene, passes):
-    """The pattern of light on a bottom at 2 m, in automatic cells, is that in cells of half the size.
-
-    The mean square of the difference is estimated without bias from products of different passes. Cells of a quarter of
-    a metre, a quarter of the beam's standard deviation, leave their triangles in the image.
-    """
-    pose = {"altitude": 200.0, "off_nadir_deg": 0.0}
-    images = {}
-    for first_seed, cell in enumerate(("auto", 0.03, 0.25)):
-        scene = lidar_scene(
-            integrator={"type": "lidar_merging", "paths_per_pass": 2**17, "cell_size": 0.015},
-            tx={**pose, "divergence_mrad": 12.0},
-            rx={**pose, "layout": "32x32", "field_of_view_mrad": 20.0, "field_of_view_shape": "square"},
-            film={"time_start_ns": 1345.0, "bin_width_ns": 15.0, "bin_count": 1},
-            sea={
-                **{"spectrum": "elfouhaily", "wind_speed": 4.0, "slope_variance": "cox_munk"},
-                **{"cell_size": cell, "refined_size": 10.0, "size": 40.0},
-            },
-            bottom=2.0,
-            rho=0.5,
-        )
-        images[cell] = passes(scene, 12, 100 * first_seed)[..., 0]
-        (sea,) = (shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
-        assert sea.shortest_wave == pytest.approx(4 * 200.0 * 20e-3 / 32, rel=1e-3) or cell == 0.25
-        assert cell != "auto" or 0.05 < sea.cell_size <= 200.0 * 10e-3 / 32
-    visible = {}
-    for cell in ("auto", 0.25):
-        difference = ((images[cell] - images[0.03]) / images[0.03].mean()).reshape(12, -1)
-        products = difference @ difference.T / difference.shape[1]
-        others = products[~np.eye(12, dtype=bool)].reshape(12, 11).mean(axis=1)
-        visible[cell] = others.mean(), 2 * others.std(ddof=1) / np.sqrt(12)
-    # Root mean squares of 3 % and 5 % of the mean of the image.
-    assert visible["auto"][0] < 0.03**2 + largest_z(12) * visible["auto"][1]
-    assert visible["auto"][1] < 0.03**2
-    assert visible[0.25][0] - largest_z(12) * visible[0.25][1] > 0.05**2
-
-
-@pytest.mark.slow
-def test_paths_go_with_the_pixels(lidar_scene):
-    """16 a pixel, and half the points: an image needs more paths, not better ones."""
-    for layout, paths, photons in (("2x2", 2**15, 2**15), ("128x128", 2**18, 2**16), ("512x512", 2**21, 2**16)):
-        scene = lidar_scene(integrator={"type": "lidar_merging"}, rx={"layout": layout})
-        sensor = scene.sensors()[0]
-        # The builder asks for 2^16 paths itself.
-        assert scene.integrator().prepare(scene, sensor).paths == 2**16
-        default = mi.load_dict({"type": "lidar_merging"}).prepare(scene, sensor)
-        assert (default.paths, default.photons) == (paths, photons)

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.loading import catalogue
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", [pytest.param("lidar_merging", marks=pytest.mark.long), "lidar_volpath"])
@@ -44,10 +42,3 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     np.testing.assert_allclose(np.median(divided.sum(axis=2) / whole.sum(axis=2), axis=0), 1, atol=1e-4)
     # Of other water the surface echo alone is the same, in a twentieth of the bins.
     assert share_of_equal_bins(record("0", scattering=0.701)) < 0.1
-
-
-@pytest.mark.slow
-def test_scenes_of_figure_15_differ_in_layout_only():
-    first, second = (catalogue.scene_parameters(catalogue.scene_path(f"fig15_{kind}")) for kind in ("2x2", "1x1"))
-    assert {name for name in first if first[name] != second[name]} == {"layout"}
-    assert first.keys() == second.keys()

@@ -98,7 +98,7 @@ def scatter(rng, direction):
     scope="module",
     params=[
         pytest.param((0.3, 0.15, 1.34), marks=pytest.mark.long),
-        pytest.param((0.8, 0.64, 1.34), marks=pytest.mark.slow),
+        pytest.param((0.8, 0.64, 1.34), marks=pytest.mark.long),
         pytest.param((0.8, 0.64, 1.0001), marks=pytest.mark.long),
     ],
     ids=str,

@@ -10,7 +10,6 @@ from significance import largest_error, largest_z
 
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
-from mitransient_lidar.rendering import passive
 from mitransient_lidar.transport.paths.path import ConnectedPath
 from mitransient_lidar.transport.rng import pass_streams
 
@@ -72,7 +71,7 @@ def agrees(samples, expected, comparisons=1, bias=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (60.0, 0.0, 0.5), (40.0, 35.0, 0.9)])
+@pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (40.0, 35.0, 0.9)])
 def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
     """E cos(theta) T(theta) rho / pi, raised by what the sea's underside returns, times T(view) / n^2.
 
@@ -143,7 +142,7 @@ def crossing(bsdf, side, off_normal_deg):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("zenith", "azimuth", "view", "wind", "wind_azimuth"),
-    [(30.0, 180.0, 20.0, 6.0, 0.0), (10.0, 60.0, 25.0, 10.0, 30.0), (35.0, 10.0, 30.0, 4.0, 90.0)],
+    [(30.0, 180.0, 20.0, 6.0, 0.0), (35.0, 10.0, 30.0, 4.0, 90.0)],
 )
 def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth):
     """Cox and Munk 1954, equation 9: L = E rho(omega) p(slope) / (4 cos(view) cos^4(tilt))."""
@@ -181,7 +180,7 @@ def direction(zenith, azimuth):
 # (d) the sky's mirror image
 
 
-@pytest.mark.parametrize("view", [0.0, 40.0, 70.0])
+@pytest.mark.parametrize("view", [0.0, 70.0])
 def test_a_level_sea_mirrors_the_sky(view):
     """Fresnel's reflectance times the sky's radiance; 53 degrees is Brewster's angle, far below 4 times 2 %."""
     scene = build(sky={"irradiance": np.pi}, rx={"off_nadir_deg": view, "field_of_view_mrad": 0.1}, depth=0.5, rho=0.0)
@@ -212,7 +211,7 @@ WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("zenith", "view"), [(30.0, 0.0), (50.0, 25.0)])
+@pytest.mark.parametrize(("zenith", "view"), [(50.0, 25.0)])
 def test_light_scattered_once(zenith, view):
     """L = E T cos / mu_s b p / (c (1/mu_s + 1/mu_v) mu_v) T / n^2 of uniform water, with directions refracted by n."""
     scene = build(
@@ -234,12 +233,9 @@ def test_light_scattered_once(zenith, view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("albedo", [0.9, 0.6])
+@pytest.mark.parametrize("albedo", [0.9])
 def test_deep_water_under_an_even_sky(albedo):
-    """Remote-sensing reflectance of Fournier-Forand water, bb/b 0.0183, against discrete ordinates.
-
-    HydroLight 4.2 gives 8.1159e-3 and 1.1462e-3 /sr for its polar cap of 10 degrees, 1.5 % above and 0.3 % below.
-    """
+    """Remote-sensing reflectance of Fournier-Forand water, bb/b 0.0183, against discrete ordinates."""
     scene = build(
         sky={"irradiance": 1.0},
         water={"attenuation": 1.0, "scattering": albedo, "backscattering": 0.0183 * albedo},
@@ -250,58 +246,6 @@ def test_deep_water_under_an_even_sky(albedo):
     leaving = passes(scene, 12) - float(fresnel(0.0, N)[0]) / np.pi
     # The discrete ordinates are right to 3e-4; ripples of 2e-5 change little.
     agrees(leaving, float(water_leaving_reflectance(albedo, moments, N)), 2, bias=1e-3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("zenith", "azimuth", "view", "coefficients", "spread"),
-    [
-        (30.0, 0.0, 0.0, (0.03997, 0.13989, 0.058815, 0.050627), 0.025),
-        (60.0, 0.0, 0.0, (0.041763, 0.141928, 0.054032, 0.06433), 0.025),
-        (30.0, 90.0, 40.0, (0.04324, 0.152211, 0.057261, 0.065745), 0.06),
-        (60.0, 180.0, 40.0, (0.046406, 0.130495, 0.064989, 0.04711), 0.06),
-    ],
-)
-@pytest.mark.parametrize(
-    ("absorption", "particles", "molecules"),
-    [(0.016, 0.08, 0.0048), (0.06, 0.33, 0.003), (0.15, 0.8, 0.002)],
-    ids=["blue_ocean", "chlorophyll_1_mg", "green_coast"],
-)
-def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, view, coefficients, spread):
-    """Remote-sensing reflectance by Lee et al. (2011, doi:10.1364/AO.50.003155), which they fitted to HydroLight's of
-    natural waters below winds of 5 m/s and a clear sky:
-
-    R = (Gw0 + Gw1 bbw/(a + bb)) bbw/(a + bb) + (Gp0 + Gp1 bbp/(a + bb)) bbp/(a + bb).
-
-    Here the sun is alone; part of the light from the sky takes a few per cent off what depends on directions, the more
-    so beside the nadir. The shape of the particles' phase function, theirs a mean of measured ones, changes it by 4 to
-    7 % (Freda and Piskozub 2012, Oceanologia 54, 29). Measured: 0.98 to 1.01 at the nadir, 0.95 to 1.05 beside it.
-    """
-    molecular, particulate = 0.5 * molecules, 0.01826 * particles
-    water = {
-        "attenuation": absorption + particles + molecules,
-        "scattering": particles + molecules,
-        "water_scattering": molecules,
-        "backscattering": molecular + particulate,
-        "phase": {"type": "petzold"},
-    }
-    kappa = absorption + molecular + particulate
-    u, v = molecular / kappa, particulate / kappa
-    gp0, gp1, gw0, gw1 = coefficients
-    expected = ((gw0 + gw1 * u) * u + (gp0 + gp1 * v) * v) * np.cos(np.radians(zenith))
-    seen = [
-        build(
-            sun={"zenith_deg": zenith, "azimuth_deg": azimuth},
-            sea={"spectrum": "flat", "wind_speed": 5.0},
-            rx={"off_nadir_deg": view},
-            water=water,
-            integrator={"paths_per_pass": 2**14, **limit},
-        )
-        for limit in ({}, {"max_scatterings": 0})
-    ]
-    # Without the glint.
-    leaving = passes(seen[0], 12) - passes(seen[1], 4).mean()
-    assert agrees(leaving, float(expected), 12, bias=spread) < 0.02
 
 
 @pytest.mark.parametrize(
@@ -343,80 +287,3 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
 
 
 # (e) waves focus the sun
-
-
-@pytest.mark.long
-def test_a_sinusoidal_sea_focuses_the_sun(tmp_path):
-    """Light on plates at five depths, seen through still water, against rays traced here.
-
-    Waves of 1 m and 12 mm lie where the sun shines in, crests along its azimuth. Crests focus at
-    n cos(phi) / ((n cos(phi) - cos(theta)) a k^2), 4 m (Schenck 1957, doi:10.1364/JOSA.47.000653, with Coddington's
-    equation for the slant). With the spherical aberration of the wave the contrast is largest a quarter deeper.
-    """
-    k, focus, ripple = 2 * np.pi, 4.0, 1e-4
-    sun = np.radians(60.0)
-    bent = N * np.cos(snell(sun, N))
-    amplitude = float(bent / (bent - np.cos(sun)) / (k**2 * focus))
-    x = np.arange(-500, 501) * 0.04
-    taper = np.clip((x - 0.1) / 0.4, 0, 1)
-    heights = amplitude * np.cos(k * x)[:, None] * taper[None, :] * np.ones((len(x), 1))
-    np.save(tmp_path / "waves.npy", heights)
-    resolved = float(np.mean(np.diff(heights, axis=0) ** 2)) / 0.04**2
-    depths, places = np.array([2.0, 3.5, 5.0, 7.0, 10.0]), np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
-    # Columns of 1/24 m along y, of a band of half a metre along x.
-    columns, side = 480, 20.0
-    labels = np.zeros((columns, columns), dtype=np.uint16)
-    band = slice(columns // 2 - 6, columns // 2 + 6)
-    y = (np.arange(columns) + 0.5) / columns * side - side / 2
-    plate_of = np.argmin(np.abs(y[:, None] - places), axis=1)
-    inside = np.abs(y - places[plate_of]) < 1.0
-    labels[band, inside] = 1 + np.flatnonzero(inside)
-    np.save(tmp_path / "columns.npy", labels)
-    scene = build(
-        sun={"zenith_deg": 60.0},
-        sea={
-            "spectrum": "height_map",
-            "filename": str(tmp_path / "waves.npy"),
-            "map_size": 40.0,
-            "slope_variance": str(2 * (resolved + ripple)),
-            "size": 200.0,
-        },
-        rx={
-            "pixel_map": str(tmp_path / "columns.npy"),
-            "altitude": 200.0,
-            "field_of_view_mrad": 1e3 * side / 200.0,
-            "aim_x": -0.5,
-        },
-        integrator={"paths_per_pass": 2**19, "max_scatterings": 0},
-        extra={f"plate{i}": plate(d, 0.05, 1.9, p) for i, (d, p) in enumerate(zip(depths, places, strict=True))},
-    )
-    picture = passive.render_passive(scene, passes=4)
-    radiance, error = picture["radiance"].values, picture["radiance_stderr"].values
-    contrast = []
-    for number in range(len(depths)):
-        chosen = plate_of[inside] == number
-        light, noise = radiance[chosen], error[chosen]
-        contrast.append(np.sqrt(light.var(ddof=1) - np.mean(noise**2)) / light.mean())
-    expected = [ray_contrast(depth, amplitude, k, sun, ripple, resolved) for depth in depths]
-    np.testing.assert_allclose(contrast, expected, rtol=0.12)
-    assert np.argmax(contrast) == 2
-    assert contrast[2] > 1.2 * max(contrast[1], contrast[3] / 1.05)
-
-
-def ray_contrast(depth, amplitude, k, sun, ripple, resolved):
-    """Return the contrast, over columns of 1/24 m, of sunlight on a level plate below a sinusoidal sea."""
-    rng = np.random.default_rng(3)
-    count = 10**6
-    y = rng.random(count) * 2 * np.pi / k
-    slope = -amplitude * k * np.sin(k * y) + rng.normal(0, np.sqrt(ripple), count)
-    normal = np.stack([rng.normal(0, np.sqrt(resolved + ripple), count), -slope, np.ones(count)])
-    lit = np.cos(sun) + normal[0] * np.sin(sun)
-    normal /= np.linalg.norm(normal, axis=0)
-    incoming = -np.array([np.sin(sun), 0, np.cos(sun)])[:, None]
-    cosine = -(incoming * normal).sum(axis=0)
-    inside = incoming / N + (cosine / N - np.sqrt(1 - (1 - cosine**2) / N**2)) * normal
-    landed = y - inside[1] / inside[2] * depth
-    # Where the receiver looks, ripples spread the columns.
-    landed += rng.normal(0, (1 - 1 / N) * np.sqrt(ripple) * depth, count)
-    light, _ = np.histogram(np.mod(landed, 2 * np.pi / k), 24, weights=lit)
-    return light.std() / light.mean()

@@ -1,14 +1,11 @@
 """Enhancement of echoes by ripples: a factor by depth and order of scattering, for meshes of any detail."""
 
 import copy
-from itertools import pairwise
 
 import mitsuba as mi
 import numpy as np
 import pytest
-import significance
 
-import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.sea.double_passage import LEAST_DEPTH
 from mitransient_lidar.transport.opaque import aligned
@@ -89,11 +86,10 @@ def test_a_switch_must_be_true_or_false(lidar_scene):
 @pytest.mark.parametrize(
     "parts",
     [
-        {"sea": {"spectrum": "flat"}},
         {"sea": SEA | {"ripple_focusing": "false"}},
         {"sea": SEA, "tx": {"altitude": -2.0}, "rx": {"altitude": -2.0}, "film": {"time_start_ns": 0.0}},
     ],
-    ids=["flat", "without", "under water"],
+    ids=["without", "under water"],
 )
 def test_seas_without_it(lidar_scene, parts):
     assert renderer_of(lidar_scene(**parts)).focusing is None
@@ -107,29 +103,3 @@ def test_labels_keep_pixel_and_events():
     assert set(found) == {"pixel", "scatterings"}
     np.testing.assert_array_equal(np.array(found["pixel"]), 200_000_000)
     np.testing.assert_array_equal(np.array(found["scatterings"]), [0, 3, 15, 15])
-
-
-@pytest.mark.long
-def test_echoes_do_not_depend_on_the_shortest_wave():
-    """Waves of 1 m and ripples, or waves from 0.15 m: gates of the column, and the bottom, mean over seas."""
-    gates = (0.6, 1.4, 2.5, 4.0, 7.0)
-    found = {}
-    for wave, cell in ((1.06, 0.088), (0.15, 0.0375)):
-        # Two seas show what is missing without it; the comparison with it needs four.
-        for focuses, seas in ((True, 4), (False, 2)):
-            rows = []
-            for seed in range(seas):
-                params = {"surface_seed": seed, "surface_shortest_wave": wave, "surface_cell_size": cell}
-                params |= {"ripple_focusing": str(focuses).lower(), "layout": "1x1"}
-                got = mitransient_lidar.render("table1", params=params, passes=2, components=True, seed=seed)
-                energy = got["impulse_response_by_origin"].isel(pixel=0)
-                depth = (got["time"].values - 1420.0) * 1e-9 * C0 / (2 * 1.364) * 0.967
-                column = energy.sel(origin="water").values
-                parts = [column[(depth > low) & (depth < high)].sum() for low, high in pairwise(gates)]
-                rows.append([*parts, float(energy.sel(origin="bottom").sum())])
-            found[wave, focuses] = np.array(rows)
-    coarse, fine = found[1.06, True], found[0.15, True]
-    significance.assert_same(coarse, fine, error=0.05, bias=0.04)
-    # Without it finer waves add 10 to 25 %.
-    difference = found[0.15, False].mean(axis=0) / found[1.06, False].mean(axis=0)
-    assert np.all(difference[:3] > 1.08)

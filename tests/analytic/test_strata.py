@@ -41,7 +41,7 @@ def bottom_echo(attenuation, reflectance):
     return arrival, sent * reflectance / np.pi * np.cos(phi[-1]) * solid_angle
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scene, passes, z_score, integrator):
     """With one group index for all the echo would come 5 ns late; without bending it would have a fifth less energy."""
     arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
@@ -62,13 +62,6 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scen
     # The partial reflections between the index_layers, 1 % a crossing here, are left out by both.
     assert abs(z) < largest_z(16), (z, late.sum(axis=1).mean() / expected)
     assert relative < 0.015
-
-
-@pytest.mark.slow
-def test_strata_of_one_index_are_one(lidar_scene, passes):
-    layered = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.34, 1.34"}
-    energies = [passes(lidar_scene(water=water), 2) for water in (layered, {"layer_tops": "0, 2, 5"})]
-    np.testing.assert_array_equal(*energies)
 
 
 @pytest.mark.slow

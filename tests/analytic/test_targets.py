@@ -11,7 +11,6 @@ from oracles.refracted_path import refracted_path
 from significance import largest_z, mean_and_error
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -93,24 +92,6 @@ def test_quadrature_agrees_with_the_closed_form_of_the_bottom():
     )
 
 
-@pytest.mark.slow
-def test_edge_of_a_large_plate_below_a_narrow_beam(lidar_scene, passes):
-    """Its edge lies where the beam has moved to at 8 m: half of the light misses the plate.
-
-    The plate covers all of the lit sea, 2 m aside; without its edge, patches that it cuts would return too little.
-    """
-    edge, half = 8.0 * np.tan(np.arcsin(np.sin(OFF_NADIR) / INDEX)), 10.0
-    narrow = {"tx": {"divergence_mrad": 0.1}, "rx": {"layout": "1x1", "field_of_view_mrad": 1.0}}
-    energies = []
-    for x in (edge, edge - half):
-        target = {"plate": plate(x, 0.0, -8.0, half, diffuse(0.5))}
-        film = {"time_start_ns": 1470.0, "bin_width_ns": 30.0, "bin_count": 1}
-        scene = lidar_scene(**{**ONE, **narrow}, bottom=None, extra=target, integrator=FEW["lidar_merging"], film=film)
-        energies.append(passes(scene, 16).sum(axis=(1, 2)))
-    whole, cut = energies
-    significance.assert_equal(cut, 0.5 * whole.mean(), error=0.01, bias=0.01)
-
-
 OBLIQUE = LidarSystem(97.5, np.radians(54.0), INDEX, INDEX, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
 #: Lidar, beam [rad], centre [m] and radius of a sphere: on the beam's axis, steep beside it, and wider than the beam.
 SPHERES = {
@@ -138,8 +119,7 @@ def echo_of(sphere):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize(
-    "sphere",
-    [pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES],
+    "sphere", [pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES]
 )
 def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
@@ -159,7 +139,7 @@ def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
     assert abs(arrival.mean() - np.sum(time * energy) / energy.sum()) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cylinder_as_narrow_as_the_patches_of_its_light(lidar_scene, passes):
     """A cylinder across the look direction, 0.6 m wide, with patches of 0.5 m: quadrature over its lit half.
 
@@ -187,7 +167,7 @@ def test_cylinder_as_narrow_as_the_patches_of_its_light(lidar_scene, passes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
     """Straight back: reflectance over 2 pi sigma^2 per steradian, 170 times a Lambertian plate."""
     width, reflectance = 4.0, 0.5
@@ -203,7 +183,7 @@ def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_opposition_effect_brightens_a_level_bottom(lidar_scene, passes, integrator):
     """Over a Lambertian bottom of the same reflectance: pi f / R for light that goes back as it came."""
     particles, reflectance = {"lobe_asymmetry": 0.3, "backward_share": 0.7, "opposition_width": 0.3}, 0.2
@@ -237,26 +217,8 @@ def test_opposition_effect_brightens_a_level_bottom(lidar_scene, passes, integra
 # Published figures 13 and 14.
 
 
-@pytest.mark.long
-def test_mine_echoes_at_its_depth_and_casts_a_shadow(passes):
-    """Echo from 8.5 m, the top of the sphere, on the axis; of the bottom at 12 m a part is in its shadow."""
-    bins = {"time_start_ns": 1490.0, "bin_width_ns": 2.0, "bin_count": 30}
-    scenes = [open_scene("fig02_mine", {**bins, "target_x": place}).scene for place in (2.4, 60.0)]
-    here, away = (passes(scene, 12)[:, 0] for scene in scenes)
-    difference, error = mean_and_error(here - away)
-    peak = 1491 + 2 * np.argmax(difference)
-    # 1419.9 ns and 9.246 ns for each metre; half the beam's spread in time on either side.
-    assert abs(peak - (1419.9 + 9.246 * 8.6)) < 3
-    assert difference.max() > 10 * error[difference.argmax()]
-    bottom = slice(15, 30)
-    shadow = 1 - here[:, bottom].sum(axis=1) / away[:, bottom].sum(axis=1)
-    # A disc of 0.5 m radius holds 1 - exp(-0.5^2 / (2 * 1.13^2)) = 9 % of a beam of 1.13 m standard deviation.
-    assert 0.05 < shadow.mean() < 0.2
-    assert shadow.std(ddof=1) / np.sqrt(12) < 0.02
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
 def test_shading_normals_decide_what_a_plate_receives(lidar_scene, passes, integrator, tmp_path):
     """A level plate with shading normals 40 degrees from the vertical: what it sends back goes with their cosine.
 

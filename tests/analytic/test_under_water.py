@@ -57,7 +57,7 @@ def build(lidar_scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_bottom_below_a_boat(build, passes, z_score, integrator):
     """A Lambertian bottom 7 m below a lidar at 1 m: E rho/pi A exp(-2 c d)/d^2, after 2 n_g d / c0."""
     distance = 7.0
@@ -128,7 +128,7 @@ def test_single_scattering_below_a_boat(build, passes, integrator, view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
 def test_surface_above_a_diver(build, passes, z_score, integrator):
     """Gaussian slopes of variance s^2 seen from 5 m below: E A R(0) exp(-2 c d) / (4 pi s^2 d^2)."""
     depth, variance = 5.0, 0.05
@@ -168,13 +168,3 @@ def test_records_end_where_the_sea_reflects_the_beam(build):
         mitransient_lidar.render(build(-3.0, 120.0), passes=2)
     scene = build(-3.0, 135.0, bins="auto")
     assert find_lidar_scene(scene, scene.sensors()[0]).axis.end_ns > 2e9 * GROUP * 3 / np.cos(np.pi / 4) / C0 + 12
-
-
-@pytest.mark.slow
-def test_echoes_are_expected_when_geometry_says(build):
-    scene = build(-3.0, 20.0, bottom=8.0)
-    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    probe = renderer.probe.echoes
-    assert probe.bottom_ns[0, 0] == pytest.approx(2e9 * GROUP * 5 / np.cos(np.radians(20)) / C0, rel=2e-3)
-    assert np.isnan(probe.surface_ns).all()
-    assert probe.missed_beam == 0

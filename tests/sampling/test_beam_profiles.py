@@ -1,7 +1,6 @@
 """Elliptic and measured beams in the tangent plane: samples, density, widths, files."""
 
 import drjit as dr
-import matplotlib.image
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -9,6 +8,7 @@ import pytest
 import significance
 from frequencies import assert_counts
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+from rows import each_row
 from significance import assert_distribution, largest_z
 
 from mitransient_lidar.transport.laser.beam_profiles import GaussianBeam, ImageBeam, TopHatBeam
@@ -84,15 +84,6 @@ def test_elliptic_samples_have_the_moments_of_a_turned_ellipse(kind):
     assert np.abs(z).max() < largest_z(COUNT, 5), z
 
 
-def test_elliptic_gaussian_falls_to_e_to_the_minus_half_at_its_half_angles():
-    beam = laser(divergence_mrad=12.0, divergence_across_mrad=3.0, ellipse_deg=30.0)
-    cos, sin = np.cos(TURN), np.sin(TURN)
-    angle_x, angle_y = mi.Float([0, 6e-3 * cos, -1.5e-3 * sin]), mi.Float([0, 6e-3 * sin, 1.5e-3 * cos])
-    density = np.array(beam.tangent_density(angle_x, angle_y))
-    assert density[0] == pytest.approx(1 / (2 * np.pi * 6e-3 * 1.5e-3), rel=1e-5)
-    np.testing.assert_allclose(density[1:] / density[0], np.exp(-0.5), rtol=1e-4)
-
-
 def test_image_cells_hold_their_shares():
     """Row 0 is far (+angle_x) and column 0 left (+angle_y): a flipped image would move the brightest cell, 12 of 25."""
     angle_x, angle_y = tangent_samples(PROFILES["image"]())
@@ -105,25 +96,6 @@ def test_image_cells_hold_their_shares():
     assert_counts(counts[lit], expected[lit], known=1)
     density = np.array(ImageBeam(IMAGE, 16 * MRAD).density(mi.Float([-4e-3, 4e-3]), mi.Float([-6e-3, -6e-3])))
     np.testing.assert_allclose(density, [12 / 25 / 16e-6, 0], rtol=1e-6)
-
-
-def test_fine_image_of_a_gaussian_is_that_gaussian():
-    ticks = (np.arange(400) - 199.5) * 0.05  # mrad
-    far, left = np.meshgrid(-ticks, -ticks, indexing="ij")
-    along, across = 0.8 * far + 0.6 * left, 0.8 * left - 0.6 * far
-    profile = ImageBeam(np.exp(-0.5 * (along**2 / 4 + across**2)), 20 * MRAD)
-    np.testing.assert_allclose(profile.spreads, [2 * MRAD, 1 * MRAD], rtol=1e-3)
-    assert np.degrees(profile.rotation) % 180 == pytest.approx(np.degrees(np.arctan2(0.6, 0.8)), abs=0.01)
-    angle_x, angle_y = tangent_samples(profile)
-    # Cells of 0.05 mrad add their own spread, 2e-4 mrad^2.
-    for g, variance in ((angle_x, 0.64 * 4 + 0.36), (angle_y, 0.36 * 4 + 0.64)):
-        limit = largest_z(COUNT) * np.sqrt(2 / COUNT) * variance + 3e-4
-        assert abs(np.mean((g / MRAD) ** 2) - variance) < limit
-    (half, (rim,)), (_, (outer,)) = profile.outlines()
-    assert half == pytest.approx(np.exp(-0.5))
-    for line, scale in ((rim, 1), (outer, 2)):
-        a, b = 0.8 * line[:, 0] + 0.6 * line[:, 1], 0.8 * line[:, 1] - 0.6 * line[:, 0]
-        np.testing.assert_allclose(np.hypot(a / 2, b) / MRAD, scale, rtol=3e-3)
 
 
 def test_rays_follow_the_intensity(tmp_path):
@@ -141,14 +113,6 @@ def test_rays_follow_the_intensity(tmp_path):
     assert_distribution(
         ChiSquareTest(SphericalDomain(), sample, density, 2, sample_count=1_000_000, res=101, ires=16, seed=5)
     )
-
-
-def test_spreads_are_those_of_the_narrow_and_the_wide_axis():
-    """Cells go by the narrow one, what covers the beam by the wide one."""
-    flat = laser(beam_profile="top_hat", divergence_mrad=2.0, divergence_across_mrad=12.0)
-    assert (flat.angular_spread, flat.widest_angular_spread) == (pytest.approx(0.5e-3), pytest.approx(3e-3))
-    assert laser().angular_spread == laser().widest_angular_spread == 5e-3
-    assert flat.divergence == pytest.approx(2e-3)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
@@ -186,19 +150,7 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
         assert error < 2e-3
 
 
-@pytest.mark.parametrize("count", [1, 3, 17])
-def test_any_number_of_photons_keeps_the_energy(count):
-    """Sums of the energies of few photons, of which some are drawn over a small view."""
-    sampler = BeamSampler(laser(), mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 2.0}).receiver)
-    assert sampler.use_view
-    shots = 2**16
-    index = dr.arange(mi.UInt32, shots * count) % count
-    _, energy = sampler.sample(index, count, pass_streams(2, 0, shots * count))
-    samples = np.array(energy, dtype=np.float64).reshape(shots, count).sum(axis=1) / 4.5e-3
-    assert abs(samples.mean() - 1) < largest_z(shots) * samples.std() / np.sqrt(shots) + 1e-5
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("image", "message"),
     [
         (np.zeros((3, 3)), "zeros only"),
@@ -225,11 +177,3 @@ def test_damaged_files_are_refused_in_one_sentence(suffix, tmp_path, capfd):
         with pytest.raises(RuntimeError, match=rf"profile_file = '.*{suffix}': .*{suffix} is damaged, or"):
             laser(beam_profile="image", profile_file=str(path), profile_mrad=16.0)
     assert capfd.readouterr() == ("", "")
-
-
-def test_colour_png_is_refused(tmp_path):
-    matplotlib.image.imsave(tmp_path / "beam.png", IMAGE)
-    with pytest.raises(
-        RuntimeError, match=r"has the shape \(3, 4, 4\): it must have rows and columns, and one \(grey\) channel"
-    ):
-        laser(beam_profile="image", profile_file=str(tmp_path / "beam.png"), profile_mrad=16.0)

@@ -76,33 +76,6 @@ def test_what_leaves_the_field_of_view_is_lost_and_no_more():
     assert error[0] < 5e-3
 
 
-@pytest.mark.slow
-def test_blur_serves_every_kind_of_pixels(tmp_path):
-    """A narrow beam in a label, in overlapping circles (both 1 - exp(-r^2 / 2 sigma^2)) and in hexagons."""
-    ticks = np.linspace(-10, 10, 400, endpoint=False) + 0.025
-    angle_x, angle_y = np.meshgrid(ticks[::-1], ticks, indexing="ij")
-    np.save(tmp_path / "disc.npy", np.where(np.hypot(angle_x, angle_y) < 4, 3, 0))
-    circle = {"type": "pixel_fov", "field_of_view_mrad": 8.0}
-    narrow = {"divergence_mrad": 0.04}
-    within = 1 - np.exp(-(4.0**2) / (2 * 2.0**2))
-    share, error, _ = energies(
-        {"pixel_map": str(tmp_path / "disc.npy"), "field_of_view_mrad": 20.0, "blur_mrad": 2.0}, narrow
-    )
-    # The disc of cells is 3e-4 off the circle.
-    assert np.all(np.abs(share - within) < largest_z(COUNT) * error + 1e-3 * within)
-    share, error, _ = energies({"a": circle, "b": {**circle, "field_of_view_mrad": 4.0}, "blur_mrad": 2.0}, narrow)
-    assert np.all(np.abs(share - [within, 1 - np.exp(-0.5)]) < largest_z(COUNT, 2) * error)
-    # A hexagon with side s = 4 mrad, by numbers on a fine raster.
-    x, y = np.abs(angle_x), np.abs(angle_y)
-    density = np.exp(-(angle_x**2 + angle_y**2) / 8) / (8 * np.pi) * 0.05**2
-    within = density[np.maximum(y, np.sqrt(0.75) * x + 0.5 * y) < np.sqrt(0.75) * 4].sum()
-    share, error, _ = energies({"layout": "hex7", "field_of_view_mrad": 8 * np.sqrt(7), "blur_mrad": 2.0}, narrow)
-    assert abs(share[3] - within) < largest_z(COUNT) * error[3] + 1e-3 * within
-    around = np.delete(share, 3)
-    assert np.all(np.abs(around - around.mean()) < largest_z(COUNT, 6) * np.delete(error, 3))
-    assert np.all(error < 5e-3)
-
-
 def test_measured_blur_puts_light_where_the_image_does(tmp_path):
     """Three of four parts on the far left and one in the middle: row 0 is +angle_x, column 0 is +angle_y."""
     image = np.zeros((5, 5))
@@ -148,17 +121,6 @@ def test_displacements_follow_the_measured_image():
     assert_counts(fine[lit], expected[lit])
 
 
-def test_sharp_optics_are_blur_0_to_the_bit():
-    views = []
-    for blur in ({}, {"blur_mrad": 0.0}):
-        receiver = mi.load_dict({"type": "multipixel_receiver", **blur}).receiver
-        view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
-        start = view.sample(dr.arange(mi.UInt32, 4096), 4096, pass_streams(3, 0, 4096))
-        views.append([np.array(values) for values in (start.direction, start.pixel, start.weight)])
-    for sharp, zero in zip(*views, strict=True):
-        np.testing.assert_array_equal(sharp, zero)
-
-
 def test_rays_for_mitsubas_integrators_are_blurred():
     """Of a small pixel the rays are as wide as the blur, and carry the pixel's solid angle."""
     pixel = {"type": "pixel_fov", "field_of_view_mrad": 0.1, "blur_mrad": 3.0}
@@ -172,7 +134,7 @@ def test_rays_for_mitsubas_integrators_are_blurred():
     assert np.array(weight).mean() == pytest.approx(COLLECTION * np.pi * 0.05e-3**2, rel=1e-3, abs=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_blurred_receiver_sees_the_sharp_image_convolved(lidar_scene, passes):
     """Bottom and water, all scattering and waves of light included: 1x3 pixels against a fine sharp imager."""
     # Beyond the field lies light that is 14 mrad, 4.7 sigma, from the nearest pixel: 1e-6 of it is seen.

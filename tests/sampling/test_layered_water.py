@@ -117,14 +117,6 @@ WIDE = {"type": "hg", "g": 0.5}
 BLEND = {"type": "blendphase", "weight": 0.3, "phase_0": {"type": "hg", "g": 0.5}, "phase_1": {"type": "rayleigh"}}
 
 
-@pytest.mark.slow
-def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes, homogeneous):
-    """Henyey-Greenstein above, a blend with Rayleigh below: 0.0177 and 0.048 /sr backwards; one for all would show."""
-    layered = single_scattering(lidar_scene, passes, {"layer_tops": "0, 3", "phase_0": WIDE, "phase_1": BLEND})
-    for gate, phase in enumerate((WIDE, BLEND)):
-        assert_same(layered[:, gate], homogeneous(lidar_scene, passes, phase)[:, gate], error=0.03)
-
-
 @pytest.mark.parametrize(
     "phase",
     [
@@ -157,12 +149,3 @@ def test_profile_file_is_its_layers(tmp_path):
     depth = 0.5 * (column.layer_tops + np.append(column.layer_tops[1:], 8.0))
     for name, top, rise in (("attenuation", 0.2, 0.05), ("scattering", 0.1, 0.025), ("backscattering", 0.002, 0.00125)):
         np.testing.assert_allclose(getattr(column, name), top + rise * depth, rtol=1e-9)
-
-
-def test_profile_is_given_alone_and_exists(tmp_path):
-    path = tmp_path / "water.csv"
-    path.write_text("depth, c, b\n0, 0.3, 0.15\n9, 0.3, 0.15\n")
-    with pytest.raises(RuntimeError, match=r"attenuation = .* describe the same: give one of them"):
-        mi.load_dict({"type": "layered_water", "profile": str(path), "attenuation": 0.4})
-    with pytest.raises(RuntimeError, match=r"none\.csv"):
-        mi.load_dict({"type": "layered_water", "profile": str(tmp_path / "none.csv")})

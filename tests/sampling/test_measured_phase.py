@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import significance
 from oracles.phase import henyey_greenstein
-from significance import assert_same, largest_z
+from significance import largest_z
 
 G = 0.9
 WI = np.array([0.3, -0.5, 0.8124]) / np.linalg.norm([0.3, -0.5, 0.8124])
@@ -46,18 +46,6 @@ def test_samples_and_values_are_those_of_the_function_in_the_table(table, caplog
     np.testing.assert_allclose(np.array(pdf), expected, rtol=0.02)
     value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)
     np.testing.assert_allclose(np.array(value)[0], np.array(density))
-
-
-@pytest.mark.slow
-def test_water_takes_it(table, lidar_scene, passes):
-    """The same scene with Mitsuba's hg: mean energies agree."""
-    film = {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 4}
-    waters = ({"phase": {"type": "measured_phase", "filename": table}}, {"phase": {"type": "hg", "g": G}})
-    energy = [
-        passes(lidar_scene(water=water, film=film), 10, first_seed=50 * number).sum(axis=1)
-        for number, water in enumerate(waters)
-    ]
-    assert_same(*energy, error=0.02, bias=0.005)
 
 
 def test_invalid_input_is_refused(tmp_path):

@@ -51,18 +51,6 @@ def test_inner_edges_join_two_facets(size):
     assert np.sum(counts == 1) == 4 * side
 
 
-def test_patch_is_periodic_and_centred():
-    vertices, _ = buffers(surface(refined_size=20.0, size=20.0, period=20.0, cell_size=20.0 / CELLS)[1])
-    grid = vertices.reshape(CELLS + 1, CELLS + 1, 3)
-    np.testing.assert_array_equal(grid[0, :, 2], grid[-1, :, 2])
-    np.testing.assert_array_equal(grid[:, 0, 2], grid[:, -1, 2])
-    assert vertices[:, :2].min() == pytest.approx(-10)
-    assert vertices[:, :2].max() == pytest.approx(10)
-    # The mean sea level is z = 0: the spectrum has no constant term.
-    assert abs(grid[:-1, :-1, 2].mean()) < 1e-6
-    assert grid[..., 2].std() > 0.01
-
-
 def test_rays_find_no_hole_and_facets_are_flat():
     """Interpolated normals would make other slopes than the facets', and lose energy."""
     scene, shape = surface(**PATCH)
@@ -123,72 +111,7 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
 
 
-def test_a_mesh_rougher_than_asked_says_so():
-    """All slopes are resolved at 1e-4: the ripples stop at their smallest, and the total is reported."""
-    _, shape = surface(wind_speed=6.0, slope_variance="1e-4", **PATCH)
-    assert shape.sea.ripple_variance == (1e-5, 1e-5)
-    assert shape.sea.slope_variance == pytest.approx(sum(shape.sea.resolved_variance) + 2e-5)
-    assert shape.sea.slope_variance > 0.005
-
-
-def test_seeds_are_different_seas():
-    heights = [buffers(surface(surface_seed=seed, **PATCH)[1])[0][:, 2] for seed in (1, 2, 1)]
-    np.testing.assert_array_equal(heights[0], heights[2])
-    assert abs(np.corrcoef(heights[0], heights[1])[0, 1]) < 0.5
-
-
 # The patch and what surrounds it.
-
-
-def heights_by_position(shape):
-    vertices, _ = buffers(shape)
-    return {(round(4 * x), round(4 * y)): z for x, y, z in vertices}
-
-
-@pytest.mark.slow
-def test_the_sea_is_the_same_wherever_the_patch_lies():
-    """Sea of 64 m period: patches 20 m apart agree where they overlap, and a whole period apart everywhere."""
-    here, there, far = (
-        heights_by_position(
-            surface(refined_size=48.0, cell_size=0.25, centre_x=x, centre_y=y, period=64.0, size=48.0)[1]
-        )
-        for x, y in ((0.0, 0.0), (20.1, -3.0), (64.0, -128.0))
-    )
-    shared = here.keys() & there.keys()
-    assert len(shared) > 10_000
-    assert all(here[place] == there[place] for place in shared)
-    np.testing.assert_array_equal(list(here.values()), list(far.values()))
-
-
-def test_cells_grow_outside_the_patch_up_to_the_size():
-    vertices, faces = buffers(surface(refined_size=32.0, cell_size=0.25)[1])
-    lines = np.unique(vertices[:, 0])
-    assert lines[0] <= -500
-    assert lines[-1] >= 500
-    lengths = np.diff(lines)
-    inside = np.abs(lines[:-1] + 0.5 * lengths) < 16
-    np.testing.assert_array_equal(lengths[inside], 0.25)
-    ratio = lengths[1:] / lengths[:-1]
-    # The last cell ends with the surface.
-    assert np.all(ratio[1:-1] < 2.001)
-    assert np.all(ratio[1:-1] > 1 / 2.001)
-    # All of 1 km^2 for twice the triangles of 32 m x 32 m.
-    assert len(faces) < 2 * 2 * 128**2
-
-
-def test_far_rays_meet_the_sea_from_above_and_below():
-    scene, _ = surface(refined_size=32.0, cell_size=0.25, wind_speed=6.0)
-    rng = np.random.default_rng(3)
-    points = np.concatenate([rng.uniform(-499, 499, (50_000, 2)), rng.uniform(-30, 30, (50_000, 2))])
-    for height, down in ((20.0, -1.0), (-20.0, 1.0)):
-        for slant in (0.0, 0.5, 5.0):  # up to 79 degrees off nadir
-            start = points - slant * abs(height) * np.array([1.0, 0.0])
-            origin = mi.Point3f(*(array(p) for p in start.T), array(height))
-            direction = np.array([slant, 0, down]) / np.hypot(slant, 1)
-            si = scene.ray_intersect(mi.Ray3f(origin, vector(direction)))
-            met = np.array(si.is_valid())
-            # One ray in 300 000 slips between two triangles.
-            assert met[np.abs(points[:, 0]) < 380].mean() > 1 - 5e-5
 
 
 @pytest.mark.slow
@@ -204,20 +127,6 @@ def test_cells_are_chosen_by_footprint_and_range():
     mast = surface(**lidar | {"altitude": 10.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 10.0})[1].sea
     # The field of view reaches from 97 to 116 m, and 1.5 times the beam's divergence from 93 to 126 m.
     assert 2 * 20 < mast.refined_size < 80
-
-
-def test_height_maps_become_surfaces(tmp_path):
-    """A plane that rises by 0.1 along x: its slope is resolved, and the ripples are what is missing to the total."""
-    x = np.linspace(-10, 10, 81)
-    np.save(tmp_path / "plane.npy", np.tile(0.1 * x, (81, 1)))
-    scene, shape = surface(
-        spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", size=60.0
-    )
-    assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
-    assert shape.sea.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
-    x = np.random.default_rng(1).uniform(-28, 28, 1000)
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(array(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
-    np.testing.assert_allclose(np.array(si.p.z), 0.1 * np.clip(x, -10, 10), atol=0.03)
 
 
 def test_swell_and_wake_lie_on_the_sea():
@@ -248,10 +157,7 @@ def test_time_moves_the_sea_downwind():
 
 @pytest.mark.slow
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
-    """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies.
-
-    What ripples focus follows from a spectrum, which a file lacks.
-    """
+    """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
     sea = {
         "ripple_focusing": False,
         "spectrum": "elfouhaily",
@@ -320,12 +226,3 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         assert shape.sea.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):
         np.testing.assert_array_equal(first, second)
-
-
-def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
-    own = {"spectrum": "elfouhaily", "refined_size": 8.0, "cell_size": 0.5, "centre_x": 1.0, "centre_y": 2.0}
-    loaded = lidar_scene(sea={**own, "shortest_wave": 1.0, "size": 50.0})
-    shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
-    sea = shape.sea
-    open_scene(loaded)
-    assert shape.sea is sea

@@ -6,6 +6,7 @@ import pytest
 import significance
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from oracles.phase import henyey_greenstein, two_term_henyey_greenstein
+from rows import each_row
 from significance import assert_distribution, largest_chi2, largest_z
 
 from mitransient_lidar.physics.water import phase as closed_form
@@ -137,7 +138,7 @@ def test_mean_cosine_and_backscatter_ratio(name):
     assert abs(np.mean(theta > np.pi / 2) - backscatter_ratio) < limit * error + 5e-6
 
 
-@pytest.mark.parametrize("name", PLUGINS)
+@each_row("name", PLUGINS)
 def test_value_is_density_and_sampling_reports_it(name):
     plugin, _, wo, pdf = sample_angles(name, 10_000)
     value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)
@@ -147,7 +148,7 @@ def test_value_is_density_and_sampling_reports_it(name):
     np.testing.assert_allclose(pdf[wide], np.array(density)[wide], rtol=2e-3)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "reference"),
     [
         ("fournier_forand", lambda t: closed_form.fournier_forand(t, *closed_form.fournier_forand_parameters(0.04))),
@@ -165,16 +166,3 @@ def test_value_is_the_closed_form(name, reference):
     wo = frame.to_world(mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta))))
     value = np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)[1])
     np.testing.assert_allclose(value, reference(theta), rtol=1e-2 if name == "petzold" else 2e-3)
-
-
-def test_segments_of_tiny_probability_are_not_drawn_too_often():
-    """With bb/b = 0.3 only 1.2e-4 is scattered below 0.1 degree; the bits of one number alone would double it."""
-    plugin = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": 0.3})
-    count = 2**22
-    rng = np.random.default_rng(11)
-    u, v = (mi.Float(rng.random(count, dtype=np.float32)) for _ in range(2))
-    s = np.array(plugin.tabulated.sample(u, v)[0], dtype=np.float64)
-    for limit in (0.001, 0.1):
-        share = float(plugin.tabulated.table.cdf_s(np.sin(np.radians(limit) / 2) ** 2))
-        found = np.mean(s < np.sin(np.radians(limit) / 2) ** 2)
-        assert abs(found - share) < largest_z(count, 2) * np.sqrt(share / count) + 10 / count

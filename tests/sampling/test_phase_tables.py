@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.transport.medium import tabulated_phase
@@ -39,7 +40,7 @@ def value(plugin, theta):
     return np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[1], dtype=np.float64)
 
 
-@pytest.mark.parametrize("description", PLUGINS)
+@each_row("description", PLUGINS)
 def test_normalised_over_the_sphere(description):
     """Quadrature in ln(theta) from 0.003 degree, plus the power law below: one half, or 4 pi, would be off by far."""
     plugin = mi.load_dict(description)

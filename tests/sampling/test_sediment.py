@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+from rows import each_row
 from significance import assert_distribution, largest_z
 
 from mitransient_lidar.loading.scene_source import object_values
@@ -97,7 +98,7 @@ def test_lambertian_model_is_the_diffuse_surface_of_mitsuba(reflectance, expecte
     assert np.array(bsdf.eval_diffuse_reflectance(si)).ravel()[0] == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("parameters", "message"),
     [
         ({"reflectance": "mud"}, "reflectance = 'mud' must be a number from 0 to 1, or one of coral_sand"),

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-import significance
 from frequencies import misfit
-from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from oracles.refracted_path import refracted_path
-from significance import assert_distribution, largest_chi2
+from rows import each_row
+from significance import largest_chi2
 
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
@@ -21,10 +20,6 @@ def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     pose = KernelPose.from_angles(altitude, angle)
     parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
     return RefractedLaserSampler(SimpleNamespace(transmitter_pose=pose, **parts))
-
-
-def chi_squared(sample, density):
-    return ChiSquareTest(SphericalDomain(), sample, density, 3, sample_count=1_000_000, res=151, ires=8, seed=2)
 
 
 def lobe_misfit(lobe, density, laser, reach=0.25, cells=40, fine=16):
@@ -64,16 +59,9 @@ def test_lobe_samples_follow_its_density(angle, depth):
     assert statistic < largest_chi2(freedom)
 
 
-def test_lobe_of_another_variance_is_distinguished():
-    """Negative control: 2 % of slope variance is seen."""
-    lobe = lobe_at(20.0)
-    statistic, freedom = lobe_misfit(lobe, lobe_at(20.0, 0.0204), lobe.direction_from(mi.Point3f(0, 0, -4)))
-    assert statistic > largest_chi2(freedom)
-
-
-@pytest.mark.parametrize("altitude", [5.0, 200.0, 3000.0])
-@pytest.mark.parametrize("angle", [0.0, 20.0, 40.0, 80.0])
-@pytest.mark.parametrize("depth", [0.01, 1.0, 8.0, 40.0])
+@each_row("altitude", [5.0, 200.0, 3000.0])
+@each_row("angle", [0.0, 20.0, 40.0, 80.0])
+@each_row("depth", [0.01, 1.0, 8.0, 40.0])
 def test_laser_is_seen_where_snells_law_says(altitude, angle, depth):
     """Against bisection in double precision; at 5 m altitude and 40 m depth the small-angle guess is far off."""
     lobe = lobe_at(angle, altitude=altitude)
@@ -126,29 +114,6 @@ def at_angle(deg, azimuth_deg=0.0):
     return [float(one) for one in (np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("wi", [at_angle(20.0, 30.0), at_angle(165.0, 200.0)])
-def test_ripples_of_a_series_sample_their_density(wi):
-    """Samples follow the density, and weights are the BSDF over it, above and below the surface.
-
-    At steeper slopes or angles Mitsuba's samples of Gaussian facets have rare ones where their density is 0.
-    """
-    scene, shape = surface(**STEEP | {"wind_speed": 4.0})
-    si, context, bsdf = interaction(scene, wi), mi.BSDFContext(), shape.bsdf()
-
-    def sample(u):
-        return si.to_world(bsdf.sample(context, si, u[0], mi.Point2f(u[1], u[2]))[0].wo)
-
-    assert_distribution(chi_squared(sample, lambda wo: bsdf.pdf(context, si, si.to_local(wo))))
-    rng = mi.PCG32(2**12, initstate=1 + significance.seed_shift)
-    first, pair = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-    bs, weight = bsdf.sample(context, si, first, pair)
-    value, density = bsdf.eval_pdf(context, si, bs.wo)
-    usual = np.array(density) > 1e-3
-    np.testing.assert_allclose((np.array(weight[0]) * bs.pdf.numpy())[usual], np.array(value[0])[usual], rtol=2e-3)
-    np.testing.assert_array_equal(np.array(bsdf.eval(context, si, bs.wo)[0]), np.array(value[0]))
-
-
 def smith(direction, slopes, density, area):
     """Return Smith's masking of a direction from the mean of what its slopes hide."""
     towards = -(direction[0] * slopes[0] + direction[1] * slopes[1])
@@ -183,12 +148,3 @@ def test_ripples_of_a_series_return_its_light(deg, azimuth_deg):
     found = float(shape.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(wi))[0][0])
     # Mitsuba's masking is a fit, of up to 0.35 % for one direction (Walter et al. 2007, equation 27).
     assert found == pytest.approx(float(wanted), rel=8e-3 if deg > 30 else 1e-4)
-
-
-def test_ripples_of_a_series_are_refused():
-    with pytest.raises(Exception, match=r"needs the slope_variance 'cox_munk', not '0\.02'"):
-        surface(**STEEP, slope_variance="0.02")
-    with pytest.raises(Exception, match="is one of ripples, which a nested bsdf replaces"):
-        surface(**STEEP, bsdf={"type": "dielectric"})
-    with pytest.raises(Exception, match=r"2[01] and 41 % of the slope variances .* longer shortest_wave than 0.25 m"):
-        surface(slope_distribution="gram_charlier", wind_speed=3.0, shortest_wave=0.25, refined_size=4.0)

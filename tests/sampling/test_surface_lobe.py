@@ -9,6 +9,7 @@ import pytest
 import significance
 from kernel_arrays import vector
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+from rows import each_row
 from scipy.stats import norm
 from significance import assert_distribution, largest_z
 
@@ -29,8 +30,8 @@ def random_points(seed):
     return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-@pytest.mark.parametrize("angle", [0.0, 20.0, 40.0])
-@pytest.mark.parametrize("point", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (0.0, 0.0, 0.2)])
+@each_row("angle", [0.0, 20.0, 40.0])
+@each_row("point", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (0.0, 0.0, 0.2)])
 def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
     """At z = 0, and in a crest above it: the line to the laser, refracted where the point is."""
     lobe = lobe_at(angle)

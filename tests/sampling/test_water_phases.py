@@ -5,11 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from oracles.phase import henyey_greenstein
+from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.physics.water import phase as closed_form
-from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
@@ -41,7 +40,7 @@ def test_water_and_particles_are_mixed_by_their_scattering():
 NAMED = [("jerlov", "I"), ("jerlov", "1C"), ("chlorophyll", "0.1"), ("kd", "0.06"), ("secchi", "25")]
 
 
-@pytest.mark.parametrize(("kind", "value"), NAMED)
+@each_row(("kind", "value"), NAMED)
 def test_waters_by_name_have_molecules_and_particles(kind, value):
     """Zhang's molecules [1/m] at 532 nm, and particles with the rest of b and of bb."""
     found, molecules = water_of(kind, value), 0.001962
@@ -53,8 +52,8 @@ def test_waters_by_name_have_molecules_and_particles(kind, value):
     assert water.phases.phases[0].backscatter_ratio == pytest.approx(found.backscatter_ratio, rel=3e-3)
 
 
-@pytest.mark.parametrize(("kind", "value"), NAMED)
-@pytest.mark.parametrize("own", [{"phase_function": "petzold"}, {"phase": {"type": "petzold"}}])
+@each_row(("kind", "value"), NAMED)
+@each_row("own", [{"phase_function": "petzold"}, {"phase": {"type": "petzold"}}])
 def test_given_phase_functions_include_the_molecules_of_waters_by_name(kind, value, own):
     water = mi.load_dict({"type": "layered_water", kind: value, **own}).water
     plain = values(mi.load_dict({"type": "petzold"}))
@@ -131,12 +130,6 @@ def test_any_phase_function_is_mixed_with_the_water(nested):
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
 
 
-def test_water_without_particles_scatters_as_water():
-    pure = {"scattering": 0.002, "backscattering": 0.001, "water_scattering": 0.002}
-    water = mi.load_dict({"type": "layered_water", **pure}).water
-    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), water_phase_function(THETA), rtol=1e-3)
-
-
 def test_each_layer_has_its_function_in_the_table():
     water = mi.load_dict(
         {"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"}
@@ -169,37 +162,7 @@ def test_samples_of_the_table_follow_each_function():
         assert abs(inverse.mean() - 2 * np.pi) < largest_z(count, 2) * inverse.std() / np.sqrt(count)
 
 
-def test_functions_without_a_common_table_are_called_by_pointer():
-    water = mi.load_dict(
-        {
-            "type": "layered_water",
-            "layer_tops": "0, 1",
-            "phase_0": {"type": "hg", "g": 0.9},
-            "phase_1": {"type": "petzold"},
-        }
-    ).water
-    theta = np.radians([1.0, 90.0])
-    found = values(water.phases.at(mi.UInt32([0, 1])), theta)
-    expected = henyey_greenstein(theta[0], 0.9), closed_form.petzold_average_particle()(theta[1])
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
-
-
-@pytest.mark.slow
-def test_layers_with_many_ratios_share_functions_within_two_percent():
-    ratios = np.geomspace(0.005, 0.05, 500)
-    text = ", ".join(f"{0.15 * ratio:.8f}" for ratio in ratios)
-    layer_tops = ", ".join(f"{0.01 * layer:.2f}" for layer in range(500))
-    water = mi.load_dict(
-        {"type": "layered_water", "layer_tops": layer_tops, "backscattering": text, "water_scattering": 0.001}
-    ).water
-    assert len({id(phase) for phase in water.phases.phases}) < 500
-    share = 0.001 / 0.15
-    for layer in (0, 250, 499):
-        wanted = ratios[layer]
-        assert water.phases.phases[layer].backscatter_ratio == pytest.approx(wanted, rel=0.02 + 0.02 * share / wanted)
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("parameters", "message"),
     [
         ({"water_scattering": 0.2}, "water_scattering = 0.2 must be at least 0 and at most scattering = 0.15"),
@@ -213,10 +176,3 @@ def test_layers_with_many_ratios_share_functions_within_two_percent():
 def test_errors(parameters, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "layered_water", **parameters})
-
-
-def test_mixtures_of_tables_refuse_weights_that_are_none():
-    table = PowerLawTable.from_function(water_phase_function)
-    for weights, message in (([0, 0], "not all of them 0"), ([1], "one number for each"), ([-1, 2], "at least 0")):
-        with pytest.raises(ValueError, match=message):
-            PowerLawTable.mixture([table, table], weights)

@@ -3,139 +3,25 @@
 import contextlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import significance
-import xarray as xr
 import zarr
 from command_line import assert_refused, run
-from descriptions import assert_described
-from few_paths import few_paths
 from quick_campaign import QUICK, files_of, planned_copy, write_toml
 
-from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
-from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
-from mitransient_lidar.campaigns.sweep import campaign as run_campaign
-from mitransient_lidar.campaigns.sweep import render_row, resume
+from mitransient_lidar.campaigns.sweep import resume
 from mitransient_lidar.campaigns.versions import FILES, check_versions
 from mitransient_lidar.core.errors import UserError
-
-FULL = {
-    "target_error": 0.6,
-    "keep": ["waveform", "stderr", "components", "echoes", "truth"],
-    "derivatives": ["attenuation", "target_reflectance"],
-    "receiver": "apd",
-    "gain": "auto",
-    "parameters": {"scattering": "0.6 * attenuation"},
-    "design": {"file": "runs.csv", "shots": 2, "seed": 9},
-}
-
-#: The second run is impossible.
-TABLE = """attenuation,target_depth,wind_speed
-0.2,4.5,3
-0.3,5,-6
-0.35,5.5,6
-"""
-
-
-@pytest.mark.long
-def test_everything_that_can_be_kept(tmp_path):
-    (tmp_path / "runs.csv").write_text(TABLE)
-    told = []
-    path = tmp_path / "full.zarr"
-    campaign = write_toml(tmp_path / "full.toml", {"scene": str(few_paths("fig13_2x2", tmp_path)), **FULL})
-    data = run_campaign(campaign, path, workers=1, progress=told.append).load()
-    assert (told[-1].done, told[-1].planned, told[-1].failed, told[-1].unit) == (3, 3, 1, "run")
-    assert data["status"].values.tolist() == [DONE, FAILED, DONE]
-    assert data["error"].values.tolist()[::2] == ["", ""]
-    assert data["error"].values[1].startswith("wind_speed = -6")
-    assert np.isnan(data["waveform"].isel(run=1)).all()
-    done = data.isel(run=[0, 2])
-    for name in ("waveform", "waveform_stderr", "waveform_by_origin", "signal", "echo_depth_m", "true_bottom_depth"):
-        assert np.isfinite(done[name].values).any(), name
-    assert done["waveform"].dims == ("run", "shot", "pixel", "time")
-    assert done["origin"].values.tolist() == ["surface", "water", "target", "bottom"]
-    assert done["parameter"].values.tolist() == ["attenuation", "target_reflectance"]
-    slopes = done["waveform_derivative"].sum(("pixel", "time"))
-    assert np.all(slopes.sel(parameter="attenuation") < 0)
-    assert np.all(slopes.sel(parameter="target_reflectance") > 0)
-    # Inputs as coordinates; the truth follows from them.
-    np.testing.assert_allclose(done["scattering"], 0.6 * np.array([0.2, 0.35]))
-    assert set(done["waveform"].coords) >= {
-        "attenuation",
-        "target_depth",
-        "wind_speed",
-        "surface_seed",
-        "pixel",
-        "time",
-    }
-    assert len(np.unique(done["surface_seed"])) == 2
-    np.testing.assert_allclose(done["true_bottom_depth"], 12, atol=1e-3)
-    heights = done["true_bottom_depth_below_surface"] - done["true_bottom_depth"]
-    np.testing.assert_allclose(heights, done["true_surface_height"], atol=1e-12)
-    np.testing.assert_allclose(done["true_attenuation"], done["attenuation"].broadcast_like(done["true_attenuation"]))
-    assert_described(data)
-    assert len(np.unique(done["aim_x"])) == 4
-    # The parts add up to the whole, and come from where they should.
-    np.testing.assert_allclose(done["waveform_by_origin"].sum("origin"), done["waveform"], rtol=1e-5, atol=1e-12)
-    first = done["waveform_by_origin"].isel(run=0, shot=0).sum("pixel")
-    peaks = first["time"].values[first.argmax("time").values]
-    assert peaks[0] < peaks[2] < peaks[3]
-    # A run alone, in this process, is the same to the bit, unless the seeds of this process are shifted.
-    alone = render_row(path, 2)
-    if significance.seed_shift == 0:
-        stored = data["waveform"].isel(run=2)
-        np.testing.assert_array_equal(alone["waveform"].values.astype(np.float32), stored.values)
-    assert float(alone.attrs["scene.attenuation"]) == 0.35
-    # Analysis commands read it, also from the campaign's file.
-    out = run("campaign", campaign, "--row", 2, "-o", tmp_path / "run.nc", "-q")
-    assert out.exit_code == 0, out.stderr
-    np.testing.assert_array_equal(results.open(tmp_path / "run.nc")["waveform"], alone["waveform"])
-    assert run("echoes", tmp_path / "run.nc", "--table").exit_code == 0
-    out = run("campaign", path, "--show", "-o", tmp_path / "run.png")
-    assert out.exit_code == 0, out.stderr
-    assert "3 runs: 2 done, 1 failed, 0 planned\nfailed 1, the first run 1: wind_speed = -6" in out.stdout
-    assert (tmp_path / "run.png").stat().st_size > 20_000
-
-
-@pytest.mark.slow
-def test_opening_needs_no_consolidated_metadata(quick):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        data = xr.open_zarr(quick, consolidated=False).load()
-    assert data["waveform"].dims == ("run", "pixel", "time")
-    np.testing.assert_allclose(data["true_bottom_depth"], data["bottom_depth"], atol=2e-4)
-    np.testing.assert_allclose(data["bottom_reflectance"], 0.02 * data["bottom_depth"])
-    # Passes end when the mean of the two middle bins has reached 0.3; stated is the higher of these.
-    assert (data["error_median"] < 0.35).all()
-    assert np.isfinite(data["waveform"].values).all()
-
-
-@pytest.mark.long
-def test_same_bits_whatever_shards_workers_and_order(campaign, tmp_path):
-    first = run_campaign(campaign, tmp_path / "first.zarr", workers=2, shard_size=6).load()
-    other = run_campaign(campaign, tmp_path / "other.zarr", workers=1, shard_size=17).load()
-    for name in first.variables:
-        np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))
-
-
-@pytest.mark.slow
-def test_a_complete_campaign_is_left_as_it_is(campaign, quick):
-    before = files_of(quick)
-    resume(quick, workers=1)
-    run_campaign(campaign, quick, workers=1)
-    assert files_of(quick) == before
 
 
 @pytest.mark.long
@@ -187,58 +73,6 @@ def shard_processes(mark):
     return found
 
 
-@pytest.mark.long
-def test_interruption_keeps_what_is_written(campaign, tmp_path):
-    path, file = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", campaign)
-    command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-o", str(path)]
-    with subprocess.Popen(
-        [*command, "--workers", "1", "--shard-size", "3"], start_new_session=True, stderr=subprocess.PIPE, text=True
-    ) as process:
-        while process.poll() is None and not (path.exists() and (Store(path).status() == DONE).any()):
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
-    assert process.returncode == 130
-    done = np.count_nonzero(Store(path).status() == DONE)
-    text = f"interrupted after {done} of 12 runs, which are kept; the same command goes on."
-    assert told.splitlines()[-1] == text
-    assert "Traceback" not in told
-    assert 0 < done < 12
-
-
-#: No new process imports this script, so that it needs no condition. Ctrl-C comes when three runs are done.
-SCRIPT = """
-import json, os, signal, sys
-import mitransient_lidar
-signal.signal(signal.SIGINT, signal.default_int_handler)
-pressed = []
-def watch(state):
-    if state.done >= 3 and not pressed:
-        pressed.append(state.done)
-        os.kill(os.getpid(), signal.SIGINT)
-try:
-    mitransient_lidar.campaign(json.loads(sys.argv[1]), sys.argv[2], workers=1, shard_size=500, progress=watch)
-except KeyboardInterrupt as error:
-    print(pressed[0], error)
-"""
-
-
-@pytest.mark.long
-def test_a_script_without_a_main_guard_that_is_interrupted_keeps_runs_of_its_shard(campaign, tmp_path):
-    """It once ended in 193 lines of tracebacks; and what a process had rendered in the last minute was lost."""
-    path, script = tmp_path / "out.zarr", tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    many = {**campaign, "design": {**campaign["design"], "count": 500}}
-    done = subprocess.run(
-        [sys.executable, str(script), json.dumps(many), str(path)], capture_output=True, text=True, check=True
-    )
-    told, text = done.stdout.split(maxsplit=1)
-    kept = np.count_nonzero(Store(path).status() == DONE)
-    assert text == f"interrupted after {kept} of 500 runs, which are kept; the same command goes on.\n"
-    assert int(told) <= kept < 500
-    assert done.stderr == ""
-
-
 @pytest.mark.slow
 def test_failed_runs_end_with_exit_code_1(quick, tmp_path):
     path = tmp_path / "failed.zarr"
@@ -270,24 +104,6 @@ def test_a_store_of_other_versions_is_not_completed(quick, tmp_path, caplog):
     assert (Store(path).status() == PLANNED).all()
     check_versions(path, {"versions": {**now, FILES: "0123456789ab"}})
     assert "files of this package have changed since" in caplog.text
-
-
-@pytest.mark.long
-def test_nothing_listens_on_a_port(quick, tmp_path):
-    """Any user of the machine could once run code through the scheduler of a campaign."""
-    psutil = pytest.importorskip("psutil")
-    path, seen = planned_copy(quick, tmp_path / "closed.zarr"), []
-
-    def watch(state):
-        here = psutil.Process()
-        for process in (here, *here.children(recursive=True)):
-            with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-                seen.append([one for one in process.net_connections("inet") if one.status == psutil.CONN_LISTEN])
-
-    before = [one for one in psutil.Process().net_connections("inet") if one.status == psutil.CONN_LISTEN]
-    resume(path, workers=2, progress=watch)
-    assert len(seen) > 2
-    assert all(one in ([], before) for one in seen)
 
 
 @pytest.mark.slow
@@ -328,21 +144,6 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-@pytest.mark.long
-def test_disk_that_is_full(quick, tmp_path):
-    """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
-    path = planned_copy(quick, tmp_path / "full.zarr")
-    done = subprocess.run(
-        [sys.executable, "-m", "mitransient_lidar", "campaign", str(path), "--workers", "1", "-q"],
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 2
-    assert done.stderr == f"cannot write {path}: File too large.\n"
-    assert (Store(path).status() == PLANNED).all()
-
-
 def shard_code(monkeypatch, arrays, start="pass"):
     """Replace what processes of shards do: a statement at their start, and an expression for the arrays of a run."""
     code = (
@@ -368,7 +169,8 @@ def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_pa
     assert "shard 1\n" in log
 
 
-@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("deaths", [2, 3])
 def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
     """Twice; it once ended the campaign."""
     path = planned_copy(quick, tmp_path / "early.zarr")
@@ -379,23 +181,6 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
     shard_code(monkeypatch, "arrays(self, number, values)", start)
     outcome = shards.render_in_process(str(path), 1)
     assert outcome == ((6, 0, "") if deaths == 2 else (0, 0, "shard 1: the process ended by signal 9"))
-
-
-@pytest.mark.long
-def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
-    """The others are rendered, and the command says which ones to look at."""
-    path = planned_copy(quick, tmp_path / "left.zarr")
-    original = shards.render_in_process
-
-    def render(path, shard, *rest):
-        return shards.Outcome(0, 0, "shard 0: lost") if shard == 0 else original(path, shard, *rest)
-
-    monkeypatch.setattr(workers, "render_in_process", render)
-    with pytest.raises(
-        UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
-    ):
-        resume(path, workers=1)
-    assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE] * 6
 
 
 @pytest.mark.long
@@ -416,3 +201,55 @@ def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatc
     assert shards.render_in_process(str(path), 1) == (5, 1, "")
     assert shards.render_in_process(str(path), 1, retry=True) == (6, 0, "")
     np.testing.assert_array_equal(open_campaign(path)["waveform"].values[8], open_campaign(quick)["waveform"].values[8])
+
+
+#: No new process imports this script, so that it needs no condition. Ctrl-C comes when three runs are done.
+SCRIPT = """
+import contextlib
+import json, os, signal, sys
+import mitransient_lidar
+signal.signal(signal.SIGINT, signal.default_int_handler)
+pressed = []
+def watch(state):
+    if state.done >= 3 and not pressed:
+        pressed.append(state.done)
+        os.kill(os.getpid(), signal.SIGINT)
+try:
+    mitransient_lidar.campaign(json.loads(sys.argv[1]), sys.argv[2], workers=1, shard_size=500, progress=watch)
+except KeyboardInterrupt as error:
+    print(pressed[0], error)
+"""
+
+
+@pytest.mark.long
+def test_nothing_listens_on_a_port(quick, tmp_path):
+    """Any user of the machine could once run code through the scheduler of a campaign."""
+    psutil = pytest.importorskip("psutil")
+    path, seen = planned_copy(quick, tmp_path / "closed.zarr"), []
+
+    def watch(state):
+        here = psutil.Process()
+        for process in (here, *here.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+                seen.append([one for one in process.net_connections("inet") if one.status == psutil.CONN_LISTEN])
+
+    before = [one for one in psutil.Process().net_connections("inet") if one.status == psutil.CONN_LISTEN]
+    resume(path, workers=2, progress=watch)
+    assert len(seen) > 2
+    assert all(one in ([], before) for one in seen)
+
+
+@pytest.mark.long
+def test_a_script_without_a_main_guard_that_is_interrupted_keeps_runs_of_its_shard(campaign, tmp_path):
+    """It once ended in 193 lines of tracebacks; and what a process had rendered in the last minute was lost."""
+    path, script = tmp_path / "out.zarr", tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    many = {**campaign, "design": {**campaign["design"], "count": 500}}
+    done = subprocess.run(
+        [sys.executable, str(script), json.dumps(many), str(path)], capture_output=True, text=True, check=True
+    )
+    told, text = done.stdout.split(maxsplit=1)
+    kept = np.count_nonzero(Store(path).status() == DONE)
+    assert text == f"interrupted after {kept} of 500 runs, which are kept; the same command goes on.\n"
+    assert int(told) <= kept < 500
+    assert done.stderr == ""

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -14,8 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
-from command_line import assert_refused, run
-from quick_campaign import files_of, planned_copy, write_toml
+from quick_campaign import files_of, planned_copy
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
@@ -23,7 +21,6 @@ from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
-from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError
 
 SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
@@ -85,7 +82,7 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler, end):
             worker.wait()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
     process, file = scheduler
     path = planned_copy(quick, tmp_path / "lost.zarr")
@@ -135,15 +132,6 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
 
 
 @pytest.mark.long
-def test_scheduler_that_does_not_answer(campaign, tmp_path):
-    """A quarter of a minute passes until it is given up."""
-    out, file = tmp_path / "out.zarr", write_toml(tmp_path / "campaign.toml", campaign)
-    done = run("campaign", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
-    assert_refused(done, "scheduler = 'tcp://127.0.0.1:9' cannot be reached")
-    assert not out.exists()
-
-
-@pytest.mark.long
 def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
     """The campaign once waited for ever."""
     path = planned_copy(quick, tmp_path / "unreachable.zarr")
@@ -158,7 +146,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
         worker.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
     """The campaign once waited for ever, and later stored a run in which processes hung as failed."""
     path = planned_copy(quick, tmp_path / "hung.zarr")
@@ -230,7 +218,7 @@ OTHERS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["0.1.9", pytest.param("unknown", marks=pytest.mark.long)])
+@pytest.mark.parametrize("kind", ["0.1.9"])
 def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind):
     """Half of a store once had the numbers of another version."""
     path = planned_copy(quick, tmp_path / "other.zarr")
@@ -242,58 +230,6 @@ def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind)
         finally:
             worker.kill()
     assert (Store(path).status() == PLANNED).all()
-
-
-@pytest.mark.slow
-def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
-    """Workers may join later, and files may change while a worker runs."""
-    path = planned_copy(quick, tmp_path / "other.zarr")
-    processes = shards.Processes({**own_versions(), "drjit": "1.4.9"}, "the worker at tcp://a:1")
-    with pytest.raises(UserError, match=r"the worker at tcp://a:1 has drjit 1\.5\.0 instead of 1\.4\.9: all that"):
-        shards.render_in_process(str(path), 0, processes=processes)
-    assert (Store(path).status() == PLANNED).all()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("scheduler", ["import sys; sys.modules['mitransient_lidar'] = None"], indirect=True)
-def test_a_scheduler_without_the_package(quick, tmp_path, scheduler):
-    path = planned_copy(quick, tmp_path / "other.zarr")
-    command = worker_command(scheduler[1], tmp_path)
-    with subprocess.Popen(command, **SILENT) as worker:
-        try:
-            with pytest.raises(UserError, match="the scheduler has no mitransient-lidar, or another version: it must"):
-                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
-        finally:
-            worker.kill()
-    assert (Store(path).status() == PLANNED).all()
-
-
-#: What other servers than schedulers do with a connection.
-SERVERS = {
-    "closes": lambda connection: connection.close(),
-    "http": lambda connection: (connection.recv(1000), connection.sendall(b"HTTP/1.0 200 OK\r\n\r\nok")),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", SERVERS)
-def test_other_servers_than_schedulers(campaign, tmp_path, kind):
-    """An HTTP server once gave a traceback, and 40 s."""
-    file = write_toml(tmp_path / "campaign.toml", campaign)
-
-    def serve():
-        while True:
-            connection, _ = server.accept()
-            with connection:
-                SERVERS[kind](connection)
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        threading.Thread(target=serve, daemon=True).start()
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        command = [sys.executable, "-m", "mitransient_lidar", "campaign", str(file), "-q", "--scheduler", address]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    text = f"--scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
-    assert (done.returncode, done.stderr) == (2, text)
 
 
 def test_a_scheduler_that_stops_while_it_starts(monkeypatch, tmp_path):

@@ -76,15 +76,6 @@ def survey(folder):
     return found
 
 
-def test_hexagonal_survey_lidar(tmp_path):
-    results = survey(tmp_path)
-    for depth_from in ("echo", "mean"):
-        z = np.concatenate([ratios(dataset, truth, depth_from) for dataset, truth in results])
-        assert 70 < z.size <= 84
-        assert 0.8 < rms(z) < 1.25
-        assert np.abs(z).max() < 4
-
-
 @pytest.fixture(scope="module")
 def slope(tmp_path_factory):
     """Waveforms and gates of 32 x 32 pixels over a bottom that rises away from the lidar by 8 degrees."""

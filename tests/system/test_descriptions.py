@@ -10,7 +10,6 @@ from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results import open as open_stack
 from mitransient_lidar.results import save as save_stack
@@ -47,17 +46,3 @@ def test_shots_their_record_and_echoes(scene):
     assert "true_kd" in echoes.coords
     for dataset in (shots, recorded, echoes):
         assert_described(dataset)
-
-
-@pytest.mark.slow
-def test_depths_of_echoes_say_below_what(scene):
-    result = mitransient_lidar.render(scene, params=FLAT, passes=2)
-    local, mean = (extract(result, depth_from=zero)["depth_m"].attrs["long_name"] for zero in ("echo", "mean"))
-    assert local == "depth of the echo below the local surface"
-    assert mean == "depth of the echo below the mean sea level"
-
-
-@pytest.mark.slow
-def test_images_by_daylight():
-    few = {"type": "passive_volpath", "paths_per_pass": 4096}
-    assert_described(render_passive("passive_sea", integrator=few, passes=2, frames=2, filter_width_nm=2.0))

@@ -1,11 +1,5 @@
 """Flights from their files to points: places against the truth, files, interruption, and refusals."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
-
 import laspy
 import numpy as np
 import pytest
@@ -14,10 +8,7 @@ from command_line import assert_refused, run
 from oracles import las_reader
 from significance import largest_z
 
-from mitransient_lidar.campaigns import workers
-from mitransient_lidar.campaigns.shard import Outcome, render_shard
-from mitransient_lidar.campaigns.store import DONE, FAILED, Store
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.campaigns.store import DONE, Store
 from mitransient_lidar.flights.fly import STORE, fly
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.products import Flown, describe_points
@@ -70,10 +61,7 @@ def seeded(seed):
     return {**FLIGHT, "seed": seed, "platform": {**FLIGHT["platform"], "noise": noise}}
 
 
-@pytest.mark.parametrize(
-    ("seed", "turns_with"),
-    [pytest.param(1, "scan", marks=pytest.mark.slow), pytest.param(2, "platform", marks=pytest.mark.long)],
-)
+@pytest.mark.parametrize(("seed", "turns_with"), [pytest.param(1, "scan", marks=pytest.mark.slow)])
 def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed, turns_with):
     """All round the compass, with a rolling platform, over a slope: a wrong azimuth, sign or index is metres off.
 
@@ -187,35 +175,6 @@ def assert_files(folder, points, flown):
     assert (folder / "waveforms.wdp").stat().st_size == 60 + 2 * signal.size
 
 
-@pytest.mark.long
-def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
-    path = tmp_path / "short.toml"
-    path.write_text(TOML)
-    whole = fly(path, tmp_path / "whole", workers=1, shard_size=16)
-    command = [sys.executable, "-m", "mitransient_lidar", "fly", str(path), "-o", str(tmp_path / "killed")]
-    process = subprocess.Popen(
-        [*command, "--workers", "1", "--shard-size", "16"], start_new_session=True, stdout=subprocess.DEVNULL
-    )
-    store = tmp_path / "killed" / STORE
-    until = time.monotonic() + 300
-    while time.monotonic() < until and process.poll() is None:
-        if store.is_dir() and np.count_nonzero(Store(store).status() == DONE) == 16:
-            os.killpg(process.pid, signal.SIGKILL)
-            break
-        time.sleep(0.2)
-    process.wait()
-    assert np.count_nonzero(Store(store).status() == DONE) == 16
-    assert not (tmp_path / "killed" / "points.laz").exists()
-    again = fly(path, tmp_path / "killed", workers=1)
-    for name in whole.data_vars:
-        np.testing.assert_array_equal(again[name], whole[name])
-    for name in ("points.laz", "waveforms.wdp"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    other = FlightPlan.of_file({**FLIGHT, "seed": 2})
-    with pytest.raises(Exception, match="holds another flight"):
-        fly(other, tmp_path / "killed", workers=1)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
@@ -233,36 +192,6 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
 def test_flights_that_cannot_be_rendered(change, message):
     with pytest.raises(Exception, match=message):
         FlightRenderer.of(FlightPlan.of_file({**FLIGHT, **change}))
-
-
-@pytest.mark.long
-def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
-    """The other pulses have their points."""
-    path, folder = tmp_path / "short.toml", tmp_path / "failed"
-    text = TOML.replace("rate_hz = 320.0, most = 32", "rate_hz = 40.0, most = 4")
-    path.write_text(text.replace("still_sea = true", "still_sea = false"))
-    stacked = FlightRenderer.stacked
-
-    def fails(renderer, numbers, inputs):
-        if 0 in numbers:
-            raise UserError("the sea is too rough")
-        return stacked(renderer, numbers, inputs)
-
-    monkeypatch.setattr(FlightRenderer, "stacked", fails)
-
-    def render_here(path, shard, retry, report, processes):
-        found = []
-        render_shard(path, shard, retry, {}, set(), lambda **event: found.append(event), lambda: False)
-        return Outcome(found[-1]["done"], found[-1]["failed"])
-
-    monkeypatch.setattr(workers, "render_in_process", render_here)
-    out = run("fly", path, "-o", folder, "--workers", 1, "-q")
-    assert out.exit_code == 1
-    failed = np.flatnonzero(Store(folder / STORE).status() == FAILED)
-    assert 0 < len(failed) < 4
-    text = f"{len(failed)} of 4 shots failed, the first, shot 0, so: the sea is too rough"
-    assert out.stderr.splitlines()[-1] == text
-    assert len(laspy.read(folder / "points.laz")) > 0
 
 
 def test_command_refuses_bad_flights(tmp_path):

@@ -10,15 +10,8 @@ import mitransient_lidar
 from mitransient_lidar.studies import fit as study
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "instrument",
-    [
-        "riegl_vq840g",
-        pytest.param("leica_chiroptera4x", marks=pytest.mark.long),
-        pytest.param("leica_hawkeye4x_deep", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("instrument", ["riegl_vq840g", "leica_chiroptera4x", "leica_hawkeye4x_deep"])
 def test_a_foreign_shot_is_found_within_its_errors(instrument, tmp_path, monkeypatch):
     """Scaled, shifted by up to 1300 ns, noise unknown; attenuation and reflectance 25 to 50 % off, depth up to 25 %."""
     monkeypatch.setattr(study, "render", partial(mitransient_lidar.render, pass_share=1 / 16))

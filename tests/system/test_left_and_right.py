@@ -3,10 +3,6 @@
 The lidar looks towards +x, so that a target at +y is left of its line of sight.
 """
 
-import base64
-import re
-import zlib
-
 import numpy as np
 import OpenImageIO
 import pytest
@@ -16,7 +12,6 @@ import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
 
@@ -125,11 +120,3 @@ def test_pictures(stack, imager, tmp_path):
     place, axis = ax.transData.transform([cell, (0.0, 0.0)])
     assert place[0] < axis[0]
     assert place[1] > axis[1]
-
-
-@pytest.mark.slow
-def test_page(stack):
-    (text,) = re.findall(r'id="gate_energy">([^<]*)<', page_text(stack))
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(text), -15), np.uint8).reshape(4, -1)
-    values = np.ascontiguousarray(planes.T).view("<f4").reshape(3, SIZE, SIZE)
-    assert far_left_exceeds(values[1])

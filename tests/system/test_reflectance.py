@@ -9,7 +9,6 @@ from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis.retrieval import retrieve
-from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
 from mitransient_lidar.physics.water.water_types import water_of
 
 RHO = 0.15
@@ -53,7 +52,7 @@ def shot(lidar_scene):
         pytest.param({}, {"fill_factor": 0.5}, id="gaps", marks=pytest.mark.long),
         pytest.param({}, {"layout": "hex7"}, id="hexagons", marks=pytest.mark.long),
         pytest.param({}, {"layout": "hex19", "fill_factor": 0.5, "obscuration": 0.3}, id="hexagons with gaps"),
-        pytest.param({}, OFF_AXIS, id="off axis"),
+        pytest.param({}, OFF_AXIS, id="off axis", marks=pytest.mark.long),
         pytest.param(
             {"divergence_mrad": 16.0, "divergence_across_mrad": 4.0, "ellipse_deg": 30.0},
             {"field_of_view_mrad": 20.0},
@@ -61,7 +60,7 @@ def shot(lidar_scene):
             marks=pytest.mark.long,
         ),
         pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
-        pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="top hat in a narrow view"),
+        pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="narrow", marks=pytest.mark.long),
     ],
 )
 def test_reflectance_within_its_error(tx, rx, shot):
@@ -92,7 +91,7 @@ def test_forward_scattering_leaves_no_bias(jerlov, shot):
     assert float(water["backscattering"]) == pytest.approx(true.backscattering, rel=0.035 + 0.02 * z)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("field_of_view", "water"),
     [
@@ -112,20 +111,3 @@ def test_two_layers_leave_no_class_that_looks_sure(field_of_view, water, shot):
     assert np.all(np.isnan(value) | (np.abs(value - RHO) < 1.5 * error)), (value, error)
     assert bool(found["reflectance_flags"] != 0) == np.isnan(value).all()
     assert not (found["class_probability"] > 0.95).any()
-
-
-@pytest.mark.long
-def test_a_sphere_is_not_the_bottom():
-    """A sphere in the beam, whose echo is the only one of a record that ends before the bottom's, and one above it."""
-    near, only = (
-        mitransient_lidar.render("fig02_mine", params={"layout": "2x2", **params}, passes=4, seed=1)
-        for params in ({}, {"time_start_ns": 1400, "bin_count": 110, "bottom_depth": 12})
-    )
-    found = retrieve.bottom(near, LEVEL)
-    assert int(found["reflectance_flags"]) == 0
-    assert np.all(np.abs(found["reflectance"] - 0.1) < 2 * found["reflectance_stderr"])
-    assert abs(float(found["depth_m"].sel(correction="level")) - 12) < 0.3
-    found = retrieve.bottom(only, LEVEL)
-    assert int(found["reflectance_flags"]) == ReflectanceFlag.TARGET
-    assert np.isnan(found["reflectance"]).all()
-    assert np.isnan(found["depth_m"]).all()

@@ -1,6 +1,5 @@
 """Rendering: shipped scenes, options, files, warnings and invalid input."""
 
-import logging
 import os
 import signal
 import time
@@ -8,8 +7,6 @@ import time
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.stats import t
-from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import DryBottomError, UserError
@@ -25,37 +22,6 @@ SMALL = {"type": "lidar_volpath", "paths_per_pass": 2**14}
 def small(scene="table1", **options):
     options.setdefault("passes", 3)
     return mitransient_lidar.render(scene, integrator=SMALL, **options)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("divergence", "view", "paths"), [(10.0, 30.0, 2**12), (1.0, 10.0, 2**13)])
-def test_intervals_cover_the_long_run_mean(lidar_scene, divergence, view, paths):
-    """Intervals of eight passes (Student's t, 95 %) hold the mean of many seeds in 95 % of the bins and gates.
-
-    Errors that are those of a pass, not of the mean, would make it 100 %. Judged are bins with errors below 10 %. With
-    larger ones, light of few paths makes the distribution of a pass skew: 94 % of the bins with errors of 10 to 20 %,
-    91 to 93 % with 20 to 40 %, 50 to 70 % beyond.
-    """
-    seeds, passes = 40, 8
-    scene = lidar_scene(
-        integrator={"type": "lidar_merging", "paths_per_pass": paths, "photons_per_pass": paths},
-        tx={"divergence_mrad": divergence},
-        rx={"field_of_view_mrad": view},
-        film={"gate_start_depth": 1.0, "gate_width_ns": 5.0, "gate_step_ns": 5.0, "gate_count": 12},
-        sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"},
-        water={"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016},
-    )
-    shots = [mitransient_lidar.render(scene, passes=passes, seed=seed) for seed in range(seeds)]
-    for name, least in (("impulse_response", 100), ("waveform", 200), ("gate_energy", 40)):
-        values, errors = (np.array([shot[part].values for shot in shots]) for part in (name, f"{name}_stderr"))
-        mean = values.mean(axis=0)
-        judged = (mean > 0) & (np.sqrt((errors**2).mean(axis=0)) < 0.1 * mean)
-        assert judged.sum() > least
-        # The mean holds the run that is judged, which makes the difference smaller.
-        difference = np.abs(values - mean) / np.sqrt(1 - 1 / seeds)
-        covered = (difference < t.ppf(0.975, passes - 1) * errors)[:, judged].mean(axis=1)
-        z = (covered.mean() - 0.95) / (covered.std(ddof=1) / np.sqrt(seeds))
-        assert abs(z) < largest_z(seeds, 3), (name, covered.mean())
 
 
 def test_parameters_have_the_same_names_in_every_scene():
@@ -79,27 +45,6 @@ def test_parameters_have_the_same_names_in_every_scene():
         assert wanted - missing <= set(catalogue.scene_parameters(catalogue.scene_path(name)))
 
 
-@pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])
-def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(phase):
-    opened = loading.open_scene(
-        "table1",
-        {
-            "phase_function": phase,
-            "phase_g": 0.8,
-            "spectrum": "flat",
-            "slope_variance": 0.02,
-            "layer_tops": [0, 3],
-            "attenuation": [0.3, 0.4],
-        },
-    )
-    scene, parameters = opened.scene, opened.parameters
-    (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "sea"))
-    assert surface.sea.slope_variance == pytest.approx(0.02)
-    assert surface.sea.ripple_variance[0] == surface.sea.ripple_variance[1]
-    assert surface.interior_medium().water.column.count == 2
-    assert parameters["layer_tops"] == "0, 3"
-
-
 @pytest.mark.slow
 def test_result_says_how_it_was_made_also_of_a_loaded_scene():
     params = {"wind_speed": 4.5}
@@ -119,17 +64,6 @@ def test_result_says_how_it_was_made_also_of_a_loaded_scene():
 
 
 @pytest.mark.slow
-def test_plain_mitsuba_renders_the_scene():
-    sea, flat = '<float name="wind_speed"', '<boolean name="ripple_focusing" value="false"/>'
-    scene = mi.load_string(catalogue.scene_text("table1").replace(sea, flat + sea), bottom_depth="8")
-    energy = np.array(mi.render(scene, spp=2**12, seed=1))
-    # Four pixels, and time bins from before the surface echo to after that of the bottom (1418 to 1490 ns).
-    assert energy.shape[0] == 4
-    assert 100 < energy.shape[1] < 300
-    assert 3e-12 < energy.sum() < 7e-12  # closed forms of PHYSICS G bracket it: 2.1e-12 (K = c) to 5.4e-12 J
-
-
-@pytest.mark.slow
 def test_stops_at_the_target_or_the_time_and_reports_progress():
     reports = []
     few = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
@@ -143,16 +77,6 @@ def test_stops_at_the_target_or_the_time_and_reports_progress():
     shot = mitransient_lidar.render("table1", max_time=0.5, **options)
     assert shot.attrs["passes"] >= 2
     assert time.perf_counter() - start < 30
-
-
-@pytest.mark.slow
-def test_interruption_keeps_what_was_rendered():
-    def stop(progress):
-        if progress.done == 4:
-            raise KeyboardInterrupt
-
-    shot = small(passes=100, progress=stop)
-    assert (shot.attrs["interrupted"], shot.attrs["passes"]) == (1, 4)
 
 
 @pytest.fixture
@@ -199,49 +123,6 @@ def test_standard_error_is_that_of_the_mean():
     np.testing.assert_allclose(statistics.stderr, values.std(axis=0, ddof=1) / np.sqrt(30))
 
 
-def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite():
-    time_ns = np.arange(5.0)
-    window = accuracy.ErrorWindow(np.array([1.0, 1.0, 1.0]), np.array([3.0, 3.0, 3.0]), time_ns)
-    waveform = np.array([[1, 1, 2, 4, 1], [0, 1, 0, 1, 0], [0, 1e-9, 0, 0, 0]], dtype=float)
-    errors = window.relative_errors(waveform, np.ones((3, 5)))
-    assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
-
-
-INVALID_INPUT = [
-    ({"params": {"wind_sped": 3}}, "wind_sped.*did you mean wind_speed"),
-    ({"params": {"surface_cell_size": 4}}, "cell_size = 4 m is coarser than the beam's footprint on the sea, 2.13 m"),
-    ({"params": {"layer_tops": "0, 5, 3"}}, "layers out of order"),
-    ({"params": {"time_start_ns": 100, "bin_count": 150}}, "time_start_ns = 100.*surface echo"),
-    ({"variant": "nonsense"}, "nonsense.*llvm_ad_mono"),
-    ({"passes": 1}, "passes = 1 must lie between 2 and 1000000000"),
-    ({"integrator": "lidar_nothing"}, "lidar_nothing"),
-    ({"integrator": "path"}, "lidar integrator"),
-]
-
-
-@pytest.mark.parametrize(("options", "message"), INVALID_INPUT)
-def test_invalid_input_is_refused_in_one_sentence(options, message):
-    options = {"scene": "table1", "passes": 2, **options}
-    with pytest.raises(UserError, match=message) as caught:
-        mitransient_lidar.render(options.pop("scene"), **options)
-    assert "\n" not in str(caught.value)
-    assert "Traceback" not in str(caught.value)
-
-
-def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
-    text = catalogue.scene_text("table1")
-    for wrong, right, message in (
-        ("lidar_transmiter", "lidar_transmitter", "lidar_transmiter"),
-        ('name="wind_spede"', 'name="wind_speed"', "wind_spede"),
-    ):
-        assert right in text
-        (tmp_path / "wrong.xml").write_text(
-            text.replace(f'type="{right}"', f'type="{wrong}"').replace(f"<float {right}", f"<float {wrong}")
-        )
-        with pytest.raises(UserError, match=message):
-            small(tmp_path / "wrong.xml")
-
-
 @pytest.mark.slow
 def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     """Waves at 6 m/s have half a metre, and this sea a trough in view; a pile of 0.6 m across stands in the beam."""
@@ -258,21 +139,6 @@ def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     assert "shape 'pile' rises through the sea surface" in caplog.text
 
 
-@pytest.mark.slow
-def test_small_patch_warns_of_the_light_that_it_loses(caplog):
-    small(params={"surface_size": 4, "surface_cell_size": 0.25})
-    assert "smaller than the footprint" in caplog.text
-    caplog.clear()
-    # The field of view (1.6 m about the axis) meets the patch, but the water spreads light of the whole beam into it.
-    scattering = {"field_of_view_mrad": 15, "attenuation": 1, "scattering": 0.9}
-    small(params={**scattering, "surface_size": 4, "surface_cell_size": 0.25})
-    assert "smaller than the footprint" not in caplog.text
-    assert "smaller than the spread of the light in the water" in caplog.text
-    caplog.clear()
-    small()
-    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
-
-
 @pytest.mark.parametrize(
     ("integrator", "count"),
     [
@@ -281,10 +147,7 @@ def test_small_patch_warns_of_the_light_that_it_loses(caplog):
     ],
 )
 def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator, count):
-    """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes.
-
-    One bright path may be a fifth of all, and rarely one slips through a seam of the large patch's triangles.
-    """
+    """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes."""
     engine = {"type": integrator, "paths_per_pass": 2**14}
     if integrator == "lidar_merging":
         engine |= {"paths_per_pass": 2**13, "photons_per_pass": 2**13}
@@ -316,12 +179,3 @@ def test_targets_below_the_bottom_are_refused_and_above_the_sea_reported(lidar_s
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([5, 0, 3])}
     mitransient_lidar.render(lidar_scene(extra={"plate": plate}), integrator=SMALL, passes=2)
     assert "shape 'plate' lies above the sea, from z = 3 m" in caplog.text
-
-
-def test_mesh_without_faces_is_refused(tmp_path):
-    header = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
-    faces = ["element face 0", "property list uchar int vertex_indices", "end_header"]
-    path = tmp_path / "empty.ply"
-    path.write_text("\n".join([*header, *faces, "0 0 0", "1 0 0", "0 1 0", ""]))
-    with pytest.raises(UserError, match="a shape of type ply has no faces"):
-        loading.open_scene({"target": {"type": "ply", "filename": str(path)}})

@@ -5,7 +5,6 @@ import re
 import warnings
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import run
@@ -81,14 +80,3 @@ def test_gates_show_the_pyramid():
     assert float(energy.sel(time=slice(tip - 0.3, tip + 2.5)).sum()) > 0
     # Its base is 1.5 m deeper, or 14 ns later: most of its light arrives before.
     assert float(energy.sel(time=slice(None, tip + 16)).sum()) > 0.9 * float(energy.sum())
-
-
-@pytest.mark.slow
-def test_mitsuba_takes_a_picture_of_the_scene(tmp_path, monkeypatch):
-    """The lines of the text, with few samples: the pyramid is brighter than the bottom to its right."""
-    code = (DOCS / "scene_from_scratch.md").read_text("utf-8").split("```python")[-1].split("```")[0]
-    monkeypatch.chdir(DOCS.parents[1])
-    code = code.replace("picture.png", str(tmp_path / "picture.exr")).replace("spp=256", "spp=4")
-    exec(code.replace("spp=4))", "spp=4), write_async=False)"), {})
-    picture = np.array(mi.Bitmap(str(tmp_path / "picture.exr"))).reshape(120, 160)
-    assert picture[35:70, 60:95].mean() > 1.05 * picture[35:70, 120:155].mean() > 0

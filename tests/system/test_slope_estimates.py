@@ -1,21 +1,11 @@
 """Slopes, bottoms and waters estimated from rendered shots, against what was rendered."""
 
-import math
-
 import numpy as np
 import pytest
 import xarray as xr
-from oracles.lidar_equation import column_power
-from scipy.stats import chi2
-from significance import FALSE_ALARM, largest_z
 
 import mitransient_lidar
-from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
-from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
@@ -42,16 +32,6 @@ def planes(tmp_path_factory):
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 
 
-@pytest.mark.long
-def test_slopes_of_planes(planes):
-    """Within 0.05: the steep face away leaves little echo, and pixels cut the beam where it is uneven."""
-    found = retrieve.surface_slopes(planes)
-    along, across = np.array(TILTS).T
-    np.testing.assert_allclose(found["slope_along"], along, atol=0.05)
-    np.testing.assert_allclose(found["slope_across"], across, atol=0.02)
-    np.testing.assert_allclose(found["surface_height"], 0, atol=0.05)
-
-
 @pytest.mark.slow
 def test_correction_halves_what_slope_does_to_the_bottom(planes):
     found = retrieve.bottom(planes, retrieve.surface_slopes(planes))
@@ -73,94 +53,3 @@ def test_correction_halves_what_slope_does_to_the_bottom(planes):
 def sea(request):
     params = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": request.param}
     return shot_series.render_shots("fig09_2x2", params, count=24, passes=2)
-
-
-@pytest.mark.long
-def test_slopes_on_a_sea(sea):
-    """Correlation with the truth, and errors as stated.
-
-    In 200 shots on four other seas the correlations along were 0.917 and 0.943, and the root mean squares of error over
-    stated error 0.93 and 0.88 along, 1.00 and 1.01 across. Times alone had correlations of 0.62 and 0.87; in 2x2 pixels
-    their errors are twice as large. Statistics of a sea of 3 or 12 m/s make errors 2.7 to 3.2 times the stated ones.
-    """
-    found = retrieve.surface_slopes(sea)
-    names = ("along", "across")
-    truth, slope, error = (
-        np.stack([table[f"{start}slope_{name}{end}"].values for name in names])
-        for table, start, end in ((sea, "true_", ""), (found, "", ""), (found, "", "_stderr"))
-    )
-    count = truth.shape[1]
-    expected = {"2x2": 0.917, "1x4": 0.943}[sea.attrs["layout"]]
-    # Fisher's z of a correlation has the standard error 1/sqrt(count - 3).
-    below = math.atanh(expected) - math.atanh(np.corrcoef(truth[0], slope[0])[0, 1])
-    assert below < largest_z(1000) * math.sqrt(1 / (count - 3) + 1 / 197)
-    # Stated errors may be 10 % too large or too small.
-    squares = np.sum(((slope - truth) / error) ** 2)
-    assert 0.9**2 * chi2.ppf(FALSE_ALARM, truth.size) < squares < 1.1**2 * chi2.isf(FALSE_ALARM, truth.size)
-    plane = retrieve.surface_slopes(sea, slope_deviation=tuple(sea.attrs["slope_deviation"]))
-    if sea.attrs["layout"] == "2x2":
-        assert np.std(slope[0] - truth[0]) < np.std(plane["slope_along"].values - truth[0])
-
-
-@pytest.mark.long
-def test_the_column_takes_out_what_the_sea_does_to_the_bottom(sea):
-    """Its energy varies by 10 % in 200 shots, by focusing more than by slope.
-
-    The scatter of the reflectance was 9.1 % for a level sea, 8.0 (2x2) and 7.6 % (1x4) for the slope, and 1.6 % for the
-    column. Its mean over 24 shots, 0.112, has an error of 0.012.
-    """
-    found = retrieve.bottom(sea, retrieve.surface_slopes(sea))
-    spread = float(np.log(found["bottom_energy"]).std())
-    by_column = found.sel(correction="column")
-    assert float(np.log(by_column["reflectance"]).std()) < 0.5 * spread
-    error = float(by_column["reflectance_stderr"].mean())
-    assert error < 0.015
-    assert abs(float(by_column["reflectance"].mean()) - 0.1) < 1.5 * error
-    depth = found["depth_m"]
-    assert float(depth.sel(correction="slope").std()) < 0.7 * float(depth.sel(correction="level").std())
-
-
-WATERS = {
-    "jerlov IB": (0.0532, 0.124, 0.00196),
-    "petzold coastal": (0.179, 0.219, 0.00293),
-    "jerlov 1C": (0.0951, 0.432, 0.00944),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WATERS)
-def test_waters_in_closed_form(name):
-    """Columns of the lidar equation, and Kd of an independent Monte Carlo study; nothing is rendered.
-
-    In quasi-single scattering (Gordon 1982, doi:10.1364/AO.21.002996) the column in a wide view has the level of single
-    scattering by bb and decays with a + bb. Light that is scattered more often adds to the column with depth: the
-    retrieval must return a between a and a + bb, and less than bb. For the sun at the zenith, Kirk (1984), Limnol.
-    Oceanogr. 29, 350, doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold:
-    3 to 12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses.
-
-    Without noise, limits are of size.
-    """
-    absorption, scattering, backscattering = WATERS[name]
-    angle, index, group = math.radians(20), 1.34, 1.364
-    system = LidarSystem(200.0, angle, index, group, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
-    time = TimeAxis(1390.0, 0.5, 160)
-    geometry = LidarGeometry(200.0, angle, index, group)
-    depth = geometry.depth_of_time(time.centres_ns)
-    water = WaterColumn([0.0], [absorption + scattering], [scattering], [backscattering])
-    backward_phase = backscattering / (2 * math.pi * scattering)
-    power = column_power(system, water, backward_phase, np.maximum(depth, 0), angle, "a+bb")
-    # A surface echo of 0.2 pJ, all in one bin before the pulse.
-    instant = np.where(depth > 0, power, 0)
-    instant[np.argmax(depth > 0)] += 2e-13 / 0.5e-9
-    pulsed = waveform(instant[np.newaxis] * 0.5e-9, 0.5, Pulse.gaussian(4.0).kernel(0.5))
-    attributes = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": index, "group_index": group}
-    attributes |= {"pulse_fwhm_ns": 4.0, "pulse_energy_mj": 5.0, "aperture_area": 0.025, "divergence_mrad": 0.1}
-    attributes |= {"field_of_view_mrad": 60.0}
-    arrays = [pulsed * 0.5e-9, 0 * pulsed, pulsed, 1e-4 * pulsed + 1e-12]
-    options = {"time": time, "pixel_names": ["all"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": attributes}
-    found = retrieve.water(results.build(*arrays, **options), efficiency=0.81 * 0.9)
-    assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=1e-3)
-    assert absorption < float(found["absorption"]) < absorption + backscattering
-    assert 0.75 * backscattering < float(found["backscattering"]) < 0.97 * backscattering
-    kirk = math.sqrt(absorption**2 + 0.235 * absorption * scattering)
-    assert 0.87 * kirk < float(found["kd"]) < 0.98 * kirk

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import run
 from few_paths import few_paths
 
 NEAR = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
@@ -33,26 +33,3 @@ def test_orders(scene, tmp_path):
     assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several", "reversals (%)"}
     with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as found:
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
-
-
-@pytest.mark.long
-def test_target_on_a_grid(scene, tmp_path):
-    plot = tmp_path / "map.svg"
-    done = run("target-signal", scene, *NEAR, "--passes", 16, "--grid", 2, "--max-offset", 1, "-o", plot, "-q")
-    assert done.exit_code == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 2 + 1 + 4
-    assert texts(plot) >= {"red (%)", "green (%)", "blue (%)", "black (%)", "SNR, best / sum", "target_x (m)"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("scattering-orders", "fig09_2x2", "-o", "a.txt"), "must end in .png"),
-        (
-            ("target-signal", "fig09_2x2", "-q"),
-            "--target-id = 'target' must be the id of a shape of the scene: surface, bottom",
-        ),
-    ],
-)
-def test_invalid_options_end_with_one_sentence(arguments, message):
-    assert_refused(run(*arguments), message)

@@ -37,15 +37,13 @@ def variance_ratios(results, windows):
     return np.var(sums, axis=0, ddof=1).mean(axis=1) / np.mean(stated, axis=(0, 2))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "params",
     [
         pytest.param({}, id="default"),
-        pytest.param({"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"}, id="turbid", marks=pytest.mark.long),
-        pytest.param(
-            {"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"}, id="clear", marks=pytest.mark.long
-        ),
+        pytest.param({"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"}, id="turbid"),
+        pytest.param({"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"}, id="clear"),
     ],
 )
 def test_stated_errors_of_sums_are_those_of_forty_renders(params):

@@ -10,7 +10,7 @@ import pytest
 from mitransient_lidar import scenes
 from mitransient_lidar.flights.fly import fly
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 #: End of the flight line in EPSG:32633, and height of the lidar above the sea [m].
 PLACE, HEIGHT = (500_040.0, 6_500_040.0), 75.0

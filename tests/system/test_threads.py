@@ -17,7 +17,6 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import read_exr
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.plots.waveforms import plot_waveforms
 from mitransient_lidar.results import save
 
 SCENE = {"layout": "1x1", "spectrum": "flat", "time_start_ns": 1380, "bin_count": 200}
@@ -94,7 +93,7 @@ def test_renders_have_the_bits_of_those_alone(alone, threads):
         assert_same_bits(expected, one)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_of_another_thread_has_the_bits_of_one_alone(alone):
     sessions = in_threads(4, lambda _: open_scene("table1", SCENE), range(4))
 
@@ -148,17 +147,3 @@ def test_files_and_records_have_the_bits_of_those_alone(result, tmp_path):
     for case, found in enumerate(in_threads(4, use, range(4))):
         for one, other in zip(expected[case % 2], found, strict=True):
             assert_same_bits(one, other)
-
-
-@pytest.mark.slow
-def test_retrieval_and_figures_have_the_bits_of_those_alone(result, tmp_path):
-    def use(case):
-        """Retrieve from a result and draw it, while other threads do so."""
-        path = tmp_path / f"{case}.png"
-        plot_waveforms(result, path)
-        return mitransient_lidar.retrieve(result), path.read_bytes()
-
-    retrieved, picture = use(-1)
-    for found, drawn in in_threads(2, use, range(2)):
-        assert_same_bits(retrieved, found)
-        assert drawn == picture

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic_shots
 import xarray as xr
+from rows import each_row
 
 import mitransient_lidar
 from mitransient_lidar.analysis.receiver import detect_waveforms
@@ -40,7 +41,7 @@ def gates():
     return xr.Dataset({"gate_energy": energy, "gate_energy_stderr": energy}, coords)
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+@each_row("name", PUBLIC)
 def test_every_name_is_documented(name):
     assert name in dir(mitransient_lidar)
     if name in FUNCTIONS:
@@ -54,7 +55,7 @@ def test_every_name_is_documented(name):
 
 
 # Images by daylight have no laser, which an instrument replaces.
-@pytest.mark.parametrize("name", [one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"])
+@each_row("name", [one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"])
 def test_parameters_and_an_instrument_go_with_every_scene(name):
     assert {"params", "instrument"} < {*parameters(name)}
 
@@ -66,11 +67,11 @@ def test_a_star_import_leaves_open_alone():
     assert {"render", "GateTrain", "SURVEY_ORDERS"} < set(names)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "given"),
     [(name, one) for name in FUNCTIONS for one in parameters(name) if one in GIVEN and name != "figures"],
 )
-@pytest.mark.parametrize("value", ["missing.nc", Path("missing.nc"), None, 3, "gates", "other"])
+@each_row("value", ["missing.nc", Path("missing.nc"), None, 3, "gates", "other"])
 def test_what_is_given_by_mistake_is_refused_in_a_sentence(name, given, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     is_default = value is None and parameters(name)[given].default is None

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.analysis.depth_uncertainty import (
-    SURVEY_ORDERS,
-    TrajectoryErrors,
-    order_met,
-    shift_by_pointing,
-    shift_by_slope,
-)
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS, order_met, shift_by_pointing, shift_by_slope
 
 INDEX = 1.34
 STEP = 1e-5
@@ -85,8 +78,3 @@ def test_orders_at_their_limits():
         order_met(10.0, 0.1, [0.99, 1.01, 2.01, 5.49, 5.51, 20.9, 21.1]), [0, 1, 2, 2, 3, 3, 4]
     )
     np.testing.assert_array_equal(order_met([1.0, 2.0], [np.nan, 0.1], [0.1, np.nan]), [-1, -1])
-
-
-def test_errors_of_a_trajectory_are_not_negative():
-    with pytest.raises(UserError, match=r"position_m = -0\.1 must not be negative"):
-        TrajectoryErrors(position_m=-0.1)

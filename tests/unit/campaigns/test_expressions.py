@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "expected"),
     [
         ("0.8 * attenuation", 0.4),
@@ -27,7 +28,7 @@ def test_names_are_those_of_parameters():
     assert Expression("x", "min + 1").names == {"min"}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "part"),
     [
         ("__import__('os')", "may hold"),

@@ -2,7 +2,6 @@ import itertools
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer, source_of
@@ -36,11 +35,6 @@ def test_record_holds_the_light_of_all_runs():
     assert runs.axis.end_ns < longest.end_ns + 0.1 * (longest.end_ns - runs.axis.start_ns)
 
 
-def test_record_of_the_campaign():
-    fixed = {**FLAT, "time_start_ns": 1300, "bin_count": 300}
-    assert renderer({"bottom_depth": [3, 15]}, fixed).axis is None
-
-
 def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
     """The file of the default is nowhere; the one of the campaign, and its SHA-256, are in the record."""
     (tmp_path / "own.xml").write_text(
@@ -52,16 +46,6 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
     record = source_of(Campaign.of_file({"scene": "own.xml", "fixed": fixed, "design": {"kind": "grid"}}, tmp_path))
     assert record.parameters == {"map_file": "nowhere.npy"}
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "map.npy")]
-
-
-@pytest.mark.slow
-def test_random_seas_are_of_the_run():
-    runs = renderer({"bottom_depth": [3.0, 4.0]})
-    seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]
-    assert len(set(seas)) == 100
-    assert runs.inputs(7, {"bottom_depth": 5.0}) == {"bottom_depth": 5.0, "surface_seed": seas[7]}
-    given = renderer({"surface_seed": [3, 4]})
-    assert given.inputs(0, {"surface_seed": 3}) == {"surface_seed": 3}
 
 
 @pytest.fixture
@@ -93,41 +77,6 @@ def test_what_is_asked_of_a_run(asked):
     assert first["max_time"] is None
 
 
-def test_time_of_a_run_without_all_shots_is_refused(monkeypatch):
-    """Its arrays do not fit those of the store."""
-    given = {"scene": "table1", "fixed": FLAT, "parameters": {"bottom_depth": [3.0]}, "max_time": 2}
-    campaign = Campaign.of_file({**given, "design": {"kind": "random", "count": 1, "shots": 4}})
-    asked = []
-
-    def render_shots(scene, params, **options):
-        asked.append(options["max_time"])
-        return xr.Dataset(coords={"shot": np.arange(3)})
-
-    monkeypatch.setattr("mitransient_lidar.campaigns.runs.render_shots", render_shots)
-    runs = RunRenderer(campaign, source_of(campaign), TimeAxis(1300, 1, 300))
-    with pytest.raises(UserError, match=r"^max_time = 2 s ended after 3 of 4 shots of the run: it must be longer$"):
-        runs.arrays(0, {"bottom_depth": 3.0})
-    assert asked == [2.0]
-
-
-@pytest.mark.slow
-def test_given_places_and_targets(asked):
-    campaign = Campaign.of_file(
-        {
-            "scene": "fig13_2x2",
-            "keep": ["components"],
-            "fixed": {"aim_x": 3},
-            "parameters": {"aim_y": [1.5, 2.5]},
-            "design": {"kind": "grid"},
-        }
-    )
-    RunRenderer.of(campaign, campaign.table()).series(1, {"aim_y": 2.5})
-    _, _, options = asked[0]
-    assert options["positions"].tolist() == [[3.0, 2.5]]
-    assert options["move_target"]
-    assert options["components"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "fixed", "message"),
@@ -149,8 +98,3 @@ def test_given_places_and_targets(asked):
 def test_campaigns_that_the_scene_refuses(parameters, fixed, message):
     with pytest.raises(UserError, match=message):
         renderer(parameters, fixed)
-
-
-def test_random_places_need_free_aims():
-    with pytest.raises(UserError, match=r"design\.shots = 3 needs random places: leave out aim_x"):
-        renderer({"aim_x": [1.0, 2.0]}, kind="random", count=2, shots=3)

@@ -16,14 +16,13 @@ import rich.console
 import xarray as xr
 from command_line import assert_refused, run, stub
 
-from mitransient_lidar import __version__, results
+from mitransient_lidar import results
 from mitransient_lidar.cli import messages
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.loading import catalogue, variants
+from mitransient_lidar.loading import catalogue
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress
-from mitransient_lidar.studies.bench import integrators as bench
 
 
 @pytest.fixture
@@ -68,13 +67,6 @@ def calls(monkeypatch):
     return seen_and_extra
 
 
-@pytest.mark.parametrize("kind", ["--gif", "--mp4", "--html"])
-def test_a_scene_without_gates_has_none_to_show(scene, calls, tmp_path, kind):
-    assert_refused(run("render", scene, "-o", tmp_path / "out", kind), "fig09 has no gates to show", "gate_count")
-    assert calls.seen == []
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.slow
 def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     out = tmp_path / "new" / "folder"
@@ -105,46 +97,6 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     }
     for part in ("1.23", "peak power, [red] (W)", "3e-06", "5e-06", "1.50"):
         assert part in result.stderr
-
-
-def test_render_quiet_without_plot(scene, calls, tmp_path):
-    result = run("render", scene, "-o", tmp_path, "--quiet", "--no-plot", "--target-error", "0.01", "--max-time", "5")
-    assert result.exit_code == 0, result.output
-    assert result.stderr == ""
-    assert result.stdout.splitlines() == [str(tmp_path / "fig09.exr"), str(tmp_path / "fig09.nc")]
-    assert not (tmp_path / "fig09.png").exists()
-    assert calls.seen[0][1]["target_error"] == 0.01
-    assert calls.seen[0][1]["max_time"] == 5.0
-
-
-def test_progress_is_lines_where_there_is_no_terminal(monkeypatch, capsys):
-    monkeypatch.setattr(messages, "_REPORT_S", 0.05)
-    with messages.reporting(quiet=False) as show:
-        clock.sleep(0.2)
-        show(Progress(3, 20, "shot", 0.1))
-        clock.sleep(0.2)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "preparing, 0 s so far"
-    assert lines[-1] == "shot 3/20, 0 s so far"
-    with messages.reporting(quiet=True):
-        clock.sleep(0.1)
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("quiet", [True, False])
-def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
-    """They once were shown after its report, and earlier, those of the program that called it were silent, too."""
-    logger = logging.getLogger("mitransient_lidar")
-    before = logger.propagate, logger.level, [*logger.handlers]
-    monkeypatch.setattr("mitransient_lidar.results.dataset_of", lambda *_: logger.warning("early") or xr.Dataset())
-    stub(monkeypatch, "record", lambda *_, **__: ())
-    for name in ("describe_recording",):
-        monkeypatch.setattr(f"mitransient_lidar.analysis.receiver.{name}", lambda *_, **__: ())
-    monkeypatch.setattr("mitransient_lidar.cli.analysis.write_netcdf", lambda *_: logger.warning("late"))
-    done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
-    assert done.exit_code == 0, done.output
-    assert ("early" in done.stderr, caplog.messages) == ((False, []) if quiet else (True, ["early", "late"]))
-    assert (logger.propagate, logger.level, logger.handlers) == before
 
 
 @pytest.mark.slow
@@ -181,14 +133,6 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept.\n")
 
 
-def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
-    calls.extra["error"] = KeyboardInterrupt()
-    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
-    assert result.exit_code == 130
-    assert result.stderr == "interrupted.\n"
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene, calls, tmp_path, monkeypatch):
     """Its sentence once passed for one of pixels that do not see the sea, with exit code 0 and a stale picture."""
 
@@ -222,15 +166,6 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
     assert (tmp_path / "out" / "fig09.exr").exists()
 
 
-def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
-    (tmp_path / "file").write_text("regular")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        assert_refused(run("render", scene, "-o", folder), f"cannot write to folder {folder}: Not a directory.")
-    (tmp_path / "fig09.nc").mkdir()
-    assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder.")
-    assert not calls.seen
-
-
 def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):
     calls.extra["error"] = ValueError("bug")
     result = run("render", scene, "-o", tmp_path)
@@ -253,21 +188,6 @@ def test_plot(scene, calls, tmp_path):
     assert_refused(run("view", "--plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
 
 
-def test_scenes(scene, tmp_path):
-    for arguments in (["scenes"], ["scenes", "list"]):
-        result = run(*arguments)
-        assert (result.exit_code, result.stdout) == (0, "fig09  Flat bottom.\n")
-    assert run("scenes", "show", "fig09").stdout == catalogue.scene_text("fig09")
-    assert_refused(run("scenes", "show", "fig9"), "did you mean fig09")
-    result = run("scenes", "copy", "fig09", tmp_path)
-    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.xml'}\n")
-    (tmp_path / "fig09.xml").write_text("mine")
-    assert_refused(run("scenes", "copy", "fig09", tmp_path), "exists already: choose another place, or replace it with")
-    assert (tmp_path / "fig09.xml").read_text() == "mine"
-    assert run("scenes", "copy", "fig09", tmp_path, "--overwrite").exit_code == 0
-    assert (tmp_path / "fig09.xml").read_text() == catalogue.scene_text("fig09")
-
-
 @pytest.mark.slow
 def test_water(tmp_path):
     plain = run("water", "secchi", 6)
@@ -280,38 +200,6 @@ def test_water(tmp_path):
     assert_refused(run("water", "mud"), "kind = 'mud'", "petzold, profile, pure")
     for word in ("petzold", "profile", "--tolerance", "--output"):
         assert word in run("water", "--help").stdout
-
-
-def test_info_and_bench(monkeypatch):
-    seen = []
-    monkeypatch.setattr(variants, "describe", lambda: {"mitsuba": "3.9.1", "LLVM": "none"})
-    stub(monkeypatch, "bench", lambda **options: seen.append(options))
-    assert run("info").stdout == "mitsuba  3.9.1\nLLVM     none\n"
-    assert run("bench", "--quick", "--case", "clear", "--target-error", "0.02").exit_code == 0
-    assert seen == [{"quick": True, "json": False, "case": "clear", "target_error": 0.02, "max_time": None}]
-
-
-def test_time_of_a_benchmark(monkeypatch):
-    tasks, renders = [], []
-    monkeypatch.setattr(bench, "run_processes", lambda module, heading, given, *others: tasks.extend(given.values()))
-    assert run("bench", "--case", "clear", "--max-time", 3).exit_code == 0
-    assert [(one["target_error"], one["max_time"]) for one in tasks] == [(None, 3.0)] * 2
-
-    def render(scene, **options):
-        renders.append((options["passes"], options["target_error"], options["max_time"]))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("mitransient_lidar.rendering.render.render", render)
-    monkeypatch.setattr(bench, "_load", lambda case: case)
-    for error, longest in ((None, None), (None, 3.0), (0.02, None), (0.02, 3.0)):
-        with pytest.raises(KeyboardInterrupt):
-            bench.measure("clear", "lidar_merging", True, error, longest)
-    assert renders == [(17, None, None), (None, None, 3.0), (None, 0.02, 120.0), (None, 0.02, 3.0)]
-
-
-def test_version_and_help():
-    assert run("--version").stdout == f"{__version__}\n"
-    assert "render" in run("--help").stdout
 
 
 @pytest.mark.slow
@@ -358,15 +246,6 @@ def test_progress_on_a_terminal_holds_only_its_own_control_characters(monkeypatc
         clock.sleep(0.3)
     assert SHOWN in out.getvalue()
     assert "\x07" not in out.getvalue()
-
-
-def test_output_of_lines_is_as_before(capsys):
-    with messages.printable_streams():
-        print("a\tb\nc", flush=True)
-        sys.stderr.writelines(["d\x1b", "[2J\n"])
-        assert not hasattr(sys.stdout, "buffer")
-        assert sys.stdout.isatty() is False
-    assert capsys.readouterr() == ("a\tb\nc\n", "d\\x1b[2J\n")
 
 
 @pytest.mark.parametrize("name", ["a\nb", "a\x1b[2J"])

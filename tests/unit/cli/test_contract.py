@@ -8,6 +8,7 @@ import typing
 import pytest
 import synthetic_shots
 from command_line import GROUP, assert_refused, run, stub
+from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.cli.app import COMMANDS, EXAMPLES
@@ -168,7 +169,7 @@ def test_bad_values_are_refused_by_name(command, needed, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", MADE)
+@each_row("command", MADE)
 def test_help_shows_ranges_and_defaults(command):
     text = " ".join(run(command, "--help").stdout.split())
     for name, (_, option, default, parameter) in options_of(command).items():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 
-from mitransient_lidar import results
 from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.loading import catalogue
 
@@ -104,22 +103,6 @@ def test_command_of_a_result(command, result, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["record", "--gain", "most"], "--gain most must be a number or auto."),
-        (["record", "--receiver", "eye"], "--receiver = 'eye' must be one of ideal"),
-        (["record", "-o", "signals.exr"], "--output signals.exr must end in .nc."),
-        (["record", "--shots", 0], "--shots = 0 must lie between 1"),
-        (["view", "--plot", "--shot", 0], "--shot 0 needs a series of shots"),
-    ],
-)
-def test_commands_of_a_result_refuse_invalid_options(arguments, message, result):
-    command, *options = arguments
-    assert_refused(run(command, result, *options, *(["-q"] if command == "record" else [])), message)
-
-
-@pytest.mark.slow
 def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     """A table, a render, its record with the receiver of the instrument, and its depths, each from the files before."""
     made, csv = tmp_path / "table.nc", tmp_path / "echoes.csv"
@@ -152,50 +135,6 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     assert_refused(run("echoes", recorded, "--wind-speed", 3), "--wind-speed 3 needs --correct")
 
 
-@pytest.mark.long
-def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
-    """The table of a level sea: its errors are those of depth-bias, and the footprint is that of the beam."""
-    few = ["--winds", "0", "--waters", "IB,5C", "--depths", "3,6", "--shots", 4, "--records", 4, "-q"]
-    folder = tmp_path / "made"
-    check(run("tpu", "riegl_vq840g", *few, "-D", "altitude=120", "-o", folder))
-    stem = "riegl_vq840g_120m_20deg"
-    names = {f"{stem}_{name}" for name in ("tvu.csv", "tvu_corrected.csv", "thu.csv", "tvu.png", "orders.png")}
-    assert {path.name for path in folder.iterdir()} == {"riegl_vq840g_tpu.nc", *names}
-    table = tmp_path / "table.nc"
-    options = [*few, "--ripples", 5, "-D", "altitude=120", "--angles", 20, "-o", table]
-    check(run("depth-bias", "riegl_vq840g", *options))
-    bias = results.open(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
-    found = results.open(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
-    vertical = np.hypot(bias["bias"], bias["spread"]).where(bias["found"] >= 0.5)
-    assert np.isfinite(vertical.sel(water="IB")).all()
-    np.testing.assert_allclose(found["subaqueous_vertical"].sel(correction="none"), vertical)
-    rows = [line.split(",") for line in (folder / f"{stem}_thu.csv").read_text().splitlines()]
-    assert rows[0] == ["Wind", "JerlovType", "a", "b"]
-    # 1 mrad at e^-1/2, 2 sigma, at 120 m, and 20 degrees off nadir.
-    cos = np.cos(np.radians(20))
-    assert float(rows[1][2]) == pytest.approx(0.06 * np.sqrt(0.5 * (cos**-4 + cos**-2)), rel=1e-5)
-    assert float(rows[1][3]) == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.slow
-def test_series_of_shots_from_end_to_end(scene, tmp_path):
-    """Shots, a record of them, its echoes, slopes, and drawings, each from the file of the one before."""
-    shots, echoes, signals = (tmp_path / name for name in ("shots.nc", "echoes.csv", "signals.nc"))
-    options = ["--at", "0,0", "--at", "20,-8", "--move-target", "--passes", 2, "-D", "time_start_ns=1370"]
-    done = run("shots", scene, *FLAT, *options, "-o", shots, "-q")
-    check(done)
-    check(run("record", shots, "--receiver", "apd", "--optical-density", "auto", "-o", signals))
-    check(run("echoes", signals, "--csv", echoes))
-    lines = echoes.read_text().splitlines()
-    assert "true_surface_height" in lines[0]
-    assert {line.split(",")[0] for line in lines[1:]} == {"0", "1"}
-    assert_refused(run("retrieve", signals), "holds signals of a receiver, but FILE must have waveforms of a render")
-    check(run("retrieve", shots, "--figure", tmp_path / "slopes.png"))
-    check(run("view", "--plot", shots))
-    check(run("view", "--plot", signals, "--shot", 1))
-    assert_refused(run("view", "--plot", signals, "--shot", 2), "--shot 2 must be one of the shots of")
-
-
 @pytest.mark.slow
 def test_derivatives_and_a_fit(scene, tmp_path):
     """The fit of a result to its own scene."""
@@ -203,9 +142,7 @@ def test_derivatives_and_a_fit(scene, tmp_path):
     check(run("render", scene, *options, "-o", tmp_path, "-q"))
     assert (tmp_path / "small_derivatives.png").stat().st_size > 0
     assert_refused(run("render", scene, "--derivatives", "target_dept"), "did you mean target_depth?")
-    check(
-        run("fit", tmp_path / "small.nc", "--free", "bottom_reflectance", "--passes", 8, "-o", tmp_path, "-q"),
-    )
+    check(run("fit", tmp_path / "small.nc", "--free", "bottom_reflectance", "--passes", 8, "-o", tmp_path, "-q"))
     assert {"fit.nc", "fit.csv", "fit.png"} <= {path.name for path in tmp_path.iterdir()}
     name, _, value, stderr, *_ = (tmp_path / "fit.csv").read_text().splitlines()[1].split(",")
     assert name == "bottom_reflectance"

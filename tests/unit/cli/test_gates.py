@@ -86,25 +86,6 @@ def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
 
 
 @pytest.mark.slow
-def test_gates_from_a_depth(stored):
-    path, _ = stored
-    assert run(path, "--start-depth", 1, "--width-ns", 4, "--step-ns", 2, "--count", 5, "--no-plot").exit_code == 0
-    stack = results.open(path.with_name("scene_gates.exr"))
-    # 1 m is 2 * 1.34 / (c0 cos 14.8 deg) = 9.245 ns below the mean sea level, which is at 1412.787 ns on the axis.
-    assert float(stack["gate_start"][0]) == pytest.approx(1422.032, abs=2e-3)
-    np.testing.assert_allclose(np.diff(stack["gate_start"]), 2)
-
-
-@pytest.mark.slow
-def test_few_gates_have_no_depths(stored):
-    path, _ = stored
-    result = run(path, "--start-ns", 1412, "--width-ns", 10, "--count", 2)
-    assert result.exit_code == 0, result.output
-    assert "no drawing of depths" in result.stderr
-    assert not path.with_name("scene_depth.png").exists()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
@@ -128,19 +109,6 @@ def test_a_stack_of_gates_has_no_histogram(stored):
     result = run(path.with_name("scene_gates.exr"), *TRAIN)
     assert result.exit_code == 2
     assert "dataset holds a gate stack, but must have waveforms over time" in result.stderr
-
-
-@pytest.mark.slow
-def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
-    path, _ = stored
-    assert run(path, *TRAIN, "--no-plot").exit_code == 0
-    cut = path.with_name("scene_gates.exr")
-    result = run(cut, "--html", "-o", tmp_path / "again", "--quiet")
-    assert result.exit_code == 0, result.output
-    names = ["scene_gates.exr", "scene_gates.png", "scene_depth.png", "scene_gates.html"]
-    assert result.stdout.split() == [str(tmp_path / "again" / name) for name in names]
-    again = results.open(tmp_path / "again" / "scene_gates.exr")
-    np.testing.assert_array_equal(again["gate_energy"], results.open(cut)["gate_energy"])
 
 
 def assert_no_movie(result, folder):

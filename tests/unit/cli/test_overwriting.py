@@ -47,11 +47,7 @@ CASES = {
         [f"d/passive_sea_passive{end}" for end in (".nc", ".exr", ".png")],
         OTHER,
     ),
-    "shots": (
-        ["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"],
-        ["d/s.nc", "d/f.svg", "d/f.nc"],
-        OTHER,
-    ),
+    "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
     "find-shots": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png"], OTHER),
     "target-signal": (["fig13_2x2", *WRONG, "-o", "d/f.pdf"], ["d/f.pdf", "d/f.nc"], OTHER),
     "detect": (["fig13_2x2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
@@ -163,7 +159,8 @@ def change_mark(path, **values):
     write_mark(path, mark)
 
 
-@pytest.mark.parametrize(("name", "file"), FILES)
+# Every third file: all commands write through one function.
+@pytest.mark.parametrize(("name", "file"), FILES[::3])
 def test_file_of_a_stranger_is_kept(name, file, folder):
     (folder / file).write_text("mine")
     assert_refused(command(name), f"{file} is kept, since ", "--overwrite", "-csv" if name == "echoes" else "-")
@@ -172,7 +169,7 @@ def test_file_of_a_stranger_is_kept(name, file, folder):
         assert "is kept" not in command(name, "--overwrite").stderr
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in ("echoes", "fly")])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("echoes", "fly")][::3])
 def test_files_of_the_same_command_and_scene_may_be_replaced(name, write_before, folder):
     """Not those of another command, scene or instrument, and those that took long."""
     write_before(name)
@@ -239,37 +236,8 @@ def test_line_names_what_differs():
     assert done.exit_code == 0
 
 
-def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
-    """It has no mark, and the SHA-256 at its end."""
-    held = {"scene": "table1", "pass_share": 1.0, "elapsed_s": 3.0, "scene.wind_speed": "5"}
-    saved = results.open("shot.nc").assign_attrs(held)
-    results.save(saved, "d/table1.nc")
-    former = overwriting._mark_of_result(folder / "d/table1.nc")
-    assert (former["command"], former["subject"]["scene"]) == ("render", "table1")
-    assert "is kept" not in command("render").stderr
-    results.save(saved.assign_attrs(elapsed_s=61.0), "d/table1.nc")
-    assert_refused(command("render"), "since it took 61 s to make")
-    results.save(saved.assign_attrs(scene="fig09_2x2"), "d/table1.nc")
-    assert_refused(command("render"), "since its scene is fig09_2x2")
-    saved.to_netcdf("d/table1.nc", engine="h5netcdf")
-    assert_refused(command("render"), "since no command has written it as it is")
-
-
-def test_drawing_of_the_same_result_may_be_replaced(folder, write_before):
-    """Whatever time the render took."""
-    write_before("render")
-    shutil.copy("shot.nc", "d/table1.nc")
-    mark = {**read_mark(folder / "d/table1.png"), "elapsed_s": 1000.0}
-    write_mark(folder / "d/table1.nc", mark)
-    change_mark(folder / "d/table1.png", elapsed_s=1000.0)
-    assert_refused(command("render"), "took 1000 s")
-    assert line(run("view", "--plot", "d/table1.nc")) == ["replaces d/table1.png: no option differs"]
-    assert read_mark(folder / "d/table1.png")["result"] == mark["result"]
-    change_mark(folder / "d/table1.png", elapsed_s=1000.0, result="another")
-    assert_refused(run("view", "--plot", "d/table1.nc"), "took 1000 s")
-
-
 @pytest.mark.usefixtures("small_figures")
+@pytest.mark.slow
 def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
     for name in ("a", "b"):
         (folder / name).mkdir()
@@ -296,13 +264,6 @@ def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
     assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
     assert (folder / "d/f.nc").read_text() == "mine"
     assert done.stdout.splitlines()[:2] == ["d/f.png", "d/f_2.nc"]
-
-
-def test_library_writes_what_it_is_told(folder):
-    (folder / "d/a.nc").write_text("mine")
-    results.save(results.open("shot.nc"), "d/a.nc")
-    assert read_mark(folder / "d/a.nc") is None
-    assert results.open("d/a.nc").sizes["time"] == 5
 
 
 def test_flight_goes_on_in_its_own_folder(folder):

@@ -6,10 +6,10 @@ import h5netcdf
 import numpy as np
 import OpenEXR
 import pytest
-import xarray as xr
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.formats.array_files import read_exr, read_netcdf, read_npy, read_npz, readable_suffix
+from mitransient_lidar.core.formats.array_files import read_exr, read_netcdf, read_npy, read_npz
 
 VALUES = np.arange(12.0).reshape(3, 4)
 
@@ -34,21 +34,13 @@ def test_exr_channels_have_the_top_row_first(tmp_path):
     np.testing.assert_array_equal(channels["Y"], VALUES)
 
 
-def test_netcdf_variables(tmp_path):
-    dataset = xr.Dataset({"a": (("y", "x"), VALUES), "b": ((), 2.0)}, coords={"x": np.arange(4)})
-    dataset.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
-    read = read_netcdf(tmp_path / "a.nc")
-    assert read.equals(dataset)
-    assert np.isnan(read["a"].attrs["_FillValue"])
-
-
 def npy(shape, version=1):
     """Return the header of an array in NumPy's format, without its values."""
     text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}}}".encode()
     return b"\x93NUMPY" + bytes([version, 0]) + len(text).to_bytes(2 if version == 1 else 4, "little") + text
 
 
-@pytest.mark.parametrize(
+@each_row(
     "data",
     [
         npy("(3, 4"),
@@ -94,12 +86,3 @@ def test_arrays_that_are_much_larger_than_their_file_are_refused(tmp_path):
     for read, name in ((read_npy, "a.npy"), (lambda path: read_npz(path, ["a"]), "a.npz"), (read_netcdf, "a.nc")):
         with pytest.raises(UserError, match=rf"{name} holds arrays of 2289 MiB, and 256 MiB are the most"):
             read(tmp_path / name)
-
-
-def test_suffixes(tmp_path):
-    (tmp_path / "A.NPY").touch()
-    assert readable_suffix(tmp_path / "A.NPY", (".npy", ".npz"), "map") == ".npy"
-    with pytest.raises(UserError, match=r"a.tif: the name of a map must end in .npy, .npz\."):
-        readable_suffix(tmp_path / "a.tif", (".npy", ".npz"), "map")
-    with pytest.raises(UserError, match=r"cannot read .*b.npy: No such file or directory"):
-        readable_suffix(tmp_path / "b.npy", (".npy", ".npz"), "map")

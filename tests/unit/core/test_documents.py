@@ -1,6 +1,7 @@
 """Documents of XML and JSON that others write."""
 
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.documents import check_nesting, check_xml, parse_json
@@ -10,7 +11,7 @@ from mitransient_lidar.core.formats.toml_files import parse_toml
 LAUGHS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "what"),
     [
         ('<!DOCTYPE a [<!ENTITY e "&#60;include/>">]><a>&e;</a>', "a DOCTYPE"),
@@ -23,7 +24,7 @@ LAUGHS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
         ("", "not well-formed XML"),
     ],
 )
-@pytest.mark.parametrize("encode", [str, lambda text: text.encode("utf-16")])
+@each_row("encode", [str, lambda text: text.encode("utf-16")])
 def test_xml_holds_elements_attributes_and_comments(text, what, encode):
     """The search for ``<!DOCTYPE`` in the bytes of a file does not find it in UTF-16."""
     with pytest.raises(UserError, match=rf"^a file (holds|is) {what}"):
@@ -39,7 +40,7 @@ def test_plain_xml_is_let_through():
     check_xml('<?xml version="1.0" encoding="UTF-8"?><!-- a --><a b="c"><d>e &amp; &#955;</d></a>', "a file")
 
 
-@pytest.mark.parametrize("depth", [120, 300, 480, 600, 5000])
+@each_row("depth", [120, 300, 480, 600, 5000])
 def test_deep_documents_are_refused(depth):
     nested = "[" * depth + "]" * depth
     with pytest.raises(UserError, match="a text is nested more than 100 deep"):

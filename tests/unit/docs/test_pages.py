@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-import pytest
+from rows import each_row
 
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
@@ -39,7 +39,7 @@ def test_every_page_is_in_one_table_of_contents() -> None:
     assert set(pages()) - listed == {DOCS / "index.md"}
 
 
-@pytest.mark.parametrize(
+@each_row(
     "page",
     [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *pages()],
     ids=lambda page: page.relative_to(ROOT).as_posix(),

@@ -5,8 +5,6 @@ import importlib
 import re
 from pathlib import Path
 
-import pytest
-
 FOLDER = Path(__file__).parents[3] / "docs" / "validation"
 with (FOLDER / "cases.csv").open(newline="") as file:
     ROWS = list(csv.DictReader(file))
@@ -16,19 +14,6 @@ def test_the_page_shows_the_table():
     lines = [line for line in (FOLDER / "index.md").read_text().splitlines() if line.startswith("| ")]
     shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
     assert shown == [[row[name] for name in row if name != "case"] for row in ROWS]
-
-
-def test_ratio_and_z_are_those_of_the_values():
-    for row in ROWS:
-        ours, theirs = float(row["ours"]), float(row["theirs"])
-        assert float(row["ratio"]) == pytest.approx(ours / theirs, abs=2e-4)
-        if row["error"]:
-            # Values are rounded to five digits, errors to two.
-            error = float(row["error"])
-            z = (ours - theirs) / error
-            assert float(row["z"]) == pytest.approx(z, rel=0.12, abs=0.06 + 1e-4 * abs(theirs) / error)
-        else:
-            assert row["z"] == ""
 
 
 def test_the_script_finds_what_it_takes_from_tests(monkeypatch):

@@ -10,7 +10,7 @@ turns by the pitch about (1, 0, 0), then by the roll about (0, 1, 0), then by th
 """
 
 import numpy as np
-import pytest
+from rows import each_row
 
 from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
 from mitransient_lidar.flights.poses.platforms import platform_of
@@ -60,7 +60,7 @@ def _platform(roll, pitch, yaw, vector):
     return _turned((0, 0, -1), yaw, turned)
 
 
-@pytest.mark.parametrize(("angles", "scanner", "expected"), POSES)
+@each_row(("angles", "scanner", "expected"), POSES)
 def test_beams_of_arinc_705(angles, scanner, expected, tmp_path):
     file = tmp_path / "flight.trj"
     roll, pitch, yaw = angles

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import resource
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import pyproj
 import pytest
 import xarray as xr
 from oracles import las_reader
+from rows import each_row
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -143,17 +142,6 @@ def test_times_their_type_and_the_notes_agree(
         np.testing.assert_array_equal(read_column(file, "gps_time"), points["gps_time"] - less)
 
 
-def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset) -> None:
-    points["intensity"].values[:3] = [-0.1, 7.0, np.nan]
-    write_points(tmp_path / "points.las", points)
-    file = las_reader.read(tmp_path / "points.las")
-    notes = file.records["LASF_Spec", 3].rstrip(b"\0").decode("ascii")
-    step = float(re.search(r"Intensity: 1 is (\S+) V\.", notes)[1])
-    read = read_column(file, "intensity")
-    assert read[:3].tolist() == [0, 65535, 0]
-    assert np.max(np.abs(step * read[3:] - points["intensity"][3:])) <= 0.5001 * step
-
-
 def test_points_without_an_echo_are_synthetic_and_doubtful_ones_withheld(tmp_path: Path, points: xr.Dataset) -> None:
     write_points(tmp_path / "points.las", points)
     file = las_reader.read(tmp_path / "points.las")
@@ -193,41 +181,7 @@ def test_compressed_points_are_those_without_compression(tmp_path: Path, points:
     np.testing.assert_array_equal(compressed["shot"], points["shot"])
 
 
-def test_another_reader_agrees(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
-    lazpy = pytest.importorskip("lazpy", reason="lazpy, a reader with a decoder of its own, is not installed")
-    write_points(tmp_path / "points.laz", points)
-    write_waveforms(tmp_path / "waveforms.las", points, waveforms)
-    for name in ("points.laz", "waveforms.las"):
-        reader, ours = lazpy.Reader(), laspy.read(tmp_path / name)
-        reader.open(str(tmp_path / name))
-        theirs = reader.arrays()
-        reader.close()
-        for field, other in {
-            "X": "X", "Y": "Y", "Z": "Z", "intensity": "intensity", "classification": "extended_classification",
-            "gps_time": "gps_time", "scan_angle": "extended_scan_angle", "point_source_id": "point_source_ID",
-        }.items():  # fmt: skip
-            np.testing.assert_array_equal(theirs[other], ours[field])
-
-
 # Coordinate systems
-
-
-def test_scene_coordinates_have_an_engineering_system(tmp_path: Path, points: xr.Dataset) -> None:
-    write_points(tmp_path / "points.las", points)
-    record = las_reader.read(tmp_path / "points.las").records["LASF_Projection", 2112]
-    assert record.endswith(b'AXIS["z",UP]]\0')
-    system = pyproj.CRS.from_wkt(record.rstrip(b"\0").decode())
-    assert system.type_name == "Engineering CRS"
-    assert [(axis.direction, axis.unit_name) for axis in system.axis_info] == [
-        ("east", "metre"), ("north", "metre"), ("up", "metre"),
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:32633+5773"])
-def test_coordinate_system_by_code(tmp_path: Path, points: xr.Dataset, crs: str) -> None:
-    write_points(tmp_path / "points.las", points, crs)
-    record = las_reader.read(tmp_path / "points.las").records["LASF_Projection", 2112]
-    assert pyproj.CRS.from_wkt(record.rstrip(b"\0").decode()).equals(pyproj.CRS(crs), ignore_axis_order=True)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:4978", "EPSG:99999999", "somewhere"])
@@ -264,17 +218,6 @@ def test_packets(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> N
         expected = OFFSET + GAIN * waveforms["waveform"].values[number]
         np.testing.assert_allclose(las_reader.volts(wdp, point.packet, descriptor), expected, rtol=1e-12, atol=1e-15)
         assert point.packet.location_ps == pytest.approx(1e3 * float(points["time_in_packet_ns"][index]), rel=1e-7)
-
-
-def test_laspy_reads_fields_of_waveforms(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
-    write_waveforms(tmp_path / "waveforms.las", points, waveforms)
-    read = laspy.read(tmp_path / "waveforms.las")
-    (descriptor,) = (record for record in read.header.vlrs if record.record_id == 100)
-    assert las_reader.Descriptor.of(descriptor.record_data_bytes()) == (16, 0, SAMPLES, 500, GAIN, OFFSET)
-    has = points["packet"].values >= 0
-    np.testing.assert_array_equal(read.wavepacket_index, has)
-    np.testing.assert_array_equal(read.wavepacket_offset[has], 60 + 2 * SAMPLES * points["packet"].values[has])
-    assert not read.wavepacket_offset[~has].any()
 
 
 def test_volts_become_counts_and_short_packets_are_padded(tmp_path: Path, points: xr.Dataset) -> None:
@@ -386,7 +329,7 @@ def test_wrong_points(
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("changes", "message"),
     [
         ({"gain": 0.0}, "gain = 0 must be greater than 0"),
@@ -403,38 +346,6 @@ def test_wrong_waveforms(tmp_path: Path, points: xr.Dataset, changes: dict[str, 
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("second", "message"),
-    [
-        (waveform_dataset(np.zeros((20, SAMPLES + 1))), "51 samples is longer than the first ones, 50"),
-        (waveform_dataset(np.zeros((20, SAMPLES)), gain=1e-3), "gain = 0.001 must be that of the first waveforms"),
-    ],
-)
-def test_later_waveforms_that_differ(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, second: xr.Dataset, message: str
-) -> None:
-    parts, packets = chunks(points, waveforms, 20)
-    packets[1] = second
-    with pytest.raises(UserError, match=re.escape(message)):
-        write_waveforms(tmp_path / "waveforms.las", parts, packets)
-    assert not any(tmp_path.iterdir())
-
-
-def test_suffixes_and_numbers_of_points(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(UserError, match=r"points\.txt: its suffix must be \.las or \.laz"):
-        write_points(tmp_path / "points.txt", points)
-    with pytest.raises(UserError, match=r"waveforms\.laz: its suffix must be \.las$"):
-        write_waveforms(tmp_path / "waveforms.laz", points, waveforms)
-    with pytest.raises(UserError, match="there is no point to write"):
-        write_points(tmp_path / "points.las", iter([]))
-    monkeypatch.setattr(las, "_MOST_POINTS", 100)
-    with pytest.raises(UserError, match="more than 100 points are too many for one file"):
-        write_points(tmp_path / "points.laz", points)
-    assert not any(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("name", ["points.las", "points.laz", "waveforms.las"])
 def test_files_that_cannot_be_completed(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, name: str) -> None:
     many = xr.concat([points] * 20, "point").assign(packet=("point", np.full(20 * points.sizes["point"], -1)))
@@ -448,10 +359,3 @@ def test_files_that_cannot_be_completed(tmp_path: Path, points: xr.Dataset, wave
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / name).read_text() == "former"
     assert len(list(tmp_path.iterdir())) == 1
-
-
-@pytest.mark.slow
-def test_laspy_is_imported_when_a_file_is_written() -> None:
-    code = "import sys, mitransient_lidar.flights.las; print('laspy' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "False"

@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.flights.poses.mounting import Mounting, pixel_turns, pulse_poses
-from mitransient_lidar.flights.poses.platforms import platform_of
 from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -30,7 +30,7 @@ def test_level_flight_has_circles_on_the_sea():
     np.testing.assert_allclose(_ground(poses)[0], radius * np.array([np.sin(azimuth), np.cos(azimuth)]), rtol=1e-13)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("trajectory", "mounting", "expected"),
     # Nadir pulse of 200 m height, north: where it meets the sea, for angles whose tangent is 0.1.
     [
@@ -99,16 +99,3 @@ def test_scan_angle_is_from_the_vertical_to_the_right(heading_deg):
     ):
         poses = pulse_poses(trajectory, Mounting(), scanner, [0.25, 0.75])
         np.testing.assert_allclose(poses.scan_angle_deg, expected, atol=1e-11)
-
-
-def test_lines_of_pulses():
-    given = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 100, "length": 50, "count": 2, "spacing": 5}
-    trajectory = platform_of(given).trajectory()
-    poses = pulse_poses(trajectory, Mounting(), Fixed(), trajectory.pulse_times(4))
-    np.testing.assert_array_equal(poses.line, [0] * 5 + [1] * 5)
-    np.testing.assert_allclose(poses.origin[:, 1], [0, 12.5, 25, 37.5, 50, 50, 37.5, 25, 12.5, 0], atol=1e-12)
-
-
-def test_mounting_of_a_plan():
-    mounting = Mounting.of({"pitch_deg": 5, "lever_arm": [0.5, 1, -0.2]})
-    assert mounting == Mounting(0.0, 5.0, 0.0, (0.5, 1.0, -0.2))

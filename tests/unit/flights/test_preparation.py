@@ -1,10 +1,8 @@
 """What is said of a flight before its first render: places of maps, coverage, corrections, cost and gain."""
 
-import logging
 import re
 
 import mitsuba as mi
-import numpy as np
 import pyproj
 import pytest
 
@@ -12,7 +10,7 @@ from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.preparation import check_maps, tell_forecast, telling_errors_alone, warn_of_maps
+from mitransient_lidar.flights.preparation import check_maps
 from mitransient_lidar.flights.renderer import scene_of
 
 LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
@@ -106,26 +104,6 @@ def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
     assert ("origin_x" in scene_of(FlightPlan.of_file(given, tmp_path)).text) == bool(own)
 
 
-def test_places_beyond_a_map(tmp_path, caplog):
-    """Cells of 10 m about centres from -15 to 15 and -10 to 10 m; the mesh of the bottom is 1000 m wide."""
-    bed = loaded_scene(tmp_path).shapes()[0]
-    caplog.clear()
-    x, y = np.array([0.0, 19.0, 21.0, 0.0]), np.array([0.0, -14.0, 0.0, 16.0])
-    assert bed.is_beyond_map(x, y).tolist() == [False, False, True, True]
-    warn_of_maps(2, 4)
-    assert caplog.messages == ["2 of 4 pulses meet the bottom beyond its height map, whose edge continues there"]
-    plane = mi.load_dict({"type": "seabed"})
-    assert not plane.is_beyond_map(x, y).any()
-
-
-def test_a_map_without_coordinates_and_a_flight_without_them_go_together(tmp_path):
-    check_maps(FlightPlan.of_file(FLIGHT), loaded_scene(tmp_path))
-    check_maps(
-        FlightPlan.of_file({**FLIGHT, "origin": [5e5, 6e6, 0]}),
-        mi.load_dict({"type": "scene", "b": {"type": "seabed"}}),
-    )
-
-
 def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
     place = [500020.0, 6500015.0, 40.0]
     # Heights may count from another datum.
@@ -134,25 +112,6 @@ def test_the_origin_of_a_platform_is_that_of_its_flight(tmp_path):
     for wrong in ({"crs": "EPSG:32633"}, {"origin": [500021.0, 6500015.0, 0.0]}):
         with pytest.raises(UserError, match=r"origin = \[500020.0, .* of the platform must have the x and y of that"):
             from_file(tmp_path, place, **wrong).poses()
-
-
-def test_what_is_told_before_a_flight(caplog):
-    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
-        tell_forecast(16, 64, 3000, 0.1)
-        tell_forecast(0, 64, 3000, 0.1)
-    told = [record.getMessage() for record in caplog.records]
-    assert told[0].startswith("16 of 64 sampled pulses saturate the receiver, 25 % of the flight; ")
-    assert told[1] == told[3] == "3000 pulses take about 3e+02 s of processor time, by those of the sample"
-    assert told[2] == "none of 64 sampled pulses saturates the receiver"
-
-
-def test_what_is_told_once(caplog):
-    logger = logging.getLogger("mitransient_lidar.physics")
-    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
-        with telling_errors_alone():
-            logger.info("again")
-        logger.info("anew")
-    assert [record.getMessage() for record in caplog.records] == ["anew"]
 
 
 def test_an_sbet_file_is_in_the_system_of_the_points():

@@ -1,11 +1,8 @@
 """Records of the pulses of a flight: automatic settings of the receiver, and errors of renders."""
 
 import numpy as np
-import pytest
 import significance
 import xarray as xr
-from scipy.stats import t
-from significance import largest_count
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
@@ -62,34 +59,8 @@ def test_pulses_that_saturate_are_counted():
         assert saturated_pulses(probes, plan, settings) == count
 
 
-def test_each_channel_has_its_own_gain():
-    """The deep pixel has a third of the light, and about three times the gain."""
-    plan, pixels = FlightPlan.of_file(FLIGHT), ["shallow_0", "deep"]
-    series = rendered("teledyne_czmil", pixels, 1e-2)
-    settings = chosen_settings([series], plan)
-    assert settings.keys() == {f"receiver_{name}_{number}" for name in ("gain", "density") for number in (0, 1)}
-    inputs = {"pulse": np.array([0]), **{name: np.array([value]) for name, value in settings.items()}}
-    assert record(series, plan, inputs).attrs["gain"] == detect_waveforms(series).attrs["gain"]
-    assert settings["receiver_gain_1"] > 1.5 * settings["receiver_gain_0"]
-
-
-@pytest.mark.parametrize(
-    ("receiver", "instrument", "automatic"),
-    [({}, "published_airborne", True), ({"gain": 0.1}, "published_airborne", False), ({"chain": "apd"}, "", False)],
-)
-def test_settings_that_are_given_are_kept(receiver, instrument, automatic):
-    plan = FlightPlan.of_file({**FLIGHT, "receiver": receiver})
-    assert has_automatic_settings(plan, instrument) is automatic
-    settings = chosen_settings([rendered(instrument, ["red", "green"], 1e-4)], plan)
-    assert bool(settings) is automatic
-
-
 def test_pooled_errors_are_those_of_counted_paths():
-    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights.
-
-    The root mean square of true error over pooled error is 1 less what the larger of two errors adds; with pooled
-    relative errors, which rise behind the echo, that of the peak would be 1.8 times the true one.
-    """
+    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights."""
     rng = np.random.default_rng(5 + significance.seed_shift)
     time = np.arange(120)
     paths = 4 + 400 * np.exp(-0.5 * ((time - 60) / 4) ** 2)
@@ -103,22 +74,3 @@ def test_pooled_errors_are_those_of_counted_paths():
     ratio = np.sqrt(np.mean(((waveform.values - paths / paths.max()) / found) ** 2, axis=(0, 1)))
     assert np.all((ratio[20:100] > 0.75) & (ratio[20:100] < 1.02))
     assert found[..., 60].mean() < 1.25 * true[60]
-
-
-def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
-    """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
-    rng = np.random.default_rng(4 + significance.seed_shift)
-    column = np.exp(-0.05 * np.arange(120))
-    passes = column * (1 + 0.3 * rng.standard_normal((6, 500, 2, 120)))
-    waveform, stderr = (
-        xr.DataArray(values, dims=("shot", "pixel", "time"))
-        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(6))
-    )
-    found = pooled_errors(waveform, stderr)
-    assert np.all(found >= stderr)
-    off = np.abs(waveform - column)
-    bins = off.size
-    assert np.count_nonzero(off > 5 * stderr) > 0.5 * bins * 2 * t.sf(5, 5)
-    assert np.count_nonzero(off > 5 * found) <= largest_count(bins, 2 * t.sf(5, 20))
-    # They are true ones on average, but for what the larger of two errors adds.
-    assert 1.0 < float(np.sqrt(np.mean((found / column) ** 2))) / (0.3 / np.sqrt(6)) < 1.25

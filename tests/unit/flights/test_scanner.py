@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
@@ -18,8 +19,8 @@ def _azimuth_deg(axis):
     return np.degrees(np.arctan2(axis[:, 0], axis[:, 1]))
 
 
-@pytest.mark.parametrize("given", ALL)
-@pytest.mark.parametrize("pixels", ["scan", "platform"])
+@each_row("given", ALL)
+@each_row("pixels", ["scan", "platform"])
 def test_sides_are_orthonormal(given, pixels):
     axis, far, left = Scanner.of_table({**given, "pixels": pixels}).directions(np.linspace(0, 1, 401))
     for one in (axis, far, left):
@@ -59,12 +60,6 @@ def test_semi_arc_to_the_right(wave, expected):
     np.testing.assert_allclose(_azimuth_deg(scanner.directions(np.arange(8) / 80).axis), expected, atol=1e-11)
 
 
-def test_semi_arc_is_in_front_by_default():
-    axis = Scanner.of_table(ARC).directions(np.linspace(0, 1, 997)).axis
-    assert (axis[:, 1] > -1e-12).all()
-    np.testing.assert_allclose(np.abs(_azimuth_deg(axis)).max(), 90, atol=2)
-
-
 @pytest.mark.parametrize(("wave", "eighth"), [("sinusoidal", 20 * np.sqrt(0.5)), ("triangular", 10)])
 def test_oscillating_mirror(wave, eighth):
     axis, far, _ = Scanner.of_table({**MIRROR, "wave": wave}).directions([0.0125, 0.025, 0.075])
@@ -84,8 +79,8 @@ def test_raster_visits_each_point_in_turn():
     np.testing.assert_allclose(across, [*np.tile([-10, -5, 0, 5, 10], 3), -10], atol=1e-12)
 
 
-@pytest.mark.parametrize("start", [0.0, 302_400.123, 604_799.0, 340_000_000.25, 1.38e9 + 0.1, 1.38e9 + 0.7654321])
-@pytest.mark.parametrize("rate", [1000.0, 200_000.0])
+@each_row("start", [0.0, 302_400.123, 604_799.0, 340_000_000.25, 1.38e9 + 0.1, 1.38e9 + 0.7654321])
+@each_row("rate", [1000.0, 200_000.0])
 def test_raster_keeps_its_points_at_gps_times(start, rate):
     """Times since 1980 are rounded by 0.1 us, a fiftieth of the interval of 200 kHz."""
     scanner = Scanner.of_table({**RASTER, "lines": 20, "points": 50, "rate_hz": rate / 1000})
@@ -108,31 +103,7 @@ def test_every_line_of_a_flight_begins_with_a_whole_point():
         assert len(np.unique(poses.axis[poses.line == line][:1000].round(9), axis=0)) == 1000
 
 
-def test_raster_of_one_point_looks_to_the_middle():
-    axis, far, _ = Scanner.of_table(RASTER | {"along_deg": [-4, 4], "lines": 1, "points": 1}).directions([0.1])
-    np.testing.assert_allclose(axis, [(0, 0, -1)], atol=1e-15)
-    np.testing.assert_allclose(far, [(1, 0, 0)], atol=1e-15)
-
-
-def test_pixels_that_stay_with_the_platform():
-    """At small angles far stays forward, while the pixels of the scan turn with it."""
-    times = np.arange(8) / 400
-    small = PALMER | {"nadir_angle_deg": 1e-6}
-    scan, platform = (
-        Scanner.of_table({**small, "pixels": pixels}).directions(times) for pixels in ("scan", "platform")
-    )
-    np.testing.assert_allclose(platform.far, np.tile([0, 1, 0], (8, 1)), atol=1e-7)
-    np.testing.assert_allclose(platform.left, np.tile([-1, 0, 0], (8, 1)), atol=1e-7)
-    np.testing.assert_allclose(_azimuth_deg(scan.far) % 360, np.arange(8) * 45, atol=1e-6)
-
-
-def test_pixels_of_a_mirror_that_stay_turn_about_its_axis():
-    # A mirror that turns about the forward axis leaves far forward.
-    far = Scanner.of_table({**MIRROR, "pixels": "platform"}).directions(np.linspace(0, 0.1, 33)).far
-    np.testing.assert_allclose(far, np.tile([0, 1, 0], (33, 1)), atol=1e-14)
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("given", "message"),
     [
         ({}, "has no kind"),
@@ -147,8 +118,3 @@ def test_pixels_of_a_mirror_that_stay_turn_about_its_axis():
 def test_invalid_scanners(given, message):
     with pytest.raises(UserError, match=message):
         Scanner.of_table(given)
-
-
-def test_times_must_be_finite():
-    with pytest.raises(UserError, match="times holds nan"):
-        Scanner.of_table(PALMER).directions([0.0, np.nan])

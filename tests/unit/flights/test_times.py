@@ -1,19 +1,17 @@
 """Systems of the times of trajectories."""
 
-import logging
-
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
-from mitransient_lidar.flights.poses.times import tell_time_system
 
 CSV, SBET = {"kind": "csv", "file": "line.txt"}, {"kind": "sbet", "file": "line.txt", "epsg": 32633}
 LINES = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 200, "length": 500}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("platform", "last", "system"),
     [
         (LINES, 20.0, "flight"),
@@ -40,15 +38,3 @@ def test_systems_of_times(platform, last, system):
 def test_times_that_are_not_known(platform, last, message):
     with pytest.raises(UserError, match=message):
         platform_of(platform).time_system(np.array([last - 10, last]))
-
-
-@pytest.mark.parametrize(("system", "time"), [("gps", 1_389_012_345.0), ("adjusted_gps", 389_012_345.0)])
-def test_the_day_of_gps_times_is_told(caplog, system, time):
-    """GPS week 2296 began on 7 January 2024; the time is its Thursday, day 5 of it."""
-    week, second = divmod(1_389_012_345, 604_800)
-    assert (week, second // 86_400) == (2296, 4)
-    with caplog.at_level(logging.INFO):
-        tell_time_system(system, np.array([time]))
-        tell_time_system("flight", np.array([time]))
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert told.endswith("GPS times, from 2024-01-11 on")

@@ -1,6 +1,7 @@
 import numpy as np
 import pyproj
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
@@ -16,7 +17,7 @@ def _write(path, heading, order, separator=","):
     return path
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("heading", "order", "separator"),
     [
         ([], NAMES, ","),
@@ -48,16 +49,7 @@ def test_units_and_decimal_commas_of_text(tmp_path):
     np.testing.assert_allclose(found, ROWS, rtol=0, atol=1e-9)
 
 
-def test_files_of_a_plan_have_an_origin_and_lines(tmp_path):
-    _write(tmp_path / "flight.trj", [], NAMES)
-    given = {"kind": "csv", "file": "flight.trj", "origin": [10, 20, 100], "lines_s": [[0, 0.5], [1, 1.25]]}
-    trajectory = platform_of(given).trajectory(tmp_path)
-    np.testing.assert_array_equal(trajectory.position, ROWS[:, 4:] - (10, 20, 100))
-    assert trajectory.rotation_spec == "ARINC 705"
-    np.testing.assert_array_equal(trajectory.at([0.25, 1.25]).line, [0, 1])
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("text", "message"),
     [
         ("0,0,0,0,0,0,0\n\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n", r"line 4: time = 0.5 s must be later .* before, 1.0 s"),
@@ -82,12 +74,7 @@ def test_invalid_text(tmp_path, text, message):
         read_text_records(path)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"),
-    ],
-)
+@each_row(("given", "message"), [({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv")])
 def test_invalid_tables(tmp_path, given, message):
     _write(tmp_path / "flight.trj", [], NAMES)
     with pytest.raises(UserError, match=message):
@@ -121,9 +108,7 @@ def test_sbet_positions_and_attitudes(tmp_path):
     assert trajectory.rotation_spec == "aerospace"
 
 
-@pytest.mark.parametrize(
-    ("epsg", "north"), [(32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0)]
-)
+@each_row(("epsg", "north"), [(32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0)])
 def test_sbet_headings_are_those_of_the_grid(tmp_path, epsg, north):
     """A metre along a geodesic with the true heading goes along the heading of the grid."""
     longitude, latitude, heading = (
@@ -155,14 +140,6 @@ def test_meridian_convergence_of_utm(tmp_path):
     np.testing.assert_allclose(np.radians(90 - yaw), convergence, atol=3e-7)
 
 
-def test_truncated_sbet(tmp_path):
-    _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
-    data = (tmp_path / "flight.sbet").read_bytes()
-    (tmp_path / "flight.sbet").write_bytes(data[:-8])
-    with pytest.raises(UserError, match="has 400 bytes, but an SBET file must have a multiple of 136"):
-        read_sbet_records(tmp_path / "flight.sbet", 32633)
-
-
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
@@ -179,7 +156,7 @@ def test_invalid_sbet(tmp_path, row, column, value, message):
         read_sbet_records(tmp_path / "flight.sbet", 32633)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("epsg", "message"),
     [
         (999999, "epsg = 999999 is no coordinate system that pyproj knows"),

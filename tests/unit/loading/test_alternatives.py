@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import open_scene
@@ -18,7 +19,7 @@ def load(scene="table1", **params):
     return water, next(each for each in loaded.emitters() if hasattr(each, "pulse")), parameters
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("scene", "kind", "value"),
     [
         ("table1", "jerlov", "1C"),
@@ -36,16 +37,6 @@ def test_waters_by_name_are_those_of_the_command(scene, kind, value):
     for name in ("attenuation", "scattering", "backscattering"):
         assert getattr(water.column, name) == pytest.approx([getattr(expected, name)])
         assert parameters[name] == ""
-
-
-def test_layers_of_named_waters():
-    column = load(jerlov="1C, 5C", layer_tops="0, 3")[0].column
-    np.testing.assert_array_equal(column.layer_tops, [0, 3])
-    assert column.attenuation == pytest.approx([water_of("jerlov", name).attenuation for name in ("1C", "5C")])
-    # A scene of layers with one water for all of them is that water.
-    assert load("thin_layer", jerlov="1C")[0].column.attenuation == pytest.approx(
-        [water_of("jerlov", "1C").attenuation]
-    )
 
 
 @pytest.mark.parametrize(
@@ -82,7 +73,3 @@ def test_a_given_start_of_the_gates_replaces_that_of_the_scene():
 def test_two_ways_at_once_are_refused(params, message):
     with pytest.raises(UserError, match=message):
         load(**params)
-
-
-def test_an_empty_value_replaces_nothing():
-    assert load(jerlov="")[2]["attenuation"] == "0.3"

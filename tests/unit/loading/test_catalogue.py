@@ -35,10 +35,6 @@ def folder(tmp_path, monkeypatch):
     return folder
 
 
-def test_names_leave_out_parts(folder):
-    assert catalogue.scene_names() == ["fig09", "fig10"]
-
-
 def test_path_of_name_and_of_file(folder, tmp_path):
     assert catalogue.scene_path("fig09") == folder / "fig09.xml"
     own = tmp_path / "own.xml"
@@ -60,31 +56,10 @@ def test_unknown_scene(folder, name, sentence):
         catalogue.scene_path(name)
 
 
-def test_folder_is_no_scene(folder):
-    with pytest.raises(UserError, match="is a folder"):
-        catalogue.scene_path(folder)
-
-
-def test_summary_and_parameters(folder):
-    assert catalogue.scene_summary("fig09") == "Flat bottom at 8 m, wind 3 m/s."
-    assert catalogue.scene_summary("fig10") == ""
-    assert catalogue.scene_parameters("fig09") == {"wind_speed": "3", "bottom_depth": "8.0", "profile": "profile.csv"}
-    assert list(catalogue.scene_parameters(folder / "fig09.xml")) == ["wind_speed", "bottom_depth", "profile"]
-
-
 def test_first_default_wins_as_in_mitsuba(folder):
     twice = '<default name="wind_speed" value="3"/><default name="wind_speed" value="4"/>'
     (folder / "twice.xml").write_text(f'<scene version="3.0.0">{twice}</scene>')
     assert catalogue.scene_parameters("twice") == {"wind_speed": "3"}
-
-
-def test_text_that_is_no_xml_or_no_text(folder):
-    (folder / "bad.xml").write_text("<scene>")
-    with pytest.raises(UserError, match=r"scene .*bad.xml is not well-formed XML: .*line 1"):
-        catalogue.scene_parameters("bad")
-    (folder / "bad.xml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UserError, match="not a text file in UTF-8"):
-        catalogue.scene_text("bad")
 
 
 def test_copy_is_one_scene_file_with_the_data_that_it_names(folder, tmp_path):
@@ -94,11 +69,6 @@ def test_copy_is_one_scene_file_with_the_data_that_it_names(folder, tmp_path):
     assert (target / "fig09.xml").read_text() == catalogue.scene_text("fig09")
     assert sorted(path.name for path in target.iterdir()) == ["fig09.xml", "profile.csv", "target.ply"]
     assert catalogue.scene_parameters(target / "fig09.xml") == catalogue.scene_parameters("fig09")
-
-
-def test_copy_to_a_new_name(folder, tmp_path):
-    assert catalogue.copy_scene("fig10", tmp_path / "new.xml") == tmp_path / "new.xml"
-    assert (tmp_path / "new.xml").is_file()
 
 
 def test_copy_overwrites_nothing(folder, tmp_path):
@@ -114,21 +84,6 @@ def test_a_scene_is_not_copied_onto_itself(folder, tmp_path):
     copy = catalogue.copy_scene("fig09", tmp_path)
     with pytest.raises(UserError, match=r"fig09\.xml is the file to be copied: choose another place"):
         catalogue.copy_scene(copy, tmp_path, overwrite=True)
-
-
-def test_copy_into_a_missing_folder(folder, tmp_path):
-    with pytest.raises(UserError, match=r"cannot write .*missing.*No such file"):
-        catalogue.copy_scene("fig10", tmp_path / "missing" / "a.xml")
-
-
-@pytest.mark.slow
-def test_shipped_scenes_are_found_and_described():
-    names = catalogue.scene_names()
-    assert "fig09_2x2" in names
-    for name in names:
-        assert catalogue.scene_path(name).is_file()
-        assert catalogue.scene_summary(name), name
-        catalogue.scene_parameters(name)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])

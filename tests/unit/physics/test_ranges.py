@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.clear_sky import background_power, clear_sky_irradiance
@@ -164,7 +165,7 @@ RANGES = [
 ]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("function", "arguments", "name"),
     [
         pytest.param(function, {**valid, name: value}, name, id=f"{function.__qualname__} {name}")

@@ -20,21 +20,6 @@ def test_codes_near_nothing_are_not_drawn():
         assert drawn[20:45].all()
 
 
-@pytest.mark.slow
-def test_one_parameter_and_few_runs():
-    one = campaign().isel(run=slice(0, 3))
-    one.attrs["inputs"] = {"bottom_depth": "bottom_depth"}
-    assert len(plot_campaign(one).axes[0].lines) == 3
-
-
-@pytest.mark.slow
-def test_every_shot_of_a_run_is_a_record():
-    made = campaign()
-    each = ("status", "error_median", *made.attrs["inputs"])
-    shots = made.expand_dims(shot=2, axis=1).assign({name: made[name] for name in each})
-    assert len(plot_campaign(shots).axes[0].lines) == 12
-
-
 def test_nothing_to_draw(tmp_path):
     made = campaign()
     with pytest.raises(UserError, match="no run that is done"):

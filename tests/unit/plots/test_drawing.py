@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
@@ -55,18 +56,12 @@ def test_images_are_pictures_taken_from_the_lidar_in_any_order_of_their_pixels()
     assert places[0, 1] > places[2, 1]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("largest", "factor", "prefix"),
     [(3.2e-6, 1e-6, "µ"), (999.0, 1.0, ""), (1000.0, 1e3, "k"), (2e-21, 1e-18, "a"), (5e12, 1e9, "G"), (0.0, 1.0, "")],
 )
 def test_prefixes_scale_to_between_1_and_1000(largest, factor, prefix):
     assert drawing.si_prefix(largest) == (pytest.approx(factor, rel=1e-12, abs=0), prefix)
-
-
-@pytest.mark.parametrize(("count", "distinct"), [(1, 1), (3, 3), (4, 4), (10, 10), (40, 40)])
-def test_colours_of_pixels_differ(count, distinct):
-    colours = drawing.pixel_colours(count)
-    assert len(colours) == len({tuple(colour) for colour in colours}) == distinct
 
 
 def test_bands_end_at_the_lowest_value():
@@ -79,7 +74,7 @@ def test_bands_end_at_the_lowest_value():
     np.testing.assert_array_equal(ax.collections[0].get_facecolor()[0, :3], [1, 0, 0])
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("attributes", "limits"),
     [
         # 6 % of the window of 50 ns on both sides, within the record.
@@ -95,14 +90,6 @@ def test_time_limits_contain_the_window_of_the_echoes(attributes, limits):
     assert drawing.time_limits(record) == pytest.approx(limits)
 
 
-@pytest.mark.parametrize(
-    ("attributes", "name"),
-    [({}, ""), ({"scene": "a/table1.xml"}, "table1"), ({"scene": "sea", "instrument": "eaarl"}, "sea, eaarl")],
-)
-def test_titles_name_scene_and_instrument(attributes, name):
-    assert drawing.scene_name(attributes) == name
-
-
 def test_figures_replace_a_file_only_on_success(tmp_path):
     path = tmp_path / "a.png"
     path.write_text("before")
@@ -114,19 +101,3 @@ def test_figures_replace_a_file_only_on_success(tmp_path):
     assert (path.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
         drawing.new_figure(tmp_path / "a.gif", 2.0, 1.0)
-
-
-@pytest.mark.slow
-def test_saved_picture_is_that_of_matplotlib(tmp_path):
-    def drawn():
-        figure = drawing.new_figure(None, 3.0, 2.0)
-        ax = figure.subplots()
-        ax.plot([0, 1], [1e-3, 10])
-        ax.set(yscale="log", xlabel="time (ns)")
-        drawing.add_top_axis(ax, 1.0, 2.0, "depth (m)")
-        return figure
-
-    drawn().savefig(tmp_path / "expected.png", dpi=160)
-    figure = drawing.save(drawn(), tmp_path / "saved.png")
-    assert (tmp_path / "saved.png").read_bytes() == (tmp_path / "expected.png").read_bytes()
-    assert figure.dpi == drawn().dpi

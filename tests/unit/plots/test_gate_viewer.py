@@ -86,26 +86,6 @@ def test_page_of_waveforms(scene, tmp_path):
     assert metadata["shapes"] is None
 
 
-def test_page_of_a_record_of_a_gated_scene(scene, tmp_path):
-    """A record that still has the coordinates of the gates, of another number than its bins."""
-    of_gates = {name: one for name, one in scene[0].coords.items() if one.dims == ("gate",)}
-    gated = numbered(scene[1]).assign_coords({"gate": np.arange(GATES), **of_gates})
-    write_page(gated.rename(waveform="signal", waveform_stderr="signal_mean_stderr"), tmp_path / "page.html")
-    assert len(embedded(tmp_path / "page.html")[0]["gate_start"]) == BINS
-
-
-def test_large_pages_of_waveforms_show_means(scene, tmp_path):
-    result = numbered(scene[1])
-    path = tmp_path / "page.html"
-    write_page(result, path)
-    letters = sum(embedded(path)[2].values())
-    write_page(result, path, limit_mb=(path.stat().st_size - 0.6 * letters + 8000) / 1e6)
-    metadata, arrays, _ = embedded(path)
-    assert (metadata["block"], metadata["waveform"]["block"]) == (2, 1)
-    assert (metadata["rows"], metadata["columns"]) == (ROWS // 2, -(-COLUMNS // 2))
-    np.testing.assert_allclose(arrays["waveform"], means(result["waveform"], 2).ravel(), rtol=1e-6)
-
-
 def test_page_of_a_series_shows_the_mean_of_its_shots(scene, tmp_path):
     one = numbered(scene[1])
     series = xr.concat([one, 3 * one, 2 * one], "shot").assign_coords(shot=[0, 1, 2])
@@ -116,22 +96,6 @@ def test_page_of_a_series_shows_the_mean_of_its_shots(scene, tmp_path):
     np.testing.assert_allclose(arrays["waveform"], 2 * one["waveform"].values.ravel(), rtol=1e-6)
     errors = np.sqrt(1 + 9 + 4) / 3 * one["waveform_stderr"].values.ravel()
     np.testing.assert_allclose(arrays["waveform_stderr"], errors, rtol=1e-6)
-
-
-def test_pixels_with_outlines_have_shapes(scene, tmp_path):
-    lines = [[[-1.0, 2.0, 3.0, 2.0, 3.0, 0.0]], [[-2.0, -1.0, 0.0, -1.0, 0.0, 0.0]]]
-    result = scene[1].isel(row=0, column=[0, 1]).rename(column="pixel").assign_coords(pixel=["a", "b"])
-    result = result.assign_attrs(pixel_outlines=json.dumps(lines))
-    write_page(result, tmp_path / "page.html")
-    metadata, _, _ = embedded(tmp_path / "page.html")
-    assert metadata["shapes"] == lines
-    # From angle_x = -2 to 3 and angle_y = -1 to 2, with a margin of 3 % of the larger side.
-    axes = metadata["axes"]
-    assert (axes["top"], axes["left"]) == pytest.approx((3.15, 2.15))
-    assert (axes["along"], 2 * axes["across"]) == pytest.approx((5.3, -3.3))
-    # Without the outline of one pixel, all are drawn side by side.
-    write_page(result.assign_attrs(pixel_outlines=json.dumps(lines[:1])), tmp_path / "page.html")
-    assert embedded(tmp_path / "page.html")[0]["shapes"] is None
 
 
 def test_page_contains_all_data(scene, tmp_path):
@@ -151,18 +115,6 @@ def test_page_contains_all_data(scene, tmp_path):
     assert axes["left"] + axes["across"] / 2 == pytest.approx(2)
     assert (axes["along"], axes["across"]) == pytest.approx((6 / 29, -4 / 20))
     assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
-
-
-def test_page_contains_the_lines_of_sight(scene, tmp_path):
-    path = tmp_path / "page.html"
-    shape = (ROWS, COLUMNS)
-    times = 1420 + np.arange(ROWS * COLUMNS).reshape(shape) / 64
-    dims = ("row", "column")
-    stack = scene[0].assign_coords(surface_time=(dims, times), depth_per_ns=(dims, np.full(shape, 0.1)))
-    write_page(stack, path)
-    _, arrays, _ = embedded(path)
-    np.testing.assert_array_equal(arrays["surface_time"], times.ravel().astype(np.float32))
-    assert (arrays["depth_per_ns"] == np.float32(0.1)).all()
 
 
 def test_large_pages_show_means(scene, tmp_path, caplog):
@@ -198,29 +150,6 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
         assert len(notes) == (block > 1) + (waveform_block > 1)
         assert all(f"{limit:g} MB" in note for note in notes)
         assert [record.getMessage() for record in caplog.records] == [f"the page: {note}" for note in notes]
-
-
-def test_waveforms_are_left_out_where_pixels_form_no_image(scene, tmp_path):
-    stack, result = (data.isel(row=0).rename(column="pixel").drop_vars("row", errors="ignore") for data in scene)
-    names = [f"pixel {i}" for i in range(COLUMNS)]
-    stack, result = (data.assign_coords(pixel=names) for data in (stack, result))
-    path = tmp_path / "page.html"
-    write_page(stack, path, result)
-    whole, letters = path.stat().st_size, embedded(path)[2]
-    write_page(stack, path, result, (whole - letters["waveform"] + 8000) / 1e6)
-    metadata, arrays, _ = embedded(path)
-    assert metadata["names"] == names
-    assert set(arrays) == {"gate_energy", "gate_energy_stderr"}
-    assert len(metadata["notes"]) == 1
-    assert metadata["notes"][0].startswith("The waveforms were left out, because the page would have exceeded")
-    with pytest.raises(UserError, match="is too small for this stack"):
-        write_page(stack, path, result, (whole - sum(letters.values())) / 1e6)
-
-
-def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
-    both = scene[0].merge(scene[1])
-    write_page(both, tmp_path / "page.html")
-    assert (embedded(tmp_path / "page.html")[1]["waveform"] == scene[1]["waveform"].values.ravel().astype("f4")).all()
 
 
 @pytest.mark.parametrize(
@@ -269,3 +198,11 @@ def test_page_is_self_contained(scene, tmp_path):
     assert "default-src 'none'" in page
     assert not re.search(r"\b(eval|innerHTML|import|fetch)\b", page)
     assert '<script>\n"use strict";' in page
+
+
+def test_page_of_a_record_of_a_gated_scene(scene, tmp_path):
+    """A record that still has the coordinates of the gates, of another number than its bins."""
+    of_gates = {name: one for name, one in scene[0].coords.items() if one.dims == ("gate",)}
+    gated = numbered(scene[1]).assign_coords({"gate": np.arange(GATES), **of_gates})
+    write_page(gated.rename(waveform="signal", waveform_stderr="signal_mean_stderr"), tmp_path / "page.html")
+    assert len(embedded(tmp_path / "page.html")[0]["gate_start"]) == BINS

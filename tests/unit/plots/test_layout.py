@@ -1,18 +1,12 @@
 """Figure of a layout: positions on the sea, colours and labels."""
 
-import json
-
 import mitsuba as mi
 import numpy as np
 import pytest
-from command_line import run
 from figure_inputs import result
-from matplotlib.image import imread
 from matplotlib.patches import PathPatch
 
-from mitransient_lidar import results
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.layout import axis_points, plot_layout
+from mitransient_lidar.plots.layout import plot_layout
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -32,19 +26,6 @@ def on_sea(angle_x_mrad):
 def patches(figure):
     """Return the filled shapes of the pixels."""
     return [patch for patch in figure.axes[0].patches if isinstance(patch, PathPatch)]
-
-
-def test_targets_beside_the_view_are_drawn_whole(lidar_scene):
-    target = {"id": "plate", "z": [-1.0, -1.0], "line": [2, -6, 8, -6, 8, 6, 2, 6], "seen": [2, -6, 8, -6, 8, 6, 2, 6]}
-    figure = plot_layout(result(**described(lidar_scene()), target_outlines=json.dumps([target])))
-    ax = figure.axes[0]
-    left, right = ax.get_xlim()
-    low, high = ax.get_ylim()
-    assert left > 6
-    assert right < -6
-    # The view reaches 3.4 m from the shot.
-    assert low < -3.4
-    assert high > 8
 
 
 def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
@@ -87,66 +68,3 @@ def test_pixels_and_beam_are_drawn_at_the_depths_of_target_and_bottom(lidar_scen
     (shadow,) = (patch for patch in figure.axes[2].patches if patch.get_label() == "shadow of target")
     vertices = shadow.get_path().vertices
     assert 0.5 * (vertices[:, 1].min() + vertices[:, 1].max()) == pytest.approx(1.5 + 2.112 * 2 / 8, abs=0.05)
-
-
-def test_axes_of_receiver_and_laser_are_printed(lidar_scene):
-    """A laser that looks 0.5 m beside the receiver's axis has a point of its own on every plane."""
-    attributes = described(lidar_scene(tx={"aim_y": 0.5}))
-    assert axis_points(result(**attributes)) == [
-        "mean sea level: axis at (0.000, 0.000, 0.000) m, laser at (0.000, 0.500, 0.000) m",
-        "bottom: axis at (2.112, 0.000, -8.000) m, laser at (2.112, 0.500, -8.000) m",
-    ]
-    assert len(axis_points(result(**described(lidar_scene())))[0].split(",")) == 3
-
-
-@pytest.mark.slow
-def test_many_targets_share_three_planes(lidar_scene):
-    heights = (-1.0, -1.02, -2.0, -5.0, -5.5, -7.0)
-    extra = {f"b{i}": {"type": "sphere", "center": [0, 0, z], "radius": 0.2} for i, z in enumerate(heights)}
-    names = [line.split(":")[0] for line in axis_points(result(**described(lidar_scene(extra=extra))))]
-    assert names == ["mean sea level", "depth of b0, b1, b2", "depth of b3, b4", "depth of b5", "bottom"]
-
-
-@pytest.mark.slow
-def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
-    attributes = described(lidar_scene(extra={"ball": {"type": "sphere", "center": [0, 0, -6], "radius": 0.5}}))
-    drawn = []
-    for suffix in (".nc", ".exr"):
-        results.save(result(**attributes), tmp_path / f"a{suffix}")
-        done = run("view", tmp_path / f"a{suffix}", "--layout", "--overwrite")
-        assert done.exit_code == 0
-        assert done.stdout.splitlines() == [
-            str(tmp_path / "a_layout.png"),
-            "mean sea level: axis at (0.000, 0.000, 0.000) m",
-            "depth of ball: axis at (1.584, 0.000, -6.000) m",
-            "bottom: axis at (2.112, 0.000, -8.000) m",
-        ]
-        drawn.append(imread(tmp_path / "a_layout.png"))
-    np.testing.assert_array_equal(*drawn)
-
-
-@pytest.mark.long
-def test_long_texts_are_left_out(lidar_scene, tmp_path):
-    """256 pixels of a circle have outlines that NetCDF could not keep together with other attributes."""
-    attributes = described(lidar_scene(rx={"layout": "16x16", "imager": False}))
-    assert all(len(value) <= 60_000 for value in attributes.values())
-    results.save(result(**attributes), tmp_path / "a.nc")
-    assert "pixel_outlines" not in described(lidar_scene(rx={"layout": "20x20", "imager": False}))
-
-
-def test_invalid_results_are_rejected(tmp_path):
-    nowhere = result()
-    del nowhere.attrs["altitude"]
-    with pytest.raises(UserError, match="no altitude and off_nadir_deg among its attributes"):
-        plot_layout(nowhere)
-    with pytest.raises(UserError, match=r"off_nadir_deg = 100 must lie between 0 and 89\.9"):
-        plot_layout(result(off_nadir_deg=100.0))
-    upwards = {f"{name}_pose": [0.0, 0, 200, 0, 0, 1, 1, 0, 0, 0, -1, 0] for name in ("receiver", "transmitter")}
-    with pytest.raises(UserError, match="no pixels that look at the sea"):
-        plot_layout(result(**upwards))
-    with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
-        plot_layout(result(), tmp_path / "a.txt")
-    results.save(result(), tmp_path / "a.nc")
-    done = run("view", tmp_path / "a.nc", "--layout", "--log")
-    assert done.exit_code == 2
-    assert "--layout does not go with --log or --linear" in done.output

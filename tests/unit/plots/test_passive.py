@@ -1,12 +1,10 @@
 """Animations of images by daylight."""
 
 import numpy as np
-import pytest
-from figure_inputs import few_radiances, frames
+from figure_inputs import frames
 from PIL import Image
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.passive import animate_passive, plot_passive
+from mitransient_lidar.plots.passive import animate_passive
 
 
 def test_animation_shows_the_frames_in_their_time(tmp_path):
@@ -23,14 +21,3 @@ def test_animation_shows_the_frames_in_their_time(tmp_path):
             shown.append(np.asarray(movie.convert("L"))[4::8, 4::8])
     assert shown[0][1, 2] == shown[1][3, 4] == 255
     assert np.corrcoef(shown[2].ravel(), radiances["radiance"][2].values.ravel())[0, 1] > 0.99
-
-
-def test_missing_frames_are_rejected(tmp_path):
-    radiances = frames()
-    with pytest.raises(UserError, match="needs frames of an imager"):
-        animate_passive(few_radiances(), tmp_path / "a.gif")
-    with pytest.raises(UserError, match=r"must end in \.gif"):
-        animate_passive(radiances, tmp_path / "a.png")
-    with pytest.raises(UserError, match="frame = 3 must lie between 0 and 2"):
-        plot_passive(radiances, tmp_path / "a.png", frame=3)
-    assert not list(tmp_path.iterdir())

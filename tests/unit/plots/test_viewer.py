@@ -1,8 +1,5 @@
 """Views of results: files of the command, and frames of notebooks."""
 
-import html
-import os
-import re
 import webbrowser
 from pathlib import Path
 
@@ -10,9 +7,7 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 
-import mitransient_lidar
 from mitransient_lidar import results
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 
@@ -26,23 +21,6 @@ def result():
         pixel_centres_mrad=[[-1.0, 0.0], [1.0, 0.0]],
         attributes={"scene": 'a "quoted" scene'},
     )
-
-
-def test_a_notebook_gets_a_frame_with_the_page(result):
-    view = mitransient_lidar.view(result, height=300)
-    frame = re.fullmatch(
-        r'<iframe sandbox="allow-scripts" srcdoc="([^"]*)" .*height: 300px.*></iframe>', view._repr_html_()
-    )
-    assert html.unescape(frame[1]) == view.page
-    assert view.page.startswith("<!DOCTYPE html>")
-    assert repr(view).startswith('<view of a "quoted" scene, ')
-
-
-def test_a_view_is_saved(result, tmp_path):
-    view = mitransient_lidar.view(result)
-    assert view.save(tmp_path / "page.html").read_text(encoding="utf-8") == view.page
-    with pytest.raises(UserError, match=r"page\.htm: the file name must end in \.html"):
-        view.save(tmp_path / "page.htm")
 
 
 @pytest.fixture
@@ -80,24 +58,3 @@ def test_the_command_refuses_what_it_cannot_show(result, opened, tmp_path):
     assert_refused(run("view", tmp_path / "empty.nc"), "empty.nc")
     assert opened == []
     assert {path.name for path in tmp_path.iterdir()} == {"shot.nc", "empty.nc"}
-
-
-def test_temporary_pages_of_former_calls_are_removed(result, opened, tmp_path):
-    """They once stayed for ever; those of the last hour may have a browser that has not read them."""
-    paths = [Path(run("view", file).stdout.strip()) for file in [saved(result, tmp_path)] * 2]
-    assert all(path.is_file() for path in paths)
-    old = paths[0].stat().st_mtime - 3700
-    os.utime(paths[0].parent, (old, old))
-    (tmp_path / "mine").mkdir()
-    link = tmp_path / "mitransient-lidar-view-link"
-    link.symlink_to(tmp_path / "mine")
-    os.utime(link, (old, old), follow_symlinks=False)
-    paths.append(Path(run("view", tmp_path / "shot.nc").stdout.strip()))
-    assert [path.parent.exists() for path in paths] == [False, True, True]
-    assert (tmp_path / "mine").is_dir()
-
-
-def saved(result, folder):
-    """Write a result, and return its path."""
-    results.save(result, folder / "shot.nc")
-    return folder / "shot.nc"

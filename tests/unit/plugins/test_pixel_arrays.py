@@ -6,18 +6,10 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import assert_same
-
-from mitransient_lidar.transport.sensor.hex_pixels import hexagon_count
+from rows import each_row
 
 BRIGHT = {"sea": {"slope_variance": "0.02"}, "film": {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 7}}
 BRIGHT |= {"integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14}}
-MERGING = {**BRIGHT, "integrator": {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}}
-
-
-def polygon(corners, **more):
-    vertices = ", ".join(f"{angle_x:.9g} {angle_y:.9g}" for angle_x, angle_y in corners)
-    return {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": vertices, **more}
 
 
 @pytest.fixture
@@ -68,23 +60,7 @@ def test_pixels_share_the_light_of_their_area_without_loss(receiver, lidar_scene
     assert np.count_nonzero(together) == together.size
 
 
-@pytest.mark.long
-def test_a_nested_pixel_sees_the_same_alone_and_among_others(lidar_scene, passes):
-    """Others overlap it, contain it, or are far away."""
-    ring = {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 16.0, "inner_mrad": 8.0, "pixel_name": "ring"}
-    others = {
-        "a": {"type": "pixel_fov", "field_of_view_mrad": 30.0, "pixel_name": "all"},
-        "b": {"type": "pixel_fov", "shape": "rectangle", "angle_x_mrad": 5.0, "pixel_name": "box"},
-        "d": polygon([(-14, -14), (-10, -14), (-14, -10)], pixel_name="corner"),
-    }
-    alone = lidar_scene(rx={"c": ring}, **MERGING)
-    among = lidar_scene(rx={"c": ring, **others}, **MERGING)
-    names = among.sensors()[0].receiver.pixels.names
-    assert sorted(names) == ["all", "box", "corner", "ring"]
-    assert_same(passes(among, 12)[:, names.index("ring")], passes(alone, 12, 50)[:, 0], error=0.03)
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("name", "kind"),
     [("map.png", np.uint8), ("map.png", np.uint16), ("map.npy", np.int64), ("map.npy", np.float64), ("map.exr", "f4")],
 )
@@ -100,25 +76,6 @@ def refused(plugin):
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "multipixel_receiver", **plugin})
     return str(caught.value)
-
-
-MAPS = [
-    (np.zeros((4, 4), np.uint8), "map.png", "must have a label other than 0"),
-    (np.array([[0.5, 1]]), "map.npy", "must hold labels that are integers from 0 to 16777216"),
-    (np.array([[-1, 1]]), "map.npy", "must hold labels that are integers"),
-    (np.array([[1, 2**25]]), "map.npy", "must hold labels that are integers"),
-    (np.array([[np.nan, 1]]), "map.npy", "must hold finite numbers"),
-    (np.ones((2, 3, 4)), "map.npy", "has the shape (2, 3, 4): it must have rows and columns"),
-    (np.ones(3), "map.npy", "has the shape (3,)"),
-    (np.array([["a"]]), "map.npy", "must hold real numbers"),
-    (np.arange(1, 2**20 + 3).reshape(2, -1), "map.npy", "has 1048578 labels; allowed are at most 1048576"),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("values", "name", "message"), MAPS)
-def test_images_that_are_no_maps_are_refused(png, values, name, message):
-    assert message in refused({"pixel_map": png(values, name)})
 
 
 def test_files_that_are_no_images_are_refused(tmp_path):
@@ -139,16 +96,3 @@ def test_images_that_are_no_point_spread_functions_are_refused(png):
     for values in (np.zeros((3, 3)), np.array([[1.0, -0.1]])):
         message = refused({"blur_file": png(values, "psf.npy"), "blur_file_mrad": 3.0})
         assert "must hold values that are not negative and not all 0" in message
-
-
-@pytest.mark.parametrize("rings", range(6))
-def test_numbers_of_hexagons(rings):
-    assert hexagon_count(f"hex{1 + 3 * rings * (rings + 1)}") == 1 + sum(6 * ring for ring in range(rings + 1))
-
-
-@pytest.mark.long
-def test_the_largest_arrays_load():
-    """590 rings; the next one would be above 2^20 pixels."""
-    pixels = mi.load_dict({"type": "multipixel_receiver", "layout": "hex1046071"}).receiver.pixels
-    assert pixels.count == len(pixels.centres()) == 1046071
-    assert "hex1049617" in refused({"layout": "hex1049617"})

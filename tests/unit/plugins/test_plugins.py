@@ -8,6 +8,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import scenes, variants
@@ -90,9 +91,7 @@ REFUSED = {
         ({"shape": "polygon", "vertices_mrad": "0 0, 6 0, 6 4, 4 4, 4 0, 2 0, 2 4, 0 4"}, "nor touch or overlap"),
         ({"shape": "strip", "angle_x_min_mrad": 5.0, "angle_x_max_mrad": 4.0}, "angle_x_max_mrad = 4 must lie"),
     ],
-    "time_gated_film": [
-        ({"bin_count": 10.5}, "bin_count = 10.5 must be an integer"),
-    ],
+    "time_gated_film": [({"bin_count": 10.5}, "bin_count = 10.5 must be an integer")],
     "ocean_surface": [
         ({"surface_seed": "x"}, "surface_seed = 'x' must be an integer"),
         ({"slope_variance": "some"}, "slope_variance = 'some' must be"),
@@ -142,18 +141,12 @@ REFUSED = {
             "blur_file = 'none.npy': cannot read none.npy: No such file or directory",
         ),
     ],
-    "sky": [
-        ({"a": {"type": "homogeneous"}}, "sky: a medium inside it would have no effect"),
-    ],
-    "lidar_volpat": [
-        ({}, "lidar_volpat"),
-    ],
+    "sky": [({"a": {"type": "homogeneous"}}, "sky: a medium inside it would have no effect")],
+    "lidar_volpat": [({}, "lidar_volpat")],
 }
 
 
-@pytest.mark.parametrize(
-    ("plugin", "given", "message"), [(plugin, *row) for plugin, rows in REFUSED.items() for row in rows]
-)
+@each_row(("plugin", "given", "message"), [(plugin, *row) for plugin, rows in REFUSED.items() for row in rows])
 def test_invalid_parameters_are_named_in_one_sentence(plugin, given, message):
     with pytest.raises(UserError, match=re.escape(message)) as caught, scenes.as_user_error():
         mi.load_dict({"type": plugin, **given})
@@ -263,37 +256,6 @@ def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
     loaded = scene(**parts)
     with pytest.raises(ValueError, match=message):
         find_lidar_scene(loaded, loaded.sensors()[0])
-
-
-def test_users_bsdf_wins_and_ripples_take_the_waters_index():
-    own = scene(sea={**FLAT, "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
-    (surface,) = (s for s in own.shapes() if hasattr(s, "sea"))
-    assert not surface.has_ripples
-    water = {"type": "layered_water", "refractive_index": 1.25}
-    loaded = scene(sea={**FLAT, "interior": water})
-    indices = [float(value[0]) if hasattr(value, "__len__") else float(value)
-               for key, value in mi.traverse(loaded) if key.endswith(".eta")]  # fmt: skip
-    assert indices == [pytest.approx(1.25)]
-
-
-def test_no_wind_is_a_flat_sea():
-    (surface,) = (s for s in scene(sea={"type": "ocean_surface", "wind_speed": 0.0,
-                  "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "sea"))  # fmt: skip
-    assert surface.bbox().max.z == surface.bbox().min.z == 0
-    assert surface.sea.spectrum == "flat"
-
-
-def test_other_integrators_see_the_layers():
-    """Mitsuba's volumetric path tracers use null collisions up to the largest attenuation."""
-    water = mi.load_dict(
-        {"type": "layered_water", "layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.6, 0.2"}
-    )
-    mei = mi.MediumInteraction3f()
-    mei.p = mi.Point3f(0, 0, mi.Float([-1.0, -4.0]))
-    scattering, null, total = (np.array(c).ravel() for c in water.get_scattering_coefficients(mei))
-    np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
-    np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
-    np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("scattering", [0.004, "0.004, 0.1", 0.0])

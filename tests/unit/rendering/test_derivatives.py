@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -27,14 +28,6 @@ def renderer():
     return choose_integrator(session.scene, FEW).prepare(session.scene, session.sensor)
 
 
-def test_a_coefficient_stands_for_all_layers(renderer):
-    found = path_parameters(renderer, ["attenuation", "bottom_reflectance", "scattering[0]"])
-    assert [one.name for one in found] == ["attenuation[0]", "attenuation[1]", "bottom_reflectance", "scattering[0]"]
-    assert [one.value for one in found] == pytest.approx([0.5, 0.3, 0.1, 0.3])
-    assert [one.units for one in found] == ["1/m", "1/m", "1", "1/m"]
-    assert {one.method for one in found} == {"score"}
-
-
 def test_layers_of_equal_water_stay_apart():
     """Layers of equal properties are traced as one, and differentiated each by itself."""
     session = open_scene(
@@ -45,7 +38,7 @@ def test_layers_of_equal_water_stay_apart():
     assert len(path_parameters(renderer, "scattering")) == 2
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("names", "message"),
     [
         (["atenuation"], r"derivatives = 'atenuation' must be one of attenuation\[0\], .*did you mean attenuation"),
@@ -61,14 +54,6 @@ def test_layers_of_equal_water_stay_apart():
 def test_unknown_names_are_refused(renderer, names, message):
     with pytest.raises(UserError, match=message):
         path_parameters(renderer, names)
-
-
-@pytest.mark.parametrize("water", [{"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9}])
-def test_backscattering_without_influence_is_refused(lidar_scene, water):
-    scene = lidar_scene(integrator=FEW, water=water)
-    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    with pytest.raises(UserError, match="backscattering: the light does not depend on it"):
-        path_parameters(renderer, ["backscattering"])
 
 
 @pytest.mark.parametrize("phase_g", [0.0, 0.02, -0.3])
@@ -108,7 +93,8 @@ def test_phase_functions_stay_normalised(renderer):
 @pytest.mark.slow
 def test_results_with_derivatives(tmp_path):
     """Waveforms are those without derivatives; a file holds all, and is rendered again to the same bits."""
-    options = {"params": LAYERS, "passes": 4, "seed": 5, "integrator": FEW}
+    few = {"type": "lidar_volpath", "paths_per_pass": 1024}
+    options = {"params": LAYERS, "passes": 4, "seed": 5, "integrator": few}
     names = ["attenuation[0]", "bottom_depth", "bottom_reflectance"]
     shot = mitransient_lidar.render("table1", derivatives=names, **options)
     plain = mitransient_lidar.render("table1", **options)

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
@@ -47,28 +46,6 @@ def test_outlines_enclose_the_areas_of_the_pixels(lidar_scene):
     assert abs(sum(enclosed_area(line) for line in outlines)) == pytest.approx(ring, rel=3e-3)
 
 
-def test_arcs_are_smooth_and_texts_short(lidar_scene):
-    text = described(lidar_scene(rx={"layout": "1x1"}))["pixel_outlines"]
-    ((line,),) = lines(text)
-    np.testing.assert_allclose(np.hypot(*line.T), HALF, rtol=1e-3)
-    chords = np.hypot(*np.diff(line, axis=0).T)
-    assert chords.max() < 2.5  # the sagitta of such a chord is a thousandth of the diameter
-    assert len(text) < 2500
-
-
-def test_beam_outlines_are_where_the_irradiance_says(lidar_scene):
-    shape = {"divergence_mrad": 12.0, "divergence_across_mrad": 4.0, "ellipse_deg": 90.0}
-    rim, outer = json.loads(described(lidar_scene(tx=shape))["beam_outlines"])
-    for outline, share, scale in ((rim, np.exp(-0.5), 1), (outer, np.exp(-2), 2)):
-        assert outline["share"] == pytest.approx(share, abs=1e-4)
-        (line,) = lines(json.dumps([outline["lines"]]))[0]
-        # Turned by 90 degrees: the long axis, half of 12 mrad, lies along angle_y.
-        np.testing.assert_allclose(np.hypot(line[:, 0] / 2, line[:, 1] / 6), scale, rtol=5e-3)
-    (edge,) = json.loads(described(lidar_scene(tx={"beam_profile": "top_hat"}))["beam_outlines"])
-    assert edge["share"] == 1
-    np.testing.assert_allclose(np.hypot(*np.reshape(edge["lines"][0], (-1, 2)).T), 5, rtol=1e-3)
-
-
 def test_targets_are_described_and_bottoms_are_not(lidar_scene, tmp_path):
     turn = mi.ScalarTransform4f().translate([0.5, 1, -5]).rotate([0, 0, 1], 45).scale(float(np.sqrt(0.5)))
     extra = {
@@ -97,14 +74,6 @@ def test_targets_are_described_and_bottoms_are_not(lidar_scene, tmp_path):
     np.testing.assert_allclose([by_depth[-6.75].min(axis=0), by_depth[-6.75].max(axis=0)], [[0.5, -2], [1.5, 0]])
 
 
-def test_upright_plate_is_a_line(lidar_scene):
-    upright = mi.ScalarTransform4f().translate([0, 0, -6]).rotate([1, 0, 0], 90)
-    extra = {"plate": {"type": "rectangle", "to_world": upright}}
-    (target,) = json.loads(described(lidar_scene(extra=extra))["target_outlines"])
-    np.testing.assert_allclose(np.sort(np.unique(np.reshape(target["line"], (-1, 2))[:, 0])), [-1, 1], atol=1e-3)
-    np.testing.assert_allclose(target["z"], [-7, -5], atol=1e-3)
-
-
 def traced_axis(scene):
     """Return where the receiver's axis meets the sea and then a solid, with the scene's own facets and normals [m]."""
     lidar = find_lidar_scene(scene, scene.sensors()[0])
@@ -129,15 +98,6 @@ def test_bottom_point_is_where_a_ray_through_the_scene_ends(lidar_scene, pose, b
     _, expected = traced_axis(scene)
     assert expected[2] < -5
     np.testing.assert_allclose(described(scene)["bottom_point"], expected, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_axis_passes_targets_on_its_way_to_the_bottom(lidar_scene):
-    extra = {"ball": {"type": "sphere", "center": [1.5, 0, -6], "radius": 0.5}}
-    scene = lidar_scene(extra=extra)
-    assert traced_axis(scene)[1][2] > -6
-    np.testing.assert_allclose(described(scene)["bottom_point"], [2.1119, 0, -8], atol=1e-3)
-    assert "bottom_point" not in described(lidar_scene(bottom=None))
 
 
 def test_bottom_is_every_wide_solid_and_no_other(lidar_scene):
@@ -171,26 +131,6 @@ def test_index_layers_bend_the_axis(lidar_scene):
     sines = np.sin(np.radians(20)) / np.array([1.334, 1.6])
     expected = float(np.array([3.0, 5.0]) @ np.tan(np.arcsin(sines)))
     np.testing.assert_allclose(attributes["bottom_point"], [expected, 0, -8], atol=1e-3)
-
-
-def test_targets_are_seen_and_shadowed_along_refracted_rays(lidar_scene):
-    """A level plate: its corners cross the sea and end on the bottom as single rays do."""
-    low, high = np.array([1.0, -0.5]), np.array([2.0, 0.5])
-    plate = mi.ScalarTransform4f().translate([1.5, 0, -6]).scale(0.5)
-    laser = {"aim_x": 1.0}
-    extra = {"plate": {"type": "rectangle", "to_world": plate}}
-    (target,) = json.loads(described(lidar_scene(tx=laser, extra=extra))["target_outlines"])
-    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    for name, aim in (("seen", 0.0), ("shadow", 1.0)):
-        offset = corners - [aim - 200 * np.tan(np.radians(20)), 0]
-        distance = np.linalg.norm(offset, axis=1)
-        theta, phi = refracted_path(distance, 200.0, 6.0, 1.34)
-        reach = 200 * np.tan(theta) + (0 if name == "seen" else 8) * np.tan(phi)
-        expected = [aim - 200 * np.tan(np.radians(20)), 0] + offset * (reach / distance)[:, None]
-        line = np.reshape(target[name], (-1, 2))
-        for corner in expected:
-            assert np.hypot(*(line - corner).T).min() < 1e-3
-    assert target["id"] == "plate"
 
 
 def test_targets_belong_to_the_view_at_their_depth(lidar_scene):

@@ -52,14 +52,6 @@ def test_a_wide_pixel_looks_where_its_light_is(lidar_scene):
     np.testing.assert_allclose(found.beam_share, 0.25, rtol=2e-3)
 
 
-def test_pixels_beside_a_narrow_beam_have_no_share(lidar_scene):
-    found, lidar = sights(lidar_scene, tx={"divergence_mrad": 0.5}, rx={"layout": "hex7", "field_of_view_mrad": 30})
-    assert found.beam_share[3] == pytest.approx(1, abs=1e-6)
-    assert np.delete(found.beam_share, 3).max() < 1e-9
-    # Without light, a pixel looks along its centre.
-    np.testing.assert_allclose(np.delete(found.sight_x, 3), np.delete(lidar.receiver.pixels.centres()[:, 0], 3))
-
-
 @pytest.mark.parametrize("place", [(-50.0, 25.0, 190.0), (10.0, -30.0, 240.0)])
 def test_laser_and_receiver_apart(lidar_scene, place):
     """A pencil beam, seen by a wide pixel elsewhere: paths of least time from the points that it lights."""
@@ -87,15 +79,3 @@ def test_laser_and_receiver_apart(lidar_scene, place):
         air, water = bend(crossing if depth else 0.0)
         expected = METRE * (out + air + GROUP * water)
         assert found.surface_time[0] + depth / found.depth_per_ns[0] == pytest.approx(expected, abs=0.02)  # 2 mm
-
-
-@pytest.mark.slow
-def test_overlapping_pixels_all_have_their_light(lidar_scene):
-    """Two concentric circles of 8 and 16 mrad about a beam of 5 mrad: 1 - exp(-r^2 / 2) of its light each."""
-    fields = {
-        name: {"type": "pixel_fov", "pixel_name": name, "shape": "circle", "field_of_view_mrad": 2 * radius}
-        for name, radius in (("inner", 4.0), ("outer", 8.0))
-    }
-    found, _ = sights(lidar_scene, rx=fields)
-    np.testing.assert_allclose(found.beam_share, 1 - np.exp(-0.5 * np.array([0.8, 1.6]) ** 2), rtol=0.01)
-    np.testing.assert_allclose(np.degrees(found.off_nadir), 20, atol=2e-3)

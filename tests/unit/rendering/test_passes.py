@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import passes
@@ -64,17 +65,7 @@ def test_the_forecast_is_that_of_the_passes_that_follow(monkeypatch, caplog):
     assert "95 % of the bins of lit pixels reached 0.218; the target takes about 100 passes and 218 s" in caplog.text
 
 
-def test_bins_without_light_leave_the_forecast_open(monkeypatch, caplog):
-    clock, reports = Clock(monkeypatch, 1.0), []
-    goal = Goal.from_options(0.1, None, 3, Goal())
-    errors = np.array([0.01, np.inf])
-    log = run_passes(clock.render_pass, goal, seed=0, errors=lambda: errors, progress=reports.append)
-    assert reports[-1].needed_passes is None
-    assert np.isnan(log.needed_s)
-    assert "fewer than 95 % of the bins of lit pixels have received light" in caplog.text
-
-
-@pytest.mark.parametrize(("limit", "expected"), [(1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18)])
+@each_row(("limit", "expected"), [(1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18)])
 def test_no_pass_begins_that_would_end_after_the_time(monkeypatch, limit, expected):
     """The first pass takes 5 s and the others 2 s; two passes are the least."""
     clock = Clock(monkeypatch, 5.0, 2.0)
@@ -95,10 +86,6 @@ def test_empty_passes_end_with_an_error(monkeypatch, goal, ended):
     assert clock.passes == ended
 
 
-def test_numbers_as_texts_are_numbers():
-    assert Goal.from_options("0.1", "5", None, Goal()) == Goal(0.1, 5.0)
-
-
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -109,12 +96,6 @@ def test_numbers_as_texts_are_numbers():
 def test_quantiles_out_of_range_are_refused(options, sentence):
     with pytest.raises(UserError, match=re.escape(sentence)):
         Goal.from_options(*options)
-
-
-def test_a_quantile_alone_applies_to_the_default_goal():
-    default = Goal(target_error=0.03, max_time=300.0)
-    assert Goal.from_options(None, None, None, default, 0.5) == Goal(0.03, 300.0, None, 0.5)
-    assert Goal.from_options(None, None, None, default) is default
 
 
 def test_the_progress_line_names_the_request_and_its_forecast():

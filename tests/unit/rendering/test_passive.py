@@ -1,20 +1,15 @@
 """Pictures by daylight as their user makes them: what is returned, files, frames, the command, and mistakes."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
-from PIL import Image
 from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering import passive
 from mitransient_lidar.results import save
 from mitransient_lidar.transport.daylight.renderer import DaylightLight
@@ -122,36 +117,6 @@ def test_a_still_picture():
     assert {"sun_zenith_deg", "sky_irradiance", "passes", "seed", "integrator", "title"} <= set(picture.attrs)
 
 
-@pytest.mark.long
-def test_standard_errors_and_connections():
-    """The path's own directions alone, and together with those towards the sun, have one mean within stated errors."""
-    found = []
-    for samples_emitter in (True, False):
-        engine = mi.load_dict({**PASSIVE, "paths_per_pass": 2**15})
-        engine.options = replace(engine.options, samples_emitter=samples_emitter)
-        found.append(render(scene("1x1"), integrator=engine, passes=12, seed=len(found)))
-    mean, error = ([float(picture[name][0]) for picture in found] for name in ("radiance", "radiance_stderr"))
-    assert abs(mean[1] - mean[0]) < largest_z(12) * np.hypot(*error)
-    assert error[0] < 0.02 * mean[0]
-
-
-@pytest.mark.slow
-def test_blur_leaves_the_mean_and_evens_the_edges():
-    """A bright plate in the air on half of the view: blurred, its neighbours get light."""
-    half = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 50, 1]).scale([50, 50, 1]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.9}}}  # fmt: skip
-    pictures = []
-    for blur in (None, 4.0):
-        parts = no_none(scene(plate=half))
-        parts["rx"] |= {"off_nadir_deg": 0.0, "field_of_view_shape": "square"} | ({"blur_mrad": blur} if blur else {})
-        pictures.append(render(parts, passes=8)["radiance"].mean("row").values)
-    sharp, blurred = pictures
-    # The plate is at +y, on the left.
-    assert sharp[0] > 5 * sharp[2]
-    assert blurred[2] > 1.5 * sharp[2]
-    assert blurred[1] < 0.95 * sharp[1]
-
-
 @pytest.mark.slow
 def test_frames_move_the_sea_and_fill_files(tmp_path):
     pictures = render(frames=2, frame_step_s=0.5, filter_width_nm=1.0)
@@ -195,31 +160,6 @@ def test_daylight_does_not_touch_the_laser():
     np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)
 
 
-@pytest.mark.long
-def test_the_shipped_scene_by_the_command(tmp_path):
-    assert "passive_sea" in catalogue.scene_names()
-    small = ["-D", "layout=8x8", "-D", "surface_refined_size=8", "-D", "surface_cell_size=0.5"]
-    options = ["--passes", "2", "--frames", "2", "--filter-width-nm", "1", "-o", str(tmp_path / "new")]
-    done = run("passive", "passive_sea", *small, *options)
-    assert done.exit_code == 0, done.output
-    written = [tmp_path / "new" / f"passive_sea_passive{suffix}" for suffix in (".nc", ".exr", ".png", ".gif")]
-    assert done.stdout.splitlines()[:4] == [str(path) for path in written]
-    with Image.open(written[2]) as picture, Image.open(written[3]) as movie:
-        assert (picture.format, movie.format, movie.n_frames, movie.size) == ("PNG", "GIF", 2, (384, 384))
-    assert "mean power of a pixel" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["fig09_1x1", "-q"], "emitters: passive imaging needs a sun or a sky"),
-        (["passive_sea", "-q", "-D", "sun=3"], "parameter 'sun' is not one of scene passive_sea"),
-    ],
-)
-def test_invalid_options_end_with_one_sentence(arguments, message):
-    assert_refused(run("passive", *arguments), message)
-
-
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
@@ -232,14 +172,3 @@ def test_invalid_options_end_with_one_sentence(arguments, message):
 def test_scenes_that_are_refused(parts, message):
     with pytest.raises(UserError, match=message):
         render(scene(**parts))
-
-
-def test_options_that_are_refused():
-    with pytest.raises(UserError, match="frames = 0 must lie between 1"):
-        render(frames=0)
-    with pytest.raises(UserError, match="renders no images by daylight"):
-        render(integrator="lidar_volpath")
-    with pytest.raises(UserError, match="the time of a loaded one cannot be changed"):
-        passive.render_passive(mi.load_dict({"type": "scene", **no_none(scene())}), passes=2, frames=2)
-    with pytest.raises(UserError, match="passive_volpath has no laser"):
-        mitransient_lidar.render(no_none({**scene(), "tx": {"type": "lidar_transmitter"}}), passes=2)

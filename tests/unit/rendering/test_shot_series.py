@@ -7,13 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run, stub
-from few_paths import few_paths
-from same_bits import assert_same_bits
+from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.shots import batches as shot_batches
 from mitransient_lidar.rendering.shots import series as shot_series
 from mitransient_lidar.rendering.shots import truth as shot_truth
@@ -63,8 +60,8 @@ class Beam:
         self.pose = KernelPose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
 
 
-@pytest.mark.parametrize(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])
-@pytest.mark.parametrize("azimuth", [0.0, 0.7])
+@each_row(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])
+@each_row("azimuth", [0.0, 0.7])
 def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth):
     """In closed form the wave is damped by exp(-(k_a^2 s_a^2 + k_c^2 s_c^2)/2); s_c is 5 mrad of 261 m, s_a longer."""
     x, y, across = 3.17, -8.4, 5e-3 * 200 / math.cos(math.radians(40))
@@ -102,21 +99,7 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
         np.testing.assert_array_equal(truth[f"true_{name}"][1], 0)
 
 
-def test_depth_below_the_surface_of_a_wave(lidar_scene, monkeypatch):
-    """The wave of 0.3 m is damped over the footprint in closed form; the beam's standard deviations are 5 mrad."""
-    scene = lidar_scene(integrator={"type": "lidar_merging"})
-    lidar = find_lidar_scene(scene, scene.sensors()[0])
-    monkeypatch.setattr(shot_truth, "sea_of", lambda _: Wave(0.4, 0.0))
-    truth = shot_truth.truth_coordinates(shot_truth.sea_of(scene), lidar, ShotPoses(np.array(PLACES)))
-    along = lidar.transmitter.widest_angular_spread * 200 / math.cos(math.radians(20)) ** 2
-    x = np.array(PLACES)[:, 0]
-    heights = 0.3 * math.exp(-0.5 * (0.4 * along) ** 2) * np.cos(0.4 * x + 0.4)
-    np.testing.assert_allclose(
-        truth["true_bottom_depth_below_surface"][1] - truth["true_bottom_depth"][1], heights, atol=2e-4
-    )
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("water", "depth", "expected"),
     [
         # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
@@ -204,57 +187,6 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
 
 
 @pytest.mark.slow
-def test_time_bins_that_leave_out_light_are_refused(rendered):
-    own = shot_series.render_shots("fig09_2x2", {**FLAT, "bottom_depth": 4}, positions=[(0, 0)])
-    with pytest.raises(UserError, match=r"the record of 13\d\d to 1\d\d\d ns leaves out light: it must hold 13\d\d to"):
-        shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0)], axis=results.time_axis(own))
-
-
-@pytest.mark.slow
-def test_seeds_and_instrument_of_a_series(rendered):
-    options = {"positions": PLACES[:2], "passes": 2, "first_seed": 40, "instrument": "teledyne_czmil"}
-    series = shot_series.render_shots("table1", FLAT, **options)
-    again = render_again(series)
-    assert [seed for one in rendered for seed in one["seeds"]] == [40, 41, 40, 41]
-    assert series.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
-
-
-@pytest.mark.slow
-def test_description_of_the_sea_can_be_left_out(rendered):
-    options = {"params": {"surface_size": 60, "surface_cell_size": 1}, "positions": PLACES[:1], "passes": 2}
-    for describe_sea in (True, False):
-        series = shot_series.render_shots("fig09_2x2", describe_sea=describe_sea, **options)
-        assert ("slope_deviation" in series.attrs) == describe_sea
-
-
-@pytest.mark.slow
-def test_series_that_does_not_fit_the_memory(rendered):
-    with pytest.raises(
-        UserError, match=r"^3 shots of 1048576 pixels x 19\d bins, and 3 components of each, take 1\d\d GB of memory"
-    ):
-        shot_series.render_shots("table1", {**FLAT, "layout": "1024x1024"}, positions=PLACES, components=True)
-
-
-@pytest.mark.slow
-def test_places_beside_the_bottom_are_told(rendered, caplog):
-    """The bottom of the scene is a square of 1 km."""
-    series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
-    np.testing.assert_array_equal(series["true_bottom_depth"], [8.0, np.nan])
-    assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
-
-
-@pytest.mark.slow
-def test_random_places_are_those_of_the_seed(rendered):
-    waves = {"surface_size": 60, "surface_cell_size": 1}
-    series = [shot_series.render_shots("fig09_2x2", waves, count=2, seed=seed) for seed in (1, 1, 2)]
-    assert (
-        series[0]["aim_x"].values.tolist() == series[1]["aim_x"].values.tolist() != series[2]["aim_x"].values.tolist()
-    )
-    assert series[0].attrs["places_seed"] == 1
-    assert min(series[0].attrs["slope_deviation"]) > 0
-
-
-@pytest.mark.slow
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
     series = ShotScene("fig13_2x2", params, np.array(PLACES), target=(0.3, 0.0))
@@ -287,90 +219,6 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     assert series.attrs["interrupted"] == 1
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Replace the time [s], which goes on by itself where `step` is not 0."""
-
-    class Clock:
-        now, step = 0.0, 0.0
-
-        def read(self):
-            self.now += self.step
-            return self.now
-
-    made = Clock()
-    monkeypatch.setattr("time.perf_counter", made.read)
-    return made
-
-
-@pytest.mark.slow
-def test_time_is_shared_among_batches_and_ends_a_series(rendered, clock, monkeypatch, caplog):
-    """Each batch of one shot takes 3 s of 10 s, more than its share of what is left."""
-    whole, limits = shot_batches.ShotBatches.limited, []
-
-    def limited(batches, passes, seconds):
-        clock.now += 3.0
-        limits.append(seconds)
-        return whole(batches, passes, seconds)
-
-    monkeypatch.setattr(shot_batches.ShotBatches, "limited", limited)
-    reports = []
-    options = {"positions": [*PLACES, (4, 4), (5, 5)], "max_time": 10.0, "progress": reports.append}
-    series = shot_series.render_shots("fig09_2x2", FLAT, **options)
-    assert limits == pytest.approx([10 / 5, 7 / 4, 4 / 3, 1 / 2])
-    assert [one.remaining_s for one in reports] == pytest.approx([7, 4, 1, 0])
-    assert (series.sizes["shot"], series.attrs["shots"], series.attrs["interrupted"]) == (4, 4, 0)
-    assert "max_time = 10 s ended after 4 of 5 shots" in caplog.text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"target_error": 1e-4, "pass_share": 1.0}, {"passes": 200}])
-def test_time_ends_the_passes_of_a_batch(clock, caplog, tmp_path, options):
-    """A launch takes 1 s and holds 4 passes of an error; the limit of 4 s begins 1 s before the batch."""
-    clock.step = 1.0
-    scene = few_paths("fig09_2x2", tmp_path)
-    params = {**FLAT, "bin_width_ns": 4, "bin_count": 40}
-    first = shot_series.render_shots(scene, params, positions=PLACES[:2], max_time=4.0, **options)
-    assert len(set(first["shot_passes"].values)) == 1
-    assert first["shot_passes"][0] == first.attrs["passes"] < first.attrs["most_passes"]
-    assert first.attrs["most_passes"] == options.get("passes", shot_batches.MOST_PASSES_FOR_ERROR)
-    if "target_error" in options:
-        assert first.attrs["passes"] == 12
-        assert "2 of 2 shots ended before target_error = 0.0001" in caplog.text
-    clock.step = 0.0
-    results.save(first, tmp_path / "a.nc")
-    assert_same_bits(first, render_again(tmp_path / "a.nc"))
-    assert render_again(first, passes=2).attrs["passes"] == 2
-
-
-@pytest.mark.slow
-def test_the_first_batch_has_two_passes_in_any_time(clock, monkeypatch, tmp_path):
-    monkeypatch.setattr(shot_batches, "_BINS", 1)  # one pass in a launch
-    clock.step = 1.0
-    scene, params = few_paths("fig09_2x2", tmp_path), {**FLAT, "bin_width_ns": 4, "bin_count": 40}
-    series = shot_series.render_shots(scene, params, positions=PLACES, passes=200, max_time=0.5)
-    assert series["shot_passes"].values.tolist() == [2]
-
-
-@pytest.mark.slow
-def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
-    whole = shot_batches.ShotBatches.render
-
-    def interrupted(batches, poses, seeds):
-        if seeds[0] == 1:
-            raise KeyboardInterrupt
-        return whole(batches, poses, seeds)
-
-    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
-    (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
-    arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
-    done = run("shots", "fig09_2x2", *arguments)
-    assert done.exit_code == 130
-    assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept."
-    assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
-
-
 @pytest.mark.parametrize(
     ("scene", "options", "message"),
     [
@@ -390,25 +238,3 @@ def test_invalid_input_is_refused_before_rendering(rendered, scene, options, mes
     with pytest.raises(UserError, match=message):
         shot_series.render_shots(scene, FLAT, **options)
     assert not rendered
-
-
-def test_command_mounts_an_instrument(monkeypatch, tmp_path):
-    def asked(scene, **options):
-        raise UserError(f"instrument {options.get('instrument')}")
-
-    stub(monkeypatch, "shots", asked)
-    assert_refused(run("shots", "table1", "--instrument", "riegl_vq840gl", "-o", tmp_path / "a.nc"), "riegl_vq840gl")
-    assert_refused(run("shots", "table1", "-o", tmp_path / "a.nc"), "instrument None")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--at", "1,2", "--places", "a.csv"], "--at and --places are alternatives"),
-        (["--at", "1;2"], "--at = '1;2' must hold numbers only"),
-        (["--places", "missing.csv"], "cannot read missing.csv"),
-        (["-o", "shots.exr"], "--output shots.exr must end in .nc"),
-    ],
-)
-def test_command_refuses_invalid_options(arguments, message):
-    assert_refused(run("shots", "fig09_2x2", *arguments), message)

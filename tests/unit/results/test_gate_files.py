@@ -3,17 +3,14 @@
 import json
 
 import numpy as np
-import OpenEXR
 import OpenImageIO
 import pytest
 import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import exr
-from mitransient_lidar.results.gate_stack import add_gate_derivatives, check_stack
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.gate_stack import check_stack
 
 ATTRIBUTES = {
     "scene": "mine field",
@@ -147,23 +144,6 @@ def test_sequence_is_read_from_its_folder_and_its_first_file(tmp_path):
     xr.testing.assert_identical(results.open(tmp_path), stack)
 
 
-@pytest.mark.slow
-def test_a_thousand_gates_have_four_digits(tmp_path):
-    stack = make(rows=0, columns=2, gates=1000)
-    results.save(stack, tmp_path / "a.exr")
-    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
-        assert [file.parts[k].header["name"] for k in (0, 999)] == ["gate0000", "gate0999"]
-    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
-
-
-def test_one_gate_and_unknown_depth(tmp_path):
-    stack = make(gates=1).drop_vars("gate_depth")
-    results.save(stack, tmp_path / "a.exr")
-    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
-    assert "gateDepthM" not in parts_by_other_reader(tmp_path / "a.exr")[0][0]
-    xr.testing.assert_identical(results.open(save_sequence(stack, tmp_path, "s")[0]), stack)
-
-
 @pytest.mark.parametrize("dim", ["origin", "parameter", "batch"])
 def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
     """As of a render with gates and `components`, `derivatives` or `batches`, whose time bins another file holds."""
@@ -171,17 +151,6 @@ def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
     with_more = make().assign(more).assign_coords({f"{dim}_names": (dim, ["a", "b"])})
     results.save(with_more, tmp_path / "gates.exr")
     xr.testing.assert_identical(results.open(tmp_path / "gates.exr"), make())
-
-
-def test_derivatives_of_gates_need_netcdf(tmp_path):
-    stack = label(make())
-    slopes, errors = np.random.default_rng(3).normal(size=(2, 2, 4, 5, 3))
-    more = add_gate_derivatives(stack, slopes, errors).assign_coords(parameter=["attenuation", "bottom_depth"])
-    for name, kept in (("a.nc", more), ("a.exr", stack)):
-        with_time = more.assign(waveform=(("row", "column", "time"), np.ones((4, 5, 7))))
-        results.save(check_stack(with_time), tmp_path / name)
-        xr.testing.assert_identical(results.open(tmp_path / name), kept)
-    assert more["gate_energy_derivative"].dims == ("parameter", "row", "column", "gate")
 
 
 def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
@@ -199,33 +168,6 @@ def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
     xr.testing.assert_identical(results.open(tmp_path / "b.nc"), more)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda stack: stack.drop_vars("gate_energy_stderr"), "no variable gate_energy_stderr|an EXR file holds"),
-        (lambda stack: stack.rename(row="line"), r"must have the dimensions \(row, column, gate\)"),
-        (lambda stack: stack.isel(gate=slice(0)), "must not be empty"),
-        (lambda stack: stack.drop_vars("gate_width"), r"no coordinate gate_width over \(gate\)"),
-    ],
-)
-def test_other_datasets_are_not_written_as_stacks(tmp_path, change, message):
-    for write in (
-        lambda stack: results.save(stack, tmp_path / "a.exr"),
-        lambda stack: save_sequence(stack, tmp_path, "a"),
-    ):
-        with pytest.raises(UserError, match=message):
-            write(change(make()))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_wrong_names(tmp_path):
-    with pytest.raises(UserError, match="without folders"):
-        save_sequence(make(), tmp_path, "a/b")
-    (tmp_path / "file").write_text("text")
-    with pytest.raises(UserError, match="cannot write"):
-        save_sequence(make(), tmp_path / "file", "a")
-
-
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
 def test_damaged_files_are_rejected(tmp_path, suffix, capfd):
     whole, part = tmp_path / f"whole{suffix}", tmp_path / f"part{suffix}"
@@ -236,23 +178,6 @@ def test_damaged_files_are_rejected(tmp_path, suffix, capfd):
         with pytest.raises(UserError, match=r"part\.\w+ is damaged or truncated"):
             results.open(part)
     assert capfd.readouterr() == ("", "")
-
-
-def test_files_with_other_content(tmp_path):
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((2, 2), np.float32)}) as file:
-        file.write(str(tmp_path / "foreign.exr"))
-    with pytest.raises(UserError, match="not a result of mitransient-lidar"):
-        results.open(tmp_path / "foreign.exr")
-    values = np.ones((1, 4))
-    options = {"pixel_names": ["a"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": {}}
-    waveforms = results.build(values, values, values, values, time=TimeAxis(0, 1, 4), **options)
-    results.save(waveforms, tmp_path / "wave.exr")
-    with pytest.raises(UserError, match=r"wave\.exr holds waveforms of a render, but FILE must have a gate stack"):
-        results.dataset_of("FILE", tmp_path / "wave.exr", "gates")
-    for gates in (1, 3):
-        results.save(make(gates=gates), tmp_path / "gates.exr")
-        with pytest.raises(UserError, match=r"gates\.exr holds a gate stack, but FILE must have waveforms of a render"):
-            results.dataset_of("FILE", tmp_path / "gates.exr", "result")
 
 
 def test_incomplete_sequences_are_rejected(tmp_path, caplog):

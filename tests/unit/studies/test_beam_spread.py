@@ -5,15 +5,10 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-import xarray as xr
-from command_line import run
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.studies.light import plot_beam_spread
-from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
-from mitransient_lidar.transport.plane_crossings import CrossingTracer
-from mitransient_lidar.transport.scene_parts import find_lidar_scene
+from mitransient_lidar.studies.beam_spread import beam_spread
 
 QUICK = {"passes": 2, "photons": 4096}
 
@@ -87,21 +82,6 @@ def test_result(spread):
 
 
 @pytest.mark.slow
-def test_light_at_the_bottom_is_light_just_above_it(lidar_scene):
-    found = beam_spread(lidar_scene(), depths=[7.9, 8.0], **QUICK)
-    above, at = found["transmitted"].values
-    assert 0.97 < at / above < 1
-
-
-@pytest.mark.slow
-def test_seed_decides(lidar_scene):
-    scene = lidar_scene()
-    first, again, other = (beam_spread(scene, depths=5.0, seed=seed, **QUICK)["shift_rms"].item() for seed in (1, 1, 2))
-    assert first == pytest.approx(again, rel=1e-12)
-    assert first != pytest.approx(other, rel=1e-6)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("off_nadir", [0.0, 30.0])
 def test_share_in_view(lidar_scene, off_nadir):
     # Receiver and laser at one point, no scattering, no ripples to speak of: at every depth the view holds of the
@@ -124,94 +104,9 @@ def test_share_in_view(lidar_scene, off_nadir):
     np.testing.assert_allclose(found["transmitted"], found["unscattered"])
 
 
-@pytest.mark.slow
-def test_depths_without_light_are_unknown(lidar_scene):
-    # A plate that is wide enough to take all light, but not the bottom.
-    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(400)}
-    found = beam_spread(lidar_scene(extra={"plate": plate}), depths=[1.0, 4.0], **QUICK)
-    assert found["transmitted"].values[1] == 0
-    assert found["transmitted"].values[0] > 0.5
-    assert np.isnan(found["radius_90"].values[1])
-    assert np.isnan(found["within_delay"].values[1]).all()
-    assert describe_spread(found)[2].split()[-1] == "-"
-    texts = [text.get_text() for text in plot_beam_spread(found).axes[0].get_legend().get_texts()]
-    assert texts[1] == "4 m: no light"
-
-
 def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     scene = lidar_scene(sea={"spectrum": "flat", "size": 2.0}, bottom=4.0)
     found = beam_spread(scene, depths=2.0, **QUICK)
     # Standard deviations of the footprint are 1.064 m across and 1.132 m along, erf(1/(sqrt(2) sigma)) in the patch.
     assert found.attrs["beam_outside_surface"] == pytest.approx(1 - 0.6526 * 0.6230, abs=0.01)
     assert "passes outside it and is left out" in caplog.text
-
-
-@pytest.mark.slow
-def test_more_room_gives_the_same_light(lidar_scene):
-    scene = lidar_scene()
-    system = find_lidar_scene(scene, scene.sensors()[0])
-    tracers = [CrossingTracer(system, np.array([1.0, 3.0, 7.0]), 4096) for _ in range(2)]
-    tracers[1]._legs = 0.1
-    lights = [tracer.trace(4, 0)[0] for tracer in tracers]
-    assert len(lights[0].plane) == len(lights[1].plane) > 4096
-    assert lights[0].weight.sum() == pytest.approx(lights[1].weight.sum(), rel=1e-12)
-
-
-@pytest.mark.slow
-def test_figure(spread, tmp_path):
-    path = tmp_path / "spread.png"
-    figure = plot_beam_spread(spread, path)
-    assert path.read_bytes().startswith(b"\x89PNG")
-    for ax, name, coordinate in zip(
-        figure.axes, ("within_radius", "within_shift", "within_delay"), ("radius", "radius", "delay"), strict=True
-    ):
-        lines = [line for line in ax.lines if line.get_linestyle() != "None"]
-        for rank, line in enumerate(lines):
-            np.testing.assert_allclose(line.get_data(), [spread[coordinate], spread[name][rank]])
-        assert len(lines) == 2
-    dots = [line.get_data() for line in figure.axes[0].lines if line.get_marker() == "o"]
-    np.testing.assert_allclose([x for x, _ in dots], np.stack([spread["radius_50"], spread["radius_90"]], axis=-1))
-    texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert texts == [
-        f"{depth} m: {100 * share:.3g} % in view" for depth, share in zip((2, 8), spread["in_view"].values, strict=True)
-    ]
-    with pytest.raises(UserError, match="must end in"):
-        plot_beam_spread(spread, tmp_path / "spread.txt")
-
-
-@pytest.mark.long
-def test_command(tmp_path):
-    target = tmp_path / "new" / "spread.png"
-    result = run(
-        "beam-spread", "fig09_1x1", "--depths", "5, 2", "-D", "bottom_depth=6", "--passes", 2, "--seed", 3, "-o", target
-    )
-    assert result.exit_code == 0, result.output
-    lines = result.stdout.splitlines()
-    assert lines[:2] == [str(target), str(target.with_suffix(".nc"))]
-    assert lines[2].split()[:4] == ["depth", "(m)", "passes", "(%)"]
-    assert [line.split()[0] for line in lines[3:]] == ["2", "5"]
-    kept = xr.load_dataset(target.with_suffix(".nc"), engine="h5netcdf")
-    assert kept.attrs["seed"] == 3
-    assert kept.attrs["scene.bottom_depth"] == "6"
-    assert f"{100 * kept['in_view'].values[0]:.1f}" in lines[3]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--depths", "2;5"], "--depths = '2;5' must hold numbers only"),
-        (["--depths", "2,nan"], "depths holds nan"),
-        (["--depths", "9"], "depths = 9 m must not lie below the bottom, at 8 m"),
-        (["--depths", "2", "-o", "spread.txt"], "must end in .png, .pdf or .svg"),
-        (["--depths", "2", "-D", "wind=3"], "parameter 'wind' is not one of scene fig09_1x1"),
-    ],
-)
-def test_command_refuses(arguments, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run("beam-spread", "fig09_1x1", *arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    # A progress bar may have come and gone before.
-    assert message in result.stderr.replace("\n", " ")
-    assert "Traceback" not in result.stderr
-    assert not any(tmp_path.iterdir())

@@ -1,20 +1,19 @@
 """Bounds of designs from closed-form light in place of renders: ratios, table, figures and the command."""
 
-import csv
 import time
 
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
+from command_line import run
 from differentiated import PHOTON, result
 from PIL import Image
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
-from mitransient_lidar.plots.studies.parameters import plot_bounds
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.studies import bounds as study
 
@@ -126,38 +125,6 @@ def test_ratios_of_counts_go_with_the_root_of_the_energy(found):
     assert np.all(found["bound_stderr"] < 1e-2 * found["bound"])
 
 
-@pytest.mark.slow
-def test_description_ranks_designs(found):
-    lines = study.describe_bounds(found)
-    assert lines[0] == "attenuation = 0.3 1/m"
-    names = [line[2:36].split("  ")[0] for line in lines[2:8]]
-    assert names[0] == "pulse_energy_mj=20, layout=1x1"
-    assert names[-1] == "pulse_energy_mj=1.25, layout=2x2"
-
-
-@pytest.mark.slow
-def test_table_has_a_row_for_each_design_and_parameter(found, tmp_path):
-    study.write_table(found, tmp_path / "table.csv")
-    rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
-    assert len(rows) == 12
-    assert rows[2] | {"bound": ""} == rows[2] | {"bound": "", "pulse_energy_mj": "5", "layout": "2x2"}
-    for number, row in enumerate(rows):
-        cell = found.isel(design=number // 2, parameter=number % 2)
-        assert row["parameter"] == cell["parameter"].item()
-        assert float(row["bound"]) == pytest.approx(float(cell["bound"]), rel=1e-5)
-        assert float(row["ratio"]) == pytest.approx(float(cell["ratio"]), rel=1e-5)
-
-
-def test_parameters_of_a_design_that_is_not_determined_are_said(rendered):
-    del rendered
-    found = study.bounds("table1", SMALL, free=["attenuation", "none"], receiver="ideal", nuisances={"scale": 0.1})
-    assert found["design"].values.tolist() == ["scene"]
-    assert np.isinf(found["bound"][0, 1])
-    lines = study.describe_bounds(found)
-    assert "scene: none has no influence on the record: no bound" in lines
-    assert "scale = 1 1, known to 0.1" in lines
-
-
 def test_receivers_are_compared_on_the_same_renders(rendered):
     """A detector of a quantum efficiency of 0.7 without other noise knows counts to 1/sqrt(0.7) times the error."""
     weak = ReceiverChannels(Channel(ReceiverChain(LinearDetector(0.7))), name="weak")
@@ -169,41 +136,6 @@ def test_receivers_are_compared_on_the_same_renders(rendered):
     ]
     ratio = found["bound"].values.reshape(2, 2)
     np.testing.assert_allclose(ratio[:, 1] / ratio[:, 0], 0.7**-0.5, rtol=1e-6)
-
-
-def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
-    def render(scene, **options):
-        return light(scene, **options).assign_attrs(interrupted=1)
-
-    monkeypatch.setattr(study, "render", render)
-    small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
-    done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
-    assert done.exit_code == 130
-    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept.\n"
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_figure_ranks_designs(found):
-    figure = plot_bounds(found)
-    panels = figure.axes
-    assert [ax.get_title() for ax in panels] == ["attenuation, bounds in 1/m", "bottom_reflectance, bounds in 1/m"]
-    for number, ax in enumerate(panels):
-        labels = [text.get_text() for text in ax.get_yticklabels()]
-        order = np.argsort(found["bound"].values[:, number])
-        assert labels == found["design"].values[order].tolist()
-        drawn = [float(container.lines[0].get_xdata()[0]) for container in ax.containers]
-        np.testing.assert_allclose(drawn, found["ratio"].values[order, number])
-
-
-@pytest.mark.slow
-def test_figure_of_one_design(rendered):
-    del rendered
-    found = study.bounds("table1", SMALL, free=["attenuation", "bottom_reflectance", "none"], receiver="ideal")
-    left, right, _ = plot_bounds(found).axes
-    np.testing.assert_allclose(left.lines[0].get_xdata(), found["bound"].values[0, :2] / [0.3, 1])
-    assert "no bound" in [text.get_text() for text in left.texts]
-    np.testing.assert_array_equal(right.images[0].get_array(), found["correlation"].values[0])
 
 
 @pytest.mark.slow
@@ -224,14 +156,7 @@ def test_command_writes_figure_data_and_table(rendered, tmp_path):
     assert len(figure.with_suffix(".csv").read_text().splitlines()) == 9
 
 
-def test_values_with_commas_are_separated_by_semicolons():
-    from mitransient_lidar.cli.options import name_and_values
-
-    assert name_and_values("--over", "layer_tops=0,2;0,3") == ("layer_tops", ["0,2", "0,3"])
-    assert name_and_values("--over", "layout = 1x1, 2x2") == ("layout", ["1x1", "2x2"])
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("options", "message"),
     [
         ({"free": []}, r"free = \[\] must be a list of different names"),
@@ -249,22 +174,3 @@ def test_invalid_input_is_refused_before_a_render(rendered, options, message):
     with pytest.raises(UserError, match=message):
         study.bounds("table1", SMALL, **{"free": ["attenuation"], **options})
     assert not rendered
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--free", "attenuation,"], "--free = 'attenuation,' has an empty entry"),
-        (["--free", "attenuation", "--over", "layout"], "--over layout is not of the form name=value,value,..."),
-        (["--free", "attenuation", "--over", "layout=1x1,"], "--over layout=1x1, is not of the form"),
-        (["--free", "attenuation", "--over", "layout=1x1", "--over", "layout=2x2"], "--over names a parameter twice"),
-        (["--free", "attenuation", "--nuisance", "scale=wide"], "--nuisance scale = 'wide' must be a number"),
-        (["--free", "attenuation", "--gain", "most"], "--gain most must be a number or auto"),
-        (["--free", "attenuation", "-o", "bounds.txt"], "must end in .png"),
-        ([], "Missing option '--free'"),
-    ],
-)
-def test_command_refuses_invalid_options(options, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert_refused(run("bounds", "table1", *options), message)
-    assert not list(tmp_path.iterdir())

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_row
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import DryBottomError, UserError
@@ -145,12 +146,7 @@ def test_seas_after_the_time_are_nan_and_named(rendered, clock, monkeypatch, cap
     assert found.attrs["seas_left_out"] == 3 * 5 - 3
 
 
-def test_a_table_needs_a_depth_below_the_waves(rendered):
-    with pytest.raises(UserError, match=r"depth = \[0\.1\] must hold one below the waves of \[3\.0\] m/s"):
-        study.depth_bias("riegl_vq840g", depths=[0.1], winds=[3.0], waters=["IB"])
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("options", "message"),
     [
         ({"altitudes": [300.0, 300.0]}, r"altitudes = \[300\.0, 300\.0\] must be numbers \(greater than 0, ascending"),

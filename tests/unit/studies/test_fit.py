@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TRUTH, closed_form, noisy
-from command_line import assert_refused, run
+from command_line import run
+from rows import each_row
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering.passes import Progress
-from mitransient_lidar.results import save
 from mitransient_lidar.studies import fit as study
 
 NAMES = ["attenuation", "bottom_reflectance"]
@@ -124,24 +124,13 @@ def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
     assert ("set bin_width_ns to 0.12 or less" in caplog.text) == (given is not None)
 
 
-def test_values_of_layers_are_set_in_their_list():
-    model = model_of("fig15_2x2", ["attenuation[1]"], wind_speed=3)
-    assert model.starts({}) == {"attenuation[1]": 0.5}
-    assert model.with_values({"attenuation[1]": 0.4}) == {"wind_speed": 3, "attenuation": "0.9, 0.4"}
-    assert model.with_values({"attenuation[0]": 1.0, "attenuation[1]": 0.4})["attenuation"] == "1.0, 0.4"
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("free", "options", "message"),
     [
         (["bottom_deep"], {}, "parameter 'bottom_deep' is not one of the scene: did you mean bottom_depth"),
         ([], {}, "must name one or more parameters"),
         (["attenuation", "attenuation"], {}, "names attenuation twice"),
-        (
-            ["attenuation"],
-            {"params": {"attenuation": "0.9, 0.5"}},
-            r"name one of its elements attenuation\[0\]",
-        ),
+        (["attenuation"], {"params": {"attenuation": "0.9, 0.5"}}, r"name one of its elements attenuation\[0\]"),
         (["attenuation[2]"], {}, r"parameter attenuation\[2\]: the index must be 0 to 0"),
         (["bin_count"], {}, "parameter bin_count = 'auto' is not a number"),
         (["attenuation"], {"passes": 1}, "passes = 1 must lie between 2 and"),
@@ -153,14 +142,6 @@ def test_invalid_parameters_are_refused(free, options, message, renders):
     data = noisy(0.01, np.random.default_rng(4), pixels=("red",))
     with pytest.raises(UserError, match=message):
         mitransient_lidar.fit(data, "table1", free, **options)
-
-
-def test_scenes_that_are_unknown_are_refused():
-    data = noisy(0.01, np.random.default_rng(5))
-    with pytest.raises(UserError, match="the result does not hold its scene"):
-        mitransient_lidar.fit(data, None, NAMES)
-    with pytest.raises(UserError, match="start of bottom_reflectance is missing"):
-        mitransient_lidar.fit(data, closed_form, NAMES, start={"attenuation": 0.2})
 
 
 def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):
@@ -181,11 +162,6 @@ def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):
     assert np.all(np.isfinite(fitted["value"]) & np.isfinite(fitted["stderr"]))
 
 
-def test_a_function_is_a_model():
-    fitted = mitransient_lidar.fit(closed_form(TRUTH), closed_form, list(TRUTH), start=TRUTH, noise=0.01)
-    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()))
-
-
 @pytest.mark.slow
 def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path):
     options = ["--start", "attenuation=0.25", "--bounds", "bottom_reflectance=0.01:0.5", "--passes", 32]
@@ -202,35 +178,3 @@ def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path
         assert np.abs((fitted["value"].values - truth) / fitted["stderr"].values).max() < 6
         assert fitted["low"].values[1] == 0.01
     assert (tmp_path / "out" / "fit.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--free", "depth"], "parameter 'depth' is not one of the scene"),
-        (["--free", ""], "--free = '' has an empty entry"),
-        ([], "--free = [] must name one or more parameters"),
-        (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
-        (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
-        (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),
-        (["--free", "attenuation", "--receiver", "none"], "receiver = 'none' must be one of"),
-        (["--free", "attenuation,bandwidth_mhz", "--receiver", "apd"], "bandwidth_mhz and a receiver"),
-        (["--free", "attenuation", "--noise", "-1"], "noise = -1 must be greater than 0"),
-    ],
-)
-def test_the_command_refuses_invalid_options(options, message, table, tmp_path):
-    done = run("fit", table, "--scene", "table1", *options, "-o", tmp_path / "out", "-q")
-    assert_refused(done, message)
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_command_refuses_files_that_it_cannot_read(tmp_path):
-    free = ["--scene", "table1", "--free", "attenuation", "-q"]
-    assert_refused(run("fit", tmp_path / "none.csv", *free), "none.csv")
-    assert_refused(run("fit", tmp_path / "none.nc", *free), "none.nc")
-    save(closed_form(TRUTH)[["waveform_derivative"]], tmp_path / "other.nc")
-    assert_refused(run("fit", tmp_path / "other.nc", *free), "other.nc")
-
-
-def test_a_table_needs_a_scene(table):
-    assert_refused(run("fit", table, "--free", "attenuation", "-q"), "scene is missing")

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
+from rows import each_row
 from scipy.integrate import trapezoid
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water import water_types
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.water_types import water_of
@@ -38,7 +38,7 @@ def figures(output):
     return named, {name: float(value) for name, value in options.items()}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("arguments", "wanted"),
     [
         (["jerlov", "II"], water_types.jerlov("II")),
@@ -88,22 +88,6 @@ def test_mistakes_are_one_sentence(arguments, message):
     assert_refused(done, message)
 
 
-@pytest.mark.parametrize(
-    ("name", "a", "b", "ratio"),
-    # a and b of his table at 530 nm, and bb/b to its two digits (Petzold 1972).
-    [("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020)],
-)
-def test_petzold_waters(name, a, b, ratio):
-    done = run("water", "petzold", name)
-    assert done.exit_code == 0, done.output
-    assert "measured at 514 to 530 nm" in done.stdout
-    named, options = figures(done.stdout)
-    assert named["absorption a (1/m)"] == a
-    assert named["bb/b"] == pytest.approx(ratio, abs=5.5e-4)
-    assert options["attenuation"] == pytest.approx(a + b, rel=1e-6)
-    assert options["backscattering"] == pytest.approx(named["bb/b"] * b, rel=1e-4)
-
-
 def test_profile_is_described(station):
     done = run("water", "profile", str(station), "--tolerance", "0.05")
     assert done.exit_code == 0, done.output
@@ -134,31 +118,6 @@ def test_profile_line_is_xml_for_a_medium(station):
     for element, tolerance in ((done.stdout.splitlines()[-1], 0.05), (usual, 0.01)):
         loaded = mi.load_string(f'<medium version="3.0.0" type="layered_water">{element}</medium>')
         assert loaded.water.column.count == read_profile(station).layers(tolerance).count
-
-
-def test_tolerance_out_of_range(station):
-    done = run("water", "profile", str(station), "--tolerance", "2")
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr == "--tolerance = 2 must lie between 1e-05 and 0.5\n"
-
-
-@pytest.mark.slow
-def test_profile_without_scattering(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("depth, a, b\n0, 0.1, 0\n5, 0.1, 0\n")
-    done = run("water", "profile", str(path), "-o", str(tmp_path / "a.png"))
-    assert done.exit_code == 0, done.output
-    assert f"{'bb/b':<30}none, nothing scatters" in done.stdout
-    assert f"{'layers within 1 %':<30}1\n" in done.stdout
-
-
-def test_profile_that_no_fournier_forand_function_fits_is_not_drawn(tmp_path):
-    path, plot = tmp_path / "a.csv", tmp_path / "a.png"
-    path.write_text("depth, a, b, bb_ratio\n0, 0.1, 0.1, 0.7\n5, 0.1, 0.1, 0.7\n")
-    done = run("water", "profile", str(path), "-o", str(plot))
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert "backscatter_ratio = 0.7 must lie between" in done.stderr
-    assert not plot.exists()
 
 
 def test_pure_sea_water_renders():
@@ -195,20 +154,3 @@ def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, a
     theta = np.linspace(np.pi / 2, np.pi, 20_001)
     assert 2 * np.pi * trapezoid(phase(theta) * np.sin(theta), theta) == pytest.approx(share, rel=5e-3)
     assert phase(np.radians(1.0)) == pytest.approx(at_1_degree, rel=tolerance)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["petzold", "turbid"], ["profile"]])
-def test_plots_are_written_and_their_paths_come_last(station, tmp_path, arguments):
-    path = tmp_path / "a.png"
-    words = [*arguments, str(station)] if arguments == ["profile"] else arguments
-    plain = run("water", *words)
-    done = run("water", *words, "-o", str(path))
-    assert done.exit_code == 0, done.output
-    assert done.stdout == f"{plain.stdout}{path}\n"
-    assert path.read_bytes().startswith(b"\x89PNG")
-
-
-def test_plot_water_knows_the_kinds():
-    with pytest.raises(UserError, match="kind = 'mud' must be one of jerlov"):
-        plot_water("mud", "3", 532.0, 20.0, 35.0, 0.01, "a.png")

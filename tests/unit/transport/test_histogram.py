@@ -95,20 +95,12 @@ def test_parts_have_the_bits_of_the_whole():
     """Coarse and fine sums, and what is not finite, of some of the pixels."""
     received = histogram(5, (7,))
     pixels, energies = np.arange(7, dtype=np.uint32), np.array([1, 1e-9, 3, np.nan, 1e-12, 0, 7], np.float32)
-    received.add(mi.UInt32(pixels), dr.zeros(mi.Float, 7), mi.Float(energies), mi.Bool(True))
+    received.add(mi.UInt32(pixels), dr.zeros(mi.Float, 7) + FIRST, mi.Float(energies), mi.Bool(True))
     whole = received.energy()
     for part in (slice(0, 3), slice(2, 7)):
         np.testing.assert_array_equal(received.energy_of(part), whole[part])
     assert np.isnan(whole[3]).any()
     assert whole[4].any()
-
-
-def test_images_have_rows_and_columns():
-    sums = histogram(5, (2, 3))
-    sums.add(mi.UInt32(4), mi.Float(1391.1e-9 * C0), mi.Float(3.0), mi.Bool(True))
-    energy = sums.energy()
-    assert energy.shape == (2, 3, 5)
-    assert energy[1, 1, 2] == energy.sum() == 3
 
 
 def test_histogram_that_would_not_fit_is_refused():

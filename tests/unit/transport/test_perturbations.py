@@ -1,6 +1,5 @@
 """Sums of perturbations along segments, at scattering events and at solids, and their channels in histograms."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
 from mitransient_lidar.transport.paths.histogram import TransientHistogram
-from mitransient_lidar.transport.perturbations import LayerChange, Perturbation, Perturbations, joined
+from mitransient_lidar.transport.perturbations import LayerChange, Perturbation, Perturbations
 
 TOPS = (0.0, 1.5, 4.0)
 EDGES = (-np.inf, 1.5, 4.0, np.inf)
@@ -54,12 +53,6 @@ def test_events_count_where_their_layer_is():
     np.testing.assert_allclose(half[0], 0.5 * wanted, rtol=1e-3, atol=1e-6)
 
 
-def test_channels_are_derivatives():
-    changes = Perturbations([Perturbation(), Perturbation()])
-    sums = joined([mi.Float(-1.5), mi.Float(0.5)], [mi.Float(0.5), mi.Float(1.5)])
-    np.testing.assert_allclose([one[0] for one in changes.channels(mi.Float(3.0), sums)], [-3.0, 6.0], rtol=1e-6)
-
-
 def test_histograms_sum_perturbations_of_both_signs():
     """Derivatives of large and small energies, and of both signs, beside the energies."""
     axis, emitted = TimeAxis(0.0, 2e9 / C0, 4), 1.0
@@ -83,11 +76,3 @@ def test_a_derivative_that_is_not_finite_is_reported():
     sums.add(mi.UInt32(0), mi.Float(1.0), mi.Float(1e-3), mi.Bool(True), [mi.Float(np.inf)])
     assert np.isnan(sums.perturbed()[0, 0, 0])
     assert sums.energy()[0, 0] == pytest.approx(1e-3)
-
-
-def test_without_perturbations_there_are_no_sums():
-    changes = Perturbations()
-    assert changes.start() == []
-    assert changes.at_event([], mi.Float(1), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1)) == []
-    assert TransientHistogram(TimeAxis(0.0, 1.0, 2), (1,), 1.0).perturbed().shape == (0, 1, 2)
-    assert dr.width(mi.Float(0)) == 1

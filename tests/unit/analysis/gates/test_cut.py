@@ -1,11 +1,11 @@
 """Gate stacks cut from results: energies, standard errors, labels and invalid input."""
 
-import logging
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from oracles.gates import transmission
+from rows import each_row
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -104,13 +104,6 @@ def test_pulses_add_up():
     assert many.attrs["pulses"] == 1000
 
 
-def test_error_without_inflation_is_the_upper_bound(caplog):
-    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
-        stack = gating.cut_gates(record(relative=0.03), GateTrain(1425.0, 10.0, 10.0, 3))
-    np.testing.assert_allclose(stack["gate_energy_stderr"], 0.03 * stack["gate_energy"], rtol=1e-12)
-    assert "upper bounds" in caplog.text
-
-
 def test_error_is_inflated_as_measured_in_the_render():
     inflation = {"error_inflation_bins": [1, 2, 4, 8, 16], "error_inflation": [1.0, 1.3, 1.8, 2.2, 2.4]}
     flat = record(values=np.full((1, BINS), 1e-5), relative=0.1, attributes=GEOMETRY | inflation)
@@ -152,25 +145,6 @@ def test_stack_is_labelled():
     assert stack.attrs["history"].startswith(dataset.attrs["history"])
 
 
-def test_gates_of_a_result_with_gates_of_its_own_are_cut_anew():
-    own = gating.cut_gates(record(), GateTrain(1418.0, 6.0, 3.0, 20))
-    dataset = record().assign(gate_energy=own["gate_energy"])
-    stack = gating.cut_gates(dataset, GateTrain(1420.0, 5.0, 5.0, 4))
-    assert stack.sizes["gate"] == 4
-    np.testing.assert_array_equal(stack["gate_start"], [1420, 1425, 1430, 1435])
-
-
-def test_flat_energies_of_imagers_come_row_by_row():
-    energy = np.arange(12.0).reshape(6, 2)
-    coords = record(scale=np.ones(6), grid=(2, 3)).coords
-    stack = gate_stack.build_gates(energy, energy, GateTrain(0.0, 1.0, 1.0, 2), coords=coords, attributes={})
-    np.testing.assert_array_equal(stack["gate_energy"], energy.reshape(2, 3, 2))
-    # Without the time of the surface there is no depth.
-    assert np.isnan(stack["gate_depth"]).all()
-    with pytest.raises(ValueError, match=r"gate_energy has shape \(5, 2\); it must be \(2, 3, 2\)"):
-        gate_stack.build_gates(energy[:5], energy, GateTrain(0.0, 1.0, 1.0, 2), coords=coords, attributes={})
-
-
 def test_nan_stays_in_its_gates():
     dataset = record()
     dataset["waveform"][1, 40] = np.nan  # 1420 to 1420.5 ns
@@ -179,7 +153,7 @@ def test_nan_stays_in_its_gates():
     assert np.isfinite(stack["gate_energy"][0]).all()
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("train", "message"),
     [
         (
@@ -203,22 +177,6 @@ def test_nan_stays_in_its_gates():
 def test_trains_outside_the_record_are_rejected(train, message):
     with pytest.raises(UserError, match=message):
         gating.cut_gates(record(), train)
-
-
-def test_train_before_a_record_of_unknown_surface():
-    with pytest.raises(UserError, match=r"before the surface: .* the record starts at 1400\.0 ns"):
-        gating.cut_gates(record(attributes={}), GateTrain(1380.0, 5.0, 5.0, 2))
-    # Near pixels see the surface before the mean: their gates are welcome.
-    early = record(attributes=GEOMETRY | {"window_start_ns": 1410.0})
-    assert gating.cut_gates(early, GateTrain(1402.0, 5.0, 5.0, 3)).sizes["gate"] == 3
-
-
-def test_stacks_without_histogram_are_rejected():
-    stack = gating.cut_gates(record(), GateTrain(1420.0, 5.0, 5.0, 4))
-    with pytest.raises(UserError, match="dataset holds a gate stack, but must have waveforms over time"):
-        gating.cut_gates(stack, GateTrain(1420.0, 5.0, 5.0, 2))
-    with pytest.raises(UserError, match=r"dimensions \('time', 'pixel'\)"):
-        gating.cut_gates(record().transpose("time", "pixel"), GateTrain(1420.0, 5.0, 5.0, 2))
 
 
 def test_train_from_options(tmp_path):
@@ -273,7 +231,7 @@ def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
     assert f"than the bins of 5 ns: the energy of an echo may be wrong by up to {100 * bound:.0f} %" in caplog.text
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("options", "message"),
     [
         ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
@@ -289,8 +247,3 @@ def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
 def test_options_that_do_not_go_together(options, message):
     with pytest.raises(UserError, match=message):
         gate_stack.train_from_options(GEOMETRY, **options)
-
-
-def test_depths_need_the_geometry():
-    with pytest.raises(UserError, match="no attribute altitude"):
-        gate_stack.train_from_options({}, start_depth_m=2.0, width_ns=5.0)

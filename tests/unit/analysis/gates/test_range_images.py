@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from figure_inputs import LIDAR, stack
+from rows import each_row
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
 
@@ -79,7 +80,7 @@ def test_range_without_light_or_with_holes():
     np.testing.assert_array_equal(found.confidence, [0, 1, 0])
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("arguments", "options", "message"),
     [
         ((np.ones((2, 4)), np.ones((2, 5)), np.arange(4)), {}, "must be equal, with the 4 gates"),

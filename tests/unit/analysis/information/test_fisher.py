@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 from differentiated import PHOTON, result
+from rows import each_row
 from significance import largest_chi2, largest_z
 
 from mitransient_lidar.analysis.information.fisher import fisher_information
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
-from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 
 ELECTRON = 1.602176634e-19
 T = np.arange(60.0)
@@ -50,21 +51,6 @@ def test_decay_in_white_noise():
     sums = 1 / (1 - x), x / (1 - x) ** 2, x * (1 + x) / (1 - x) ** 3
     correlation = sums[1] / np.sqrt(sums[0] * sums[2])
     assert float(found["correlation"][0, 1]) == pytest.approx(correlation, abs=1e-3)
-
-
-def test_amplitude_of_counts():
-    """Poisson counts: N photons give the amplitude to 1/sqrt(N), and a dark pixel beside it nothing."""
-    photons = np.stack([pulse(300.0)[0], np.zeros(T.size)])
-    found = fisher_information(result(PHOTON * photons, {"amplitude": PHOTON * photons}), "ideal")
-    assert float(found["bound"][0]) == pytest.approx(photons.sum() ** -0.5, rel=1e-9)
-    assert float(found["variance_share"][0]) == 0
-
-
-def test_time_of_a_pulse_of_counts():
-    """N photons of a Gaussian pulse of width sigma: sigma / sqrt(N), with or without a known height."""
-    shape, slope = pulse(300.0)
-    found = fisher_information(result(PHOTON * shape, {"time": PHOTON * slope, "height": PHOTON * shape}), "ideal")
-    assert float(found["bound"][0]) == pytest.approx(4 / np.sqrt(shape.sum()), rel=1e-6)
 
 
 def test_time_offset_is_the_difference_of_bins():
@@ -127,14 +113,6 @@ def test_rounding_and_saturation():
     np.testing.assert_allclose(found["information"], slopes @ slopes.T / DEVIATION**2, rtol=1e-3)
 
 
-def test_logarithm_loses_nothing():
-    data = decay()
-    logarithmic = ReceiverChain(WHITE.detector, WHITE.amplifier, LogAmplifier(0.25, 1e-3))
-    np.testing.assert_allclose(
-        fisher_information(data, logarithmic)["information"], fisher_information(data, WHITE)["information"]
-    )
-
-
 def test_fits_of_counts_scatter_as_the_bound(record_property):
     """Maximum likelihood of 400 records of Poisson counts: sum of squares in units of the bound is chi-squared."""
     data = decay()
@@ -156,16 +134,6 @@ def test_fits_of_counts_scatter_as_the_bound(record_property):
     assert squares < largest_chi2(800)
     # The scatter is no smaller, either: sums of 800 squares have the standard error sqrt(2 / 800).
     assert squares > 800 * (1 - largest_z(800) * np.sqrt(2 / 800))
-
-
-def test_noise_of_one_render_is_reported():
-    """Errors of derivatives add their square over the variance: exact for Poisson counts without correlation."""
-    error = 0.05 * np.abs(BY_NAME["rate"]).max()
-    found = fisher_information(decay(errors={"rate": PHOTON * error}), "ideal")
-    share = np.sum(error**2 / DECAY) / np.sum(BY_NAME["rate"] ** 2 / DECAY)
-    np.testing.assert_allclose(found["monte_carlo_share"], [0, share], rtol=1e-9)
-    assert "adds" in found.attrs["remarks"]
-    assert "information about rate: its bound is too low" in found.attrs["remarks"]
 
 
 @pytest.mark.slow
@@ -191,27 +159,6 @@ def test_noise_of_renders_does_not_count_as_information():
     assert np.min(np.diagonal(bias)) > largest_z(80, 2)
 
 
-@pytest.mark.slow
-def test_error_of_a_bound_by_renders():
-    """The jackknife's error of bounds of three noisy renders has the scatter of bounds between trials."""
-    random = np.random.default_rng(8)
-    bounds, errors = [], []
-    for _ in range(60):
-        renders = []
-        for _ in range(4):
-            slopes = {name: one * (1 + 0.05 * random.normal(size=T.size)) for name, one in BY_NAME.items()}
-            renders.append(result(PHOTON * DECAY, {name: PHOTON * one for name, one in slopes.items()}))
-        found = fisher_information(renders, "ideal")
-        assert found["bound_left_out"].sizes == {"render": 4, "parameter": 2}
-        bounds.append(found["bound"].values)
-        errors.append(found["bound_stderr"].values)
-    scatter = np.std(bounds, axis=0, ddof=1)
-    stated = np.sqrt(np.mean(np.square(errors), axis=0))
-    # Two standard errors of 60 and 180 degrees of freedom; the jackknife overstates by some per cent (Efron, Stein).
-    assert np.all(stated > scatter * (1 - largest_z(60) * np.sqrt(1 / 120 + 1 / 360)))
-    assert np.all(stated < scatter * (1.1 + largest_z(60) * np.sqrt(1 / 120 + 1 / 360)))
-
-
 def test_known_scale_narrows_the_bound():
     """A scale that is known to s is a measurement of it: between unknown and known."""
     light = PHOTON * DECAY
@@ -228,21 +175,6 @@ def test_known_scale_narrows_the_bound():
     assert bound() == pytest.approx(f[1, 1] ** -0.5)
 
 
-def test_counter_with_dead_time():
-    """Steady light on a counter: the counts of a renewal process give the rate to the deviation of their number.
-
-    For m bins, rate r and dead time d the number has the variance N (1 - d N/m)^2, and the mean m r/(1 + r d): the
-    information about ln r is m r/(1 + r d), that of one Poisson event a count.
-    """
-    bins = 500
-    light = np.full(bins, 0.02 * PHOTON)
-    chain = ReceiverChain(SinglePhotonDetector(1.0, 5.5))
-    found = fisher_information(result(light, {"log_rate": light}), chain)
-    counts = float(detect_waveforms(result(light, {"log_rate": light}), chain)["signal_mean"].sum())
-    # Bins of 2 % differ from continuous time by some of 2 %.
-    assert float(found["information"][0, 0]) == pytest.approx(counts, rel=0.02)
-
-
 def test_parameters_without_influence_and_degenerate_pairs():
     slopes = {"height": PHOTON * BY_NAME["height"], "twice": 2 * PHOTON * BY_NAME["height"], "none": 0 * T}
     found = fisher_information(result(PHOTON * DECAY, {**slopes, "rate": PHOTON * BY_NAME["rate"]}), "ideal")
@@ -256,7 +188,7 @@ def test_parameters_without_influence_and_degenerate_pairs():
     assert "height and nearly have a correlation of -0.99" in found.attrs["remarks"]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("change", "options", "message"),
     [
         (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
@@ -272,20 +204,3 @@ def test_parameters_without_influence_and_degenerate_pairs():
 def test_invalid_input(change, options, message):
     with pytest.raises(UserError, match=message):
         fisher_information(change(decay()), **{"chain": "ideal", **options})
-
-
-def test_imagers_and_channels():
-    """Pixels of an imager count as those of a list."""
-    data = result(PHOTON * np.stack([DECAY] * 4), {"rate": PHOTON * np.stack([BY_NAME["rate"]] * 4)})
-    flat = fisher_information(data, "apd")
-    image = data.drop_vars(("pixel", "angle_x", "angle_y"))
-    image = image.assign_coords(pixel=np.arange(4)).assign_coords(
-        row=("pixel", [0, 0, 1, 1]), column=("pixel", [0, 1] * 2)
-    )
-    image = image.set_index(pixel=("row", "column")).unstack("pixel")
-    image = image.transpose("parameter", "row", "column", "time").assign_coords(row=[0, 1], column=[0, 1])
-    found = fisher_information(image, "apd")
-    assert found["lost_samples"].dims == ("row", "column")
-    np.testing.assert_allclose(found["information"], flat["information"])
-    single = fisher_information(data.isel(pixel=[0]), "apd")
-    np.testing.assert_allclose(flat["information"], 4 * single["information"])

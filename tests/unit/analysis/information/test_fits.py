@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import BIN, TIME, TRUTH, closed_form, noisy
+from rows import each_row
 from scipy.stats import chi2, kstest
 from significance import FALSE_ALARM, largest_z
 
 from mitransient_lidar.analysis.information.fits import WaveformFit
 from mitransient_lidar.analysis.information.measured import measured
-from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.fit import describe_fit, parameter_frame
 
@@ -82,30 +82,8 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
 
 
 @pytest.mark.slow
-def test_errors_of_records_of_a_receiver_are_those_of_its_closed_form():
-    """Records of 40 shots behind an avalanche photodiode, whose bandwidth correlates neighbouring samples."""
-    light = closed_form(TRUTH, pixels=("a", "b"), power=3e-7)
-    recorded = detect_waveforms(light, "apd", shots=20 * 40, seed=4)
-    distances, probabilities = [], []
-    for number in range(20):
-        found = recorded.isel(shot=slice(40 * number, 40 * number + 40)).assign_attrs(shots=40)
-
-        def model(values):
-            return closed_form(values, pixels=("a", "b"), power=3e-7)
-
-        fitted = fit(found, model=model)
-        distances.append(distance(fitted))
-        probabilities.append(fitted.attrs["probability"])
-    assert_chi_squared(distances, len(TRUTH))
-    assert kstest(probabilities, "uniform").pvalue > FALSE_ALARM
-
-
-@pytest.mark.slow
 def test_noise_of_the_model_widens_the_covariance():
-    """A model with the error of the data: the same for all values, as by common random numbers.
-
-    With the errors of the data alone, the mean squared distance was 6.
-    """
+    """A model with the error of the data: the same for all values, as by common random numbers."""
     random = np.random.default_rng(5)
     distances = []
     for _ in range(20):
@@ -141,18 +119,13 @@ def rendered(values, errors, stderr):
     exact = closed_form(values)
     batches = exact["waveform"].values + errors[:, None]
     return exact.assign(
-        waveform=exact["waveform"] + errors.mean(axis=0),
-        waveform_batch=(("batch", "pixel", "time"), batches),
-        **stderr,
+        waveform=exact["waveform"] + errors.mean(axis=0), waveform_batch=(("batch", "pixel", "time"), batches), **stderr
     ).assign_coords(batch_passes=("batch", np.ones(len(errors), dtype=int)))
 
 
 @pytest.mark.slow
 def test_errors_of_all_bins_that_agree_are_in_the_covariance():
-    """A model of 16 passes whose errors are a common factor for the larger part, which only batches of passes show.
-
-    With errors of the model that are independent from bin to bin, the mean squared distance was 23.
-    """
+    """A model of 16 passes whose errors are a common factor for the larger part, which only batches of passes show."""
     random = np.random.default_rng(9)
     distances = []
     for _ in range(60):
@@ -161,41 +134,6 @@ def test_errors_of_all_bins_that_agree_are_in_the_covariance():
             distance(fit(noisy(0.002, random), TRUTH, model=lambda values, own=own: rendered(values, *own)))
         )
     assert_mean(distances)
-
-
-@pytest.mark.slow
-def test_standard_errors_from_few_passes_widen_the_covariance():
-    """Data of 8 passes, whose own standard errors as weights gave mean squared distances of 5.9 to 9.1."""
-    random = np.random.default_rng(10)
-    distances = []
-    for _ in range(100):
-        data = rendered(TRUTH, *of_passes(random, 8, 0.01))
-        distances.append(distance(fit(data.drop_vars("waveform_derivative"), TRUTH)))
-    assert_mean(distances)
-
-
-@pytest.mark.slow
-def test_errors_of_a_result_without_batches_agree_as_those_of_the_model():
-    """Data of 16 passes whose errors are a common factor for the larger part, which the batches of the model tell.
-
-    With errors of the data that are independent from bin to bin, the mean squared distance was 5.5.
-    """
-    random = np.random.default_rng(11)
-    distances = []
-    for _ in range(110):
-        data = rendered(TRUTH, *of_passes(random, 16, 0.1)).drop_vars(["waveform_batch", "waveform_derivative"])
-        own = of_passes(random, 64, 0.1)
-        fitted = fit(data, TRUTH, model=lambda values, own=own: rendered(values, *own))
-        distances.append(distance(fitted))
-    assert_mean(distances)
-    assert not any("stated errors are too small" in text for text in fitted.attrs["messages"])
-
-
-def test_errors_of_a_render_that_are_too_small_are_named():
-    """Neither the data nor the model have batches."""
-    exact = closed_form(TRUTH)
-    fitted = fit(exact[["waveform"]].assign(waveform_stderr=xr.full_like(exact["waveform"], 0.002)), TRUTH)
-    assert any("stated errors are too small" in text for text in fitted.attrs["messages"])
 
 
 def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
@@ -236,27 +174,6 @@ def test_logarithms_lead_from_wrong_starts_to_the_solution_with_few_renders(devi
         assert off @ np.linalg.solve(wanted["covariance"].values, off) < 0.2**2
 
 
-def test_parameters_that_are_hardly_told_apart_are_not_extrapolated():
-    """A large error of both is no reason to take the model as linear over it: samples would be off by their errors."""
-
-    def model(values):
-        exact = closed_form({**TRUTH, "scattering": values["scattering"] * values["factor"]})
-        slope = exact["waveform_derivative"].sel(parameter="scattering")
-        slopes = np.stack([slope * values["factor"], slope * values["scattering"]])
-        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
-        return xr.Dataset(data, {"parameter": ["scattering", "factor"]}, exact.attrs)
-
-    fitted = fit(closed_form(TRUTH), {"scattering": 0.05, "factor": 1.0}, model=model, noise=1e-5)
-    assert float(fitted["value"].prod()) == pytest.approx(0.15, rel=1e-4)
-    assert abs(fitted["residual"]).max() < 0.2
-
-
-def test_covariance_is_the_inverse_of_the_information():
-    fitted = fit(closed_form(TRUTH), TRUTH, noise=0.002)
-    slopes = closed_form(TRUTH)["waveform_derivative"].values[:, 0] / 0.002
-    np.testing.assert_allclose(fitted["covariance"], np.linalg.inv(slopes @ slopes.T), rtol=1e-6)
-
-
 def test_bounds_are_kept():
     fitted = fit(closed_form(TRUTH), bounds={"attenuation": (0.05, 0.15)}, noise=0.002)
     assert 0.1499 <= fitted["value"].sel(parameter="attenuation") <= 0.15
@@ -277,30 +194,6 @@ def test_errors_are_taken_from_residuals_where_they_are_unknown():
     assert any("errors of the waveforms are unknown" in text for text in unknown.attrs["messages"])
 
 
-def test_degenerate_and_idle_parameters_are_named():
-    """A second scattering of the same effect, and a parameter without any."""
-
-    def model(values):
-        exact = closed_form({**TRUTH, "scattering": values["scattering"] + values["twin"]})
-        slope = exact["waveform_derivative"].sel(parameter="scattering")
-        slopes = np.stack([slope, slope, 0 * slope])
-        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
-        return xr.Dataset(data, {"parameter": ["scattering", "twin", "idle"]}, exact.attrs)
-
-    starts = {"scattering": 0.05, "twin": 0.05, "idle": 1.0}
-    fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
-    assert float(fitted["value"][:2].sum()) == pytest.approx(0.15, rel=1e-5)
-    messages = " ".join(fitted.attrs["messages"])
-    assert "scattering and twin cannot be told apart" in messages
-    assert "idle has no influence" in messages
-    assert np.isnan(fitted["stderr"].values[2])
-
-
-def test_a_parameter_of_little_influence_is_named():
-    fitted = fit(closed_form(TRUTH), TRUTH, noise=2.0)
-    assert any("bottom_reflectance has little influence" in text for text in fitted.attrs["messages"])
-
-
 def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     """A scene whose scattering must not exceed its attenuation, as of renders; a full first step does."""
     refused = []
@@ -318,28 +211,7 @@ def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-4)
 
 
-def test_a_fit_that_ends_at_refused_values_says_so():
-    """The truth has an attenuation of 0.2, and the scene refuses more than 0.15."""
-
-    def model(values):
-        if values["attenuation"] > 0.15:
-            raise UserError("attenuation must not exceed 0.15")
-        return closed_form(values)
-
-    fitted = fit(closed_form(TRUTH), model=model, noise=0.002)
-    assert fitted["value"][0] <= 0.15
-    text = "steps were refused, at which the fit may have ended: attenuation must not exceed 0.15"
-    assert text in fitted.attrs["messages"]
-
-
-def test_few_renders_end_without_convergence():
-    fitted = fit(closed_form(TRUTH), noise=0.002, most_renders=3)
-    assert fitted.attrs["renders"] == 3
-    assert not fitted.attrs["converged"]
-    assert fitted.attrs["messages"][0] == "the fit has not converged in 3 renders"
-
-
-@pytest.mark.parametrize("complete", [0, 1, 2, 3, 4])
+@each_row("complete", [0, 1, 2, 3, 4])
 def test_an_interrupted_fit_has_its_last_step(complete):
     """Ctrl-C in the render after so many, of an approach with a coarse model and of the fit that follows it."""
     renders = []
@@ -369,20 +241,7 @@ def test_an_interrupted_fit_has_its_last_step(complete):
         np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=0.1)
 
 
-def test_some_pixels_are_fitted_by_their_names():
-    data = noisy(0.002, np.random.default_rng(7), pixels=("a", "b", "c")).isel(pixel=[2, 0])
-
-    def model(values):
-        return closed_form(values, pixels=("a", "b", "c"))
-
-    fitted = fit(data, model=model)
-    assert fitted["fitted"]["pixel"].values.tolist() == ["c", "a"]
-    assert abs(fitted["residual"]).max() < 6
-    with pytest.raises(UserError, match="the scene has no pixel c: its pixels are a, b"):
-        fit(data, model=lambda values: closed_form(values, pixels=("a", "b")))
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("options", "message"),
     [
         (
@@ -408,20 +267,3 @@ def test_some_pixels_are_fitted_by_their_names():
 def test_invalid_input_is_refused(options, message):
     with pytest.raises(UserError, match=message):
         fit(noisy(0.002, np.random.default_rng(8)), **options)
-
-
-def test_samples_without_value_or_error_are_left_out(tmp_path):
-    lines = [
-        f"{time},{light:.9g},0.002" for time, light in zip(TIME, closed_form(TRUTH)["waveform"][0].values, strict=True)
-    ]
-    lines[50], lines[60] = "50,,0.002", "60,7,"
-    (tmp_path / "gaps.csv").write_text("\n".join(["time_ns,single,single_stderr", *lines]))
-    fitted = fit(tmp_path / "gaps.csv", free_scale=False, free_time=False)
-    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-5)
-    assert np.flatnonzero(fitted["used"][0] == 0).tolist() == [50, 60]
-    assert fitted.attrs["expected"] == pytest.approx(TIME.size - 2 - len(TRUTH))
-
-
-def test_dark_waveforms_of_unknown_scale_are_refused():
-    with pytest.raises(UserError, match="the waveforms have no light where the scene has"):
-        fit(-1 * closed_form(TRUTH)[["waveform"]].assign_attrs(BIN), free_scale=True, noise=0.1)

@@ -62,7 +62,7 @@ def fit(path, factors, **options):
     return mitransient_lidar.fit(path, model, options.pop("free", list(TRUTH)), start=start, **options)
 
 
-@pytest.mark.parametrize("factors", [(0.6, 1.5, 0.75), (1.5, 0.6, 1.25), (1.5, 1.5, 0.8)])
+@pytest.mark.parametrize("factors", [(0.6, 1.5, 0.75)])
 def test_a_shifted_and_scaled_shot_is_found_from_wrong_starts(factors, tmp_path):
     """Depths wrong by a quarter: the fit aligned one echo alone, with a chi-squared of 30 times its mean."""
     fitted = fit(shot(tmp_path / "shot.csv"), factors, receiver="riegl_vq840g")
@@ -80,15 +80,6 @@ def test_light_lasts_to_the_bottom_however_bright_the_surface_is():
     assert light_duration(np.arange(100.0), lit) == 50
     lit[:, 60] = 0, 1e-5
     assert light_duration(np.arange(100.0), lit) == 50
-
-
-def test_the_squares_of_stored_residuals_are_the_chi_squared(tmp_path):
-    """With noise of the receiver, of the user, and unknown: the last one had those of other units."""
-    path = shot(tmp_path / "shot.csv")
-    for options in ({"receiver": "riegl_vq840g"}, {"noise": 0.05}, {}):
-        fitted = fit(path, (1, 1, 1), **options)
-        assert float(np.nansum(fitted["residual"] ** 2)) == pytest.approx(fitted.attrs["chi_squared"], rel=1e-9)
-        assert int(fitted["used"].sum()) == np.isfinite(fitted["residual"]).sum()
 
 
 def test_errors_grow_with_a_misfit_and_a_bad_fit_is_refused(tmp_path):
@@ -138,13 +129,3 @@ def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
     # A scene of which nothing is free has no derivatives.
     alone = BehindBandwidth(lambda _: model(TRUTH).drop_dims("parameter"))({"bandwidth_mhz": 80.0})
     assert alone["waveform_derivative"].sizes["parameter"] == 1
-
-
-def test_volts_behind_a_logarithm_are_expanded(tmp_path):
-    recorded = detect_waveforms(model(TRUTH), "pmt_log", seed=4, gain="auto")
-    samples = recorded["signal"].values.ravel() - np.median(recorded["signal"].values.ravel()[:20])
-    rows = [f"{t + SHIFT},{v:.6g}" for t, v in zip(recorded["time"].values, samples, strict=True)]
-    (tmp_path / "log.csv").write_text("\n".join(["time_ns,volts", *rows]))
-    fitted = fit(tmp_path / "log.csv", (0.8, 1.2, 0.9), receiver="pmt_log")
-    z = (fitted["value"].values[:3] - list(TRUTH.values())) / fitted["stderr"].values[:3]
-    assert np.abs(z).max() < 5, z

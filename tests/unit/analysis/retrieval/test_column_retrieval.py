@@ -5,12 +5,9 @@ import math
 import numpy as np
 import pytest
 from oracles.lidar_equation import bottom_energy, column_power, cos_water
+from rows import each_row
 
-from mitransient_lidar.analysis.retrieval.column_retrieval import (
-    bottom_class,
-    bottom_reflectance,
-    water_of_column,
-)
+from mitransient_lidar.analysis.retrieval.column_retrieval import bottom_class, bottom_reflectance, water_of_column
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -38,16 +35,11 @@ def test_water_of_its_own_level_and_decay():
         np.testing.assert_allclose(values, A + 0.0019623 + (BB - 0.0019623 / 2) / ratio, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid"])
+@each_row("name", ["jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid"])
 def test_bounds_of_attenuation_include_waters_by_name(name):
     water = water_of(*name.split())
     found = water_of_column(water.absorption, water.backscattering / (2 * np.pi), 0.0, 1.0)
     assert found.attenuation_low < water.attenuation < found.attenuation_high
-
-
-def test_columns_that_no_water_makes_are_nan():
-    found = water_of_column([0.05, np.nan, -0.1, 0.1, 0.1], [1e-3, 1e-3, 1e-3, np.nan, -1e-3], 0.06, 1.0)
-    assert np.isnan(found.kd).all()
 
 
 def test_reflectance_is_the_ratio_of_bottom_and_column():

@@ -1,11 +1,9 @@
 """Decay of the column signal: the fit and its error on synthetic records, and invalid input."""
 
-import logging
-
 import numpy as np
 import pytest
-from few_paths import few_paths
 from oracles.column_slope import effective_attenuation
+from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar import results
@@ -37,12 +35,6 @@ def record(attenuation, noise=0.0, seed=0, **changes):
     )
 
 
-def test_slope_without_geometry():
-    k, _ = effective_attenuation(record(0.2), 0.5, 9.0)
-    # Without the solid angle it would be 1/(n H) = 0.005 too steep.
-    assert k == pytest.approx(0.2, abs=1e-9)
-
-
 @pytest.mark.slow
 def test_standard_error_is_the_scatter_of_the_slope():
     found = np.array([effective_attenuation(record(0.2, noise=0.05, seed=seed), 1.0, 5.0) for seed in range(300)])
@@ -69,7 +61,7 @@ def test_jackknife_sees_correlated_bins():
     assert errors.mean() > 2 * independent
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("depths", "changes", "message"),
     [
         ((5, 1), {}, "max_depth = 1 m must be greater than min_depth = 5 m"),
@@ -88,17 +80,6 @@ def test_jackknife_sees_correlated_bins():
 def test_depths_that_do_not_serve(depths, changes, message):
     with pytest.raises(UserError, match=message):
         effective_attenuation(record(0.2, **changes), *depths)
-
-
-def test_a_column_without_signal():
-    dark = record(0.2)
-    dark["impulse_response"][:, 100:] = 0.0
-    with pytest.raises(UserError, match="the column has no signal in"):
-        effective_attenuation(dark, 1, 5)
-    noisy = record(0.2)
-    noisy["impulse_response_stderr"] = 0.8 * noisy["impulse_response"]
-    with pytest.raises(UserError, match=r"relative standard error, 0\.57 in its worst bin, must be at most 0\.5"):
-        effective_attenuation(noisy, 1, 5)
 
 
 SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_start_ns": 1330, "bin_count": 80}
@@ -128,28 +109,3 @@ SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_s
 def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
     with pytest.raises(UserError, match=message):
         fov_sweep("table1", {**SCENE, "bin_count": 110, **params}, fov_mrad=fields, **{"passes": 4, **options})
-
-
-def test_fields_of_view_are_given_by_name():
-    with pytest.raises(UserError, match=r"params = \[5, 10\] must be a dict of names and values"):
-        fov_sweep("table1", [5, 10])
-
-
-@pytest.mark.slow
-def test_the_time_leaves_out_the_widest_fields_of_view(caplog, tmp_path):
-    options, scene = {"passes": 4, "seed": 1}, few_paths("table1", tmp_path)
-    found = fov_sweep(scene, {**SCENE, "bin_count": 110}, fov_mrad=[15, 10, 20], max_time=0.01, **options)
-    assert found["field_of_view"].values.tolist() == [10]
-    assert found.attrs["left_out_mrad"] == "15, 20"
-    assert "fields of view of 15, 20 mrad are left out" in caplog.text
-    whole = fov_sweep(scene, {**SCENE, "bin_count": 110}, fov_mrad=[10], **options)
-    assert whole.attrs["left_out_mrad"] == ""
-
-
-@pytest.mark.slow
-def test_a_small_surface_is_warned_of(caplog):
-    params = {**SCENE, "off_nadir_deg": 20, "time_start_ns": 1400, "attenuation": 1, "scattering": 0.9}
-    params |= {"surface_size": 4, "surface_cell_size": 0.25}
-    with caplog.at_level(logging.WARNING):
-        fov_sweep("table1", params, fov_mrad=[15], passes=4, max_depth=3)
-    assert "the surface is smaller than the spread of the light" in caplog.text

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
+from rows import each_row
 from scipy.stats import truncnorm
 from synthetic_shots import (
     ANGLE_X,
     ANGLE_Y,
     BB,
-    BINS,
     C0,
     COS_WATER,
     DEPTH,
@@ -36,41 +36,6 @@ from mitransient_lidar.plots import retrieval
 from mitransient_lidar.rendering.shots import series as shot_series
 
 pytestmark = pytest.mark.usefixtures("scattered_once")
-
-
-@pytest.mark.slow
-def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
-    """A plane of 40 degrees along, in a sea whose slopes have a standard deviation of 0.1 in each direction."""
-    shot = result(np.stack([waveform(delay) for delay in plane_delays(0.84, 0.05)]), surface_slope_variance=0.02)
-    found = retrieve.surface_slopes(shot)
-    assert math.isnan(found["slope_along"])
-    assert math.isnan(found["slope_along_stderr"])
-    assert float(found["slope_refused"]) == 1
-    assert float(found["slope_across"]) == pytest.approx(0.05, abs=0.03)
-    assert found.attrs["steepest_slope"] == pytest.approx(0.5)
-    results.save(shot, tmp_path / "shot.nc")
-    done = run("retrieve", tmp_path / "shot.nc")
-    assert "slope along: refused, an estimate is steeper than 0.50, beyond what the sea has" in done.output
-    # With a prior, only the prior is left.
-    along = retrieve.surface_slopes(shot, slope_deviation=(0.1, 0.1))
-    assert (float(along["slope_along"]), float(along["slope_along_stderr"])) == (0.0, pytest.approx(0.1))
-    kept = retrieve.surface_slopes(result(shot["waveform"].values))
-    assert float(kept["slope_along"]) == pytest.approx(0.84, rel=0.1)
-    assert float(kept["slope_refused"]) == 0
-
-
-def test_a_receiver_of_one_pixel_gives_bottom_and_water():
-    """Refused for want of slopes before, which neither needs."""
-    one = result(4 * waveform()[np.newaxis])
-    found = retrieve.retrieve(one)
-    assert np.isnan(found["slope_along"])
-    assert float(found["surface_height"]) == pytest.approx(0, abs=0.1)
-    assert float(found["depth_m"].sel(correction="level")) == pytest.approx(DEPTH, abs=0.02)
-    # The error of the surface's range by a glint of 4 ns is an optical depth of 0.03.
-    np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.04)
-    np.testing.assert_allclose([found["absorption"], found["backscattering"]], [A, BB], rtol=0.05)
-    with pytest.raises(UserError, match="at least 2 pixels"):
-        retrieve.surface_slopes(one)
 
 
 def test_the_tail_of_a_bottom_counts_and_its_focusing_does_not():
@@ -133,29 +98,6 @@ def of_a_sea(**changes):
     outlines = json.dumps([[line.ravel().tolist()] for line in lines])
     values = changes.pop("values", None)
     return result(values, **{"pixel_outlines": outlines, "divergence_mrad": 10.0, **sea, **changes})
-
-
-@pytest.mark.slow
-def test_strengths_and_the_sea_count():
-    """Echoes of a level sea at the same times, ten times fainter: a face away; with a wind that is given or known."""
-    bright, faint = (
-        retrieve.surface_slopes(of_a_sea(values=np.stack([waveform(t, glint=glint) for t in plane_delays(0, 0)])))
-        for glint in (5e-12, 5e-13)
-    )
-    assert bright.attrs["slope_method"] == "times and strengths"
-    assert float(bright["slope_along"]) > float(faint["slope_along"]) + 0.02
-    # The slopes of the sea over this beam vary by 0.06 and 0.04.
-    np.testing.assert_allclose(bright.attrs["slope_prior_deviation"][:2], [0.06, 0.04], rtol=0.15)
-    assert float(bright["slope_along_stderr"]) < 0.7 * bright.attrs["slope_prior_deviation"][0]
-    given = retrieve.surface_slopes(of_a_sea(**{"scene.spectrum": "jonswap"}), wind_speed=6, wind_direction_deg=0)
-    xr.testing.assert_allclose(given, retrieve.surface_slopes(of_a_sea()))
-    across_wind = retrieve.surface_slopes(of_a_sea(), wind_direction_deg=90)
-    np.testing.assert_allclose(across_wind.attrs["slope_prior_deviation"][:2], [0.04, 0.06], rtol=0.15)
-    no_scale = of_a_sea()
-    del no_scale.attrs["two_way_efficiency"]
-    assert retrieve.surface_slopes(no_scale).attrs["slope_method"] == "times on a sea"
-    flat = retrieve.surface_slopes(of_a_sea(**{"scene.spectrum": "height_map"}))
-    assert flat.attrs["slope_method"] == "times"
 
 
 def test_corrections_that_do_not_help_are_not_applied():
@@ -244,51 +186,6 @@ def test_errors_of_depths_hold_slope_and_range():
     assert found == pytest.approx(math.hypot(0.01 * turn, 0.1 * per_range), rel=0.02)
 
 
-def test_estimate_has_all_known_quantities():
-    found = retrieve.retrieve(result())
-    assert {"slope_along", "reflectance", "kd"} <= set(found)
-    narrow = retrieve.retrieve(result(field_of_view_mrad=20.0))
-    assert "kd" not in narrow
-    dark = result(np.stack([waveform(delay, depth=30.0) for delay in plane_delays(0, 0)]))
-    assert np.isnan(retrieve.retrieve(dark)["depth_m"]).all()
-
-
-def short(bins=0, depth=DEPTH):
-    """Four pixels whose record ends before the bottom, or whose column is too short to be fitted."""
-    shot = result(np.stack([waveform(delay, depth=depth) for delay in plane_delays(0.1, 0.0)]))
-    return shot.isel(time=slice(0, bins or None))
-
-
-@pytest.mark.slow
-def test_estimates_without_a_column(tmp_path, caplog):
-    """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
-    for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):
-        caplog.clear()
-        found = retrieve.retrieve(shot)
-        assert float(found["slope_along"]) == pytest.approx(0.1, abs=0.02)
-        assert float(found["depth_m"].sel(correction="slope")) == pytest.approx(depth, abs=0.1, nan_ok=True)
-        assert np.isnan(found["reflectance"]).all()
-        assert np.isnan(found["class_probability"]).all()
-        assert np.isnan(found["kd"])
-        assert caplog.messages == [
-            "no waveform has a column long enough for a fit: the reflectance of the bottom is unknown"
-        ]
-        results.save(shot, tmp_path / "short.nc")
-        done = run("retrieve", tmp_path / "short.nc")
-        assert done.exit_code == 0, done.output
-        unseen = (
-            "bottom: not observable, no echo" if math.isnan(depth) else "bottom reflectance: not observable, no column"
-        )
-        for text in ("slope along: +0.1", unseen, "water: not observable, no column that can be fitted"):
-            assert text in done.output
-        assert "nan" not in done.output
-
-
-def test_no_estimate():
-    with pytest.raises(UserError, match="nothing can be estimated: no waveform has a surface echo"):
-        retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
-
-
 @pytest.mark.slow
 def test_command(tmp_path):
     results.save(result(), tmp_path / "shot.nc")
@@ -343,33 +240,13 @@ def test_estimates_of_a_series_are_compared_with_its_truth(shots_with_truth):
         retrieval.plot_retrieval(found.drop_vars([name for name in found.coords if str(name).startswith("true_")]))
 
 
-@pytest.mark.slow
-def test_command_lists_the_shots_of_a_series(shots_with_truth, tmp_path):
-    results.save(shots_with_truth.assign_attrs(slope_deviation=[0.05, 0.04]), tmp_path / "shots.nc")
-    options = ["-o", tmp_path / "found.nc", "--figure", tmp_path / "found.png"]
-    done = run("retrieve", tmp_path / "shots.nc", *options)
-    assert done.exit_code == 0, done.output
-    lines = done.stdout.splitlines()
-    assert lines[0].split()[:4] == ["shot", "slope", "along", "true"]
-    assert [line.split()[0] for line in lines[1:4]] == ["0", "1", "2"]
-    assert lines[-3].startswith("depth (m): bias ")
-    assert lines[-2:] == [str(tmp_path / "found.nc"), str(tmp_path / "found.png")]
-    kept = xr.load_dataset(tmp_path / "found.nc", engine="h5netcdf")
-    expected = retrieve.retrieve(shots_with_truth, slope_deviation=(0.05, 0.04))
-    np.testing.assert_allclose(kept["slope_along_stderr"], expected["slope_along_stderr"])
-    np.testing.assert_allclose(kept["true_surface_height"], [0.0, 0.2, -0.3])
-    results.save(result(), tmp_path / "one.nc")
-    sentence = "needs a series of shots with true slopes"
-    assert_refused(run("retrieve", tmp_path / "one.nc", "--figure", tmp_path / "one.png"), sentence)
-
-
 def drop(name):
     shot = result()
     del shot.attrs[name]
     return shot
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("call", "sentence"),
     [
         (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),

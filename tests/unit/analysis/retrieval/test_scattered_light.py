@@ -18,7 +18,6 @@ VIEW = View(SYSTEM, radius=15e-3, centre=0.0, beam=5e-3, slope_variance=0.0183, 
 # column's exponential, and the optical depth of both ways to the bottom less that of this exponential.
 RENDERED = {
     "1C at 8 m": (0.09757, 0.008851, (2.15, 7.10), 8.413, 0.1361, 0.001741, 0.102),
-    "3C at 8 m": (0.15301, 0.012859, (2.15, 7.10), 8.452, 0.2076, 0.002716, 0.183),
     "5C at 8 m": (0.22715, 0.023088, (2.15, 7.32), 8.570, 0.3187, 0.005945, 0.394),
 }
 

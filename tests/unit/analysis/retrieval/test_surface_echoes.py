@@ -4,15 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from oracles.two_scale import two_scale_ratio
-from significance import largest_z
 
-from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
-from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 THETA, HEIGHT, BEAM, N = math.radians(20), 200.0, 2e-3, 1.34
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 10e-3
@@ -26,10 +20,7 @@ def lidar(*outlines, beam=BEAM, height=HEIGHT):
 
 @pytest.mark.parametrize(("along", "across", "wind"), [(0, 0, 0), (0.15, 0, 0), (-0.1, 0.2, 0), (0.1, -0.1, 0.7)])
 def test_plane(along, across, wind):
-    """E = Q A F(0) D/(4 cos R^2) for a beam within the pixel, at the time of the plane on the axis.
-
-    Slopes of the ray against the facet are components of its tangent; the ripples' axes follow from their definition.
-    """
+    """E = Q A F(0) D/(4 cos R^2) for a beam within the pixel, at the time of the plane on the axis."""
     lines = np.linspace(-4, 4, 401)
     x, y = (one.ravel()[np.newaxis] for one in np.meshgrid(lines, lines))
     variances = (0.02, 0.03)
@@ -48,12 +39,6 @@ def test_plane(along, across, wind):
     assert time[0, 0] == pytest.approx(2e9 * distance / C0, abs=0.03)
 
 
-def test_lidars_just_above_waves_are_refused():
-    """The places at which waves may reflect the light of a narrow beam are millions for each shot."""
-    with pytest.raises(UserError, match=r"altitude = 0.1: the light of a shot meets these waves at up to \d+ places"):
-        sea_shots(lidar([SQUARE], height=0.1), 3.0, 0.0)
-
-
 def test_pixels_share_the_light():
     """A level sea in two halves: equal energies that sum to that of both, and nothing in a pixel off the beam."""
     lines = np.linspace(-4, 4, 200)
@@ -66,42 +51,3 @@ def test_pixels_share_the_light():
     # A hole takes its light away: that beyond 3 mrad in either angle remains.
     hole, whole = lidar([SQUARE, 0.3 * SQUARE], [SQUARE]).echoes(*points)[0][0]
     assert hole / whole == pytest.approx(1 - math.erf(1.5 / math.sqrt(2)) ** 2, rel=0.05)
-
-
-def footprint_variances(wind, direction, spread):
-    """Variances of the slopes along and across averaged with a Gaussian, from the spectrum."""
-    spectrum = MatchedSpectrum(ElfouhailySpectrum(wind), *cox_munk(wind))
-    k, weight = spectrum.quadrature()
-    curvature = spectrum.omnidirectional(k) * k**2 * weight * np.exp(-((k * spread) ** 2))
-    up, cross = (np.sum(curvature * (0.5 + sign * spectrum.spreading(k) / 4)) for sign in (1, -1))
-    cos, sin = math.cos(direction) ** 2, math.sin(direction) ** 2
-    return up * cos + cross * sin, up * sin + cross * cos
-
-
-@pytest.mark.parametrize(
-    ("wind", "direction"),
-    [pytest.param(10.0, 0.4, marks=pytest.mark.slow), pytest.param(3.0, 0.0, marks=pytest.mark.long)],
-)
-def test_seas_have_the_slopes_and_mean_echo_of_their_spectrum(wind, direction):
-    """Eight independent sets of seas: their spread is the standard error."""
-    beam = 5e-3
-    sets = [sea_shots(lidar([SQUARE * 2], beam=beam), wind, direction, seed=100 * seed) for seed in range(8)]
-    spread = HEIGHT / math.cos(THETA) * beam / math.sqrt(math.cos(THETA))
-    total = cox_munk(wind)
-    # Cells of a quarter of the beam hold the share of the spectrum below their size; the ripples have the rest.
-    cell = 0.25 * HEIGHT / math.cos(THETA) * beam
-    resolved = footprint_variances(wind, 0.0, 0.35 * cell)
-    ratio = two_scale_ratio(resolved, tuple(t - r for t, r in zip(total, resolved, strict=True)), THETA, direction)
-    tilt = math.tan(THETA) * np.array([math.cos(direction), math.sin(direction)])
-    density = math.exp(-0.5 * np.sum(tilt**2 / total)) / (2 * math.pi * math.sqrt(total[0] * total[1]))
-    distance = HEIGHT / math.cos(THETA)
-    level = REFLECTANCE * density / (4 * math.cos(THETA) ** 5 * distance**2)
-    samples = [[np.mean(one.along**2), np.mean(one.across**2), np.mean(one.energy)] for one in sets]
-    expected = (*footprint_variances(wind, direction, spread), ratio * level)
-    z = (np.mean(samples, axis=0) - expected) / (np.std(samples, axis=0, ddof=1) / math.sqrt(len(sets)))
-    assert np.abs(z).max() < largest_z(len(sets), 9)
-
-
-def test_wind_out_of_range():
-    with pytest.raises(UserError, match=r"wind_speed = 0\.5 must lie between 1 and 30"):
-        sea_shots(lidar([SQUARE]), 0.5, 0.0)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 from scipy.signal import fftconvolve
-from scipy.special import ndtr
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import echo_table
@@ -13,13 +13,6 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
-
-
-def test_a_gaussian_pulse_is_one_gaussian():
-    shape = EchoShape.of(Template.of(Pulse.gaussian(5.0), 0.5))
-    assert shape.delays.tolist() == pytest.approx([0], abs=1e-9)
-    assert shape.sigma == pytest.approx(5.0 / np.sqrt(8 * np.log(2)), rel=0.005)
-    assert shape.width_of(np.array([2 * shape.sigma]))[0][0] == pytest.approx(2 * shape.fwhm_ns)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +32,7 @@ def test_other_shapes_are_sums_of_gaussians_within_a_hundredth(fwhm, bin_ns, tau
     assert shape.width_of(np.array([wide]))[0][0] == pytest.approx((half[-1] - half[0]) * bin_ns / 15, rel=0.06)
 
 
-@pytest.mark.parametrize("name", ["apd", "pmt", "photodiode", "sipm", "ideal"])
+@each_row("name", ["apd", "pmt", "photodiode", "sipm", "ideal"])
 def test_template_of_a_receiver_is_the_mean_record_of_an_echo(name):
     """Arrival, height and tail of the closed form of the receiver, which does not know of templates."""
     chain, bin_ns = RECEIVERS[name], 1.0
@@ -74,16 +67,7 @@ def test_onset_is_the_blurred_column_and_has_its_derivatives(sigma):
     np.testing.assert_allclose(second, np.interp(at, fine, np.gradient(slope, 0.01)), atol=0.03 / sigma**2)
 
 
-def test_onset_without_waves_is_the_normal_distribution():
-    time = np.linspace(-5, 5, 11)
-    value, first, second = ColumnOnset().at(time, np.full(11, 2.0))
-    np.testing.assert_allclose(value, ndtr(time / 2))
-    np.testing.assert_allclose(first, np.gradient(ndtr(np.linspace(-5, 5, 100001) / 2), 1e-4)[::10000], atol=1e-6)
-    np.testing.assert_allclose(second, -time / 4 * first)
-    assert Focusing.from_attributes({}) is None
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("depths", "factors"),
     [
         ([1.0, 2.0], [1.0]),

@@ -61,15 +61,6 @@ def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
     assert 0.8 < z.std() < np.sqrt(largest_chi2(shots) / shots)
 
 
-def test_a_late_echo_in_a_lit_pixel_is_replaced():
-    level = lines(1).surface_time
-    late = level + np.array([0, 0, 12.0, 0, np.nan])
-    found = infer(late)
-    assert found.own.tolist() == [[True, True, False, True, False]]
-    np.testing.assert_allclose(found.time_ns, level)
-    assert found.stderr_ns[0, 2] > 0.3
-
-
 def test_an_echo_outside_the_heights_of_the_sea_is_not_the_surface():
     """A bottom 8 m deep, 75 ns late in all pixels, refers to the mean sea level, whose heights are its error."""
     found = infer(lines(1).surface_time + 75)
@@ -138,18 +129,3 @@ def test_clocks_and_trigger_between_a_surface_and_later_echoes(height):
         clock_ns=clock,
     )
     np.testing.assert_allclose(late.stderr_ns**2 - none.stderr_ns**2, trigger**2 + clock**2)
-
-
-def test_unknown_shares_leave_the_times_as_they_are():
-    time = lines(1).surface_time + np.array([0, 30, 0, 0, np.nan])
-    found = infer(time, share=np.full(5, np.nan))
-    np.testing.assert_array_equal(found.time_ns, time)
-    assert found.own.tolist() == [[True, True, True, True, False]]
-
-
-@pytest.mark.parametrize("pixel", [0, 3])
-def test_a_pixel_without_an_echo_takes_the_others(pixel):
-    time = lines(1).surface_time - 3.0
-    time[0, pixel] = np.nan
-    found = infer(time, heights=(-np.inf, np.inf))
-    assert found.time_ns[0, pixel] == pytest.approx(lines(1).surface_time[0, pixel] - 3.0)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 from scipy.stats import norm
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
 
 
 @pytest.mark.parametrize("response", ["single_pole", "gaussian"])
@@ -24,8 +24,8 @@ def test_low_pass_halves_the_power_at_the_bandwidth(response):
     assert delay == pytest.approx(1 / (2 * np.pi * frequency) if response == "single_pole" else 0, rel=1e-3, abs=1e-9)
 
 
-@pytest.mark.parametrize("width", [0.1, 1.0, 7.0])
-@pytest.mark.parametrize("response", ["single_pole", "gaussian"])
+@each_row("width", [0.1, 1.0, 7.0])
+@each_row("response", ["single_pole", "gaussian"])
 def test_samples_see_each_charge_once_and_in_its_time(response, width):
     """Steady light, an echo in one bin, and the bins that a sample depends on."""
     low_pass = Amplifier(1.0, bandwidth_mhz=100.0, response=response).low_pass(width)
@@ -46,10 +46,8 @@ def test_samples_see_each_charge_once_and_in_its_time(response, width):
     np.testing.assert_array_equal(every, matrix[:, ::3])
 
 
-@pytest.mark.parametrize("width", [0.1, 1.0, 4.0])
-@pytest.mark.parametrize(
-    ("response", "factor"), [("single_pole", np.pi / 2), ("gaussian", np.sqrt(np.pi / np.log(16)))]
-)
+@each_row("width", [0.1, 1.0, 4.0])
+@each_row(("response", "factor"), [("single_pole", np.pi / 2), ("gaussian", np.sqrt(np.pi / np.log(16)))])
 def test_thermal_noise_behind_the_bandwidth(response, factor, width):
     """4 k T/R times the equivalent noise bandwidth, 1.571 and 1.064 times that of half power, for bins of any width."""
     amplifier = Amplifier(50.0, load_ohm=50.0, temperature_k=300.0, bandwidth_mhz=100.0, response=response)
@@ -61,24 +59,6 @@ def test_thermal_noise_behind_the_bandwidth(response, factor, width):
     rho = np.exp(-angle) if response == "single_pole" else np.exp(-(angle**2) / (4 * np.log(2)))
     assert np.sum(weights**2) == pytest.approx(1)
     assert np.sum(weights[1:] * weights[:-1]) == pytest.approx(rho, abs=1e-6)
-
-
-def test_amplifier_noise_without_a_low_pass_is_that_of_the_bins():
-    # White noise averaged over 1 ns has the bandwidth of 500 MHz; 3 and 4 pA/sqrt(Hz) together are 5.
-    density = 4 * 1.380649e-23 * 293.15 / (4e-12) ** 2
-    amplifier = Amplifier(1e3, noise_pa_per_rthz=3.0, load_ohm=density)
-    deviation, weights = amplifier.noise(1.0, 5)
-    assert deviation == pytest.approx(1e3 * 5e-12 * np.sqrt(5e8))
-    assert weights == np.ones(1)
-    record = np.arange(6.0)
-    np.testing.assert_array_equal(amplifier.low_pass(1.0).sampled(record, 1), record)
-
-
-def test_filtered_is_causal_and_ordered():
-    record = np.zeros((2, 8))
-    record[1, 3] = 2.0
-    np.testing.assert_allclose(filtered(record, np.array([0.5, 0.3, 0.2]))[1], [0, 1.0, 0.6, 0.4, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(filtered(record, np.array([2.0])), 2 * record)
 
 
 def test_logarithm():
@@ -119,7 +99,7 @@ def test_rounding_noise():
     assert np.all(samples.var(axis=0) > sigma**2 * (1 + limit))
 
 
-@pytest.mark.parametrize("mean", [-1.5, -0.9, 0.2, 0.95, 3.0])
+@each_row("mean", [-1.5, -0.9, 0.2, 0.95, 3.0])
 def test_limits_of_the_amplifier(mean):
     # Censored normal distribution in closed form.
     sigma, a, b = 0.3, -1.0, 1.0
@@ -135,7 +115,7 @@ def test_limits_of_the_amplifier(mean):
     assert found.saturation[0] == pytest.approx(norm.cdf(low) + norm.sf(high), abs=1e-12)
 
 
-@pytest.mark.parametrize("mean", [-2e-3, 0.0, 2e-3, 2e-2, 0.5])
+@each_row("mean", [-2e-3, 0.0, 2e-3, 2e-2, 0.5])
 def test_logarithm_of_noise(mean):
     # The quadrature against quantiles of the normal distribution.
     stage = Readout(0.8, LogAmplifier(0.3, 1e-3), Digitiser(16, 1.2, -0.4))
@@ -146,31 +126,3 @@ def test_logarithm_of_noise(mean):
     assert found.mean[0] == pytest.approx(samples.mean(), abs=2e-5)
     assert found.variance[0] == pytest.approx(samples.var(), rel=1e-4, abs=1e-15)
     assert found.saturation[0] == pytest.approx(saturated.mean(), abs=1e-5)
-
-
-def test_logarithm_saturates_at_its_input():
-    # 0.3 V a decade and the top code at 0.6 V: ten to the 2 times the knee.
-    stage = Readout(None, LogAmplifier(0.3, 1e-3), Digitiser(16, 0.6, 0.0))
-    samples, saturated = stage.read(np.array([0.09, 0.11, -1e-3]))
-    np.testing.assert_array_equal(saturated, [False, True, True])
-    assert samples[1] == pytest.approx(0.6, rel=1e-4)
-    still = stage.expected(np.array([0.09, 0.11, -1e-3]), np.zeros(3))
-    np.testing.assert_allclose(still.mean, samples, atol=1e-5)
-    np.testing.assert_array_equal(still.saturation, [0, 1, 1])
-
-
-def test_samples_fall_on_bins():
-    assert Digitiser(8, 1.0).stride(0.3) == 1
-    assert Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.25) == 4
-    assert Digitiser(8, 1.0, sampling_ghz=0.3).stride(1 / 0.3) == 1
-    with pytest.raises(ValueError, match=r"sampling_ghz = 1 must give an integer number of bins of 0.3 ns .* 3.33333"):
-        Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
-    with pytest.raises(ValueError, match="sampling_ghz = 2"):
-        Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
-
-
-def test_stages_that_lack_another_are_refused():
-    with pytest.raises(UserError, match="block_after = 5 needs block_threshold_v"):
-        Digitiser(8, 1.0, block_after=5)
-    with pytest.raises(UserError, match="response = 'boxcar'"):
-        Amplifier(1.0, response="boxcar")

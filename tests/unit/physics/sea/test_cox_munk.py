@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from oracles.wave_spectra import mesh_slope_variance
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
@@ -19,8 +20,8 @@ def test_cox_munk_totals(wind, total):
     assert up + cross == pytest.approx(total, rel=0.01)
 
 
-@pytest.mark.parametrize("wind", [1, 3, 10])
-@pytest.mark.parametrize("kind", [ElfouhailySpectrum, PiersonMoskowitzSpectrum])
+@each_row("wind", [1, 3, 10])
+@each_row("kind", [ElfouhailySpectrum, PiersonMoskowitzSpectrum])
 def test_matched_waves_leave_ripples_to_every_mesh(kind, wind):
     """Refining the mesh moves variance from the ripples to the facets; nothing is counted twice."""
     matched = MatchedSpectrum(kind(wind, direction=0.5), *cox_munk(wind))
@@ -34,13 +35,6 @@ def test_matched_waves_leave_ripples_to_every_mesh(kind, wind):
         before = ripples
 
 
-def normal_grid(reach=9.0, count=721):
-    """Return crosswind and upwind slopes over their standard deviations, and the Gaussian's integral of each node."""
-    nodes = np.linspace(-reach, reach, count)
-    x, y = np.meshgrid(nodes, nodes)
-    return x, y, np.exp(-0.5 * (x**2 + y**2)) / (2 * np.pi) * (nodes[1] - nodes[0]) ** 2
-
-
 @pytest.mark.parametrize(
     ("wind", "nadir", "looking_upwind", "looking_downwind"), [(6, 1.109, 1.188, 0.743), (10, 1.109, 0.95, 0.87)]
 )
@@ -51,39 +45,6 @@ def test_series_at_20_degrees(wind, nadir, looking_upwind, looking_downwind):
     assert series.ratio(0.0, 0.0) == pytest.approx(nadir, abs=5e-4)
     assert series.ratio(0.0, slope) == pytest.approx(looking_upwind, abs=5e-3)
     assert series.ratio(0.0, -slope) == pytest.approx(looking_downwind, abs=5e-3)
-
-
-def test_series_has_the_moments_of_its_terms():
-    series = GramCharlierSeries(-0.05, -0.16, 0.4, 0.12, 0.23)
-    x, y, gaussian = normal_grid()
-    density = gaussian * series.ratio(x, y)
-
-    def mean(values):
-        return float(np.sum(density * values))
-
-    found = [mean(one) for one in (np.ones_like(x), x, y, x * x, y * y, x * y, x * x * y, y**3, x**3)]
-    assert found == pytest.approx([1, 0, 0, 1, 1, 0, 0.05, 0.16, 0], abs=1e-9)
-    assert [mean(x**4) - 3, mean(x * x * y * y) - 1, mean(y**4) - 3] == pytest.approx([0.4, 0.12, 0.23], abs=1e-9)
-    for angle in (0.3, 2.0, 4.5):
-        across, up = np.sin(angle), np.cos(angle)
-        slope = across * x + up * y
-        wanted = mean(slope**3), mean(slope**4) - 3
-        assert series.along(across, up) == pytest.approx(wanted, abs=1e-9)
-
-
-def test_waves_and_ripples_together_have_the_series():
-    """The ripples' density, averaged over Gaussian slopes of waves, is the whole series."""
-    total, part = cox_munk(6.0), (0.6 * cox_munk(6.0)[0], 0.7 * cox_munk(6.0)[1])
-    series = GramCharlierSeries.of_clean_sea(6.0)
-    ripples = series.of_part(total, part)
-    x, y, gaussian = normal_grid(reach=7.0, count=281)
-    sigma = np.sqrt(np.array([total, part, np.subtract(total, part)]))
-    for up, across in ((0.0, 0.0), (0.3, 0.1), (-0.25, 0.2)):
-        u, c = ((slope - sigma[2, i] * node) / sigma[1, i] for slope, node, i in ((up, y, 0), (across, x, 1)))
-        density = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[1].prod()) * ripples.ratio(c, u)
-        u, c = up / sigma[0, 0], across / sigma[0, 1]
-        wanted = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[0].prod()) * series.ratio(c, u)
-        assert np.sum(gaussian * density) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_series_of_strong_wind_or_a_small_part_is_refused():

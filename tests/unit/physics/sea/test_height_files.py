@@ -16,6 +16,7 @@ import pytest
 import rasterio
 import xarray as xr
 from array_inputs import write_bag
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.height_maps import read_height_map
@@ -242,7 +243,7 @@ READ = {
 }
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("kind", "content", "options"),
     [pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in READ.items() for row in rows],
 )
@@ -334,7 +335,7 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("kind", "content", "options", "message"),
     [pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in REFUSED.items() for row in rows],
 )
@@ -344,7 +345,7 @@ def test_what_is_no_height_is_refused_in_one_sentence(tmp_path, kind, content, o
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("kind", "content", "options"),
     [
         # Declared by the file, to six digits in the cells of a header of sixteen.
@@ -369,13 +370,6 @@ def test_declared_holes_are_refused_or_filled(tmp_path, kind, content, options):
     found = read(tmp_path, kind, content, holes="fill", **options)
     np.testing.assert_allclose(found.heights[:, :-1], -5, rtol=0, atol=1e-6)
     assert found.filled.sum() == 12
-
-
-def test_a_deep_sea_is_no_missing_value(tmp_path):
-    """Depths about 9999 m, as in a trench, are depths."""
-    values = -9999.0 + 10 * HEIGHTS + 50
-    values[0, 0] = -9999.0
-    assert read(tmp_path, "tif", Content(values)).heights.min() == -9999
 
 
 def test_the_log_states_what_the_file_does(tmp_path, caplog):

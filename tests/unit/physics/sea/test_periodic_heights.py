@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from oracles.wave_spectra import mesh_slope_variance
-from significance import assert_equal
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import Motion, realise_heights
@@ -12,13 +11,6 @@ from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 STILL = Motion(0.0, 1e4, (0.0, 0.0))
 SEA = MatchedSpectrum(ElfouhailySpectrum(6.0), *cox_munk(6.0))
-
-
-def facet_slopes(waves, cell, count, first=0):
-    """Return the slopes along x and y of square cells of a patch that starts at a whole number of cells."""
-    lines = cell * (first + np.arange(count + 1))
-    heights = waves.sample(lines, lines)
-    return np.diff(heights, axis=1)[:-1] / cell, np.diff(heights, axis=0)[:, :-1] / cell
 
 
 @pytest.mark.parametrize(("period", "cell"), [(128.0, 0.06), (512.0, 0.2)])
@@ -30,16 +22,6 @@ def test_bands_resolve_the_slope_variance_of_one_fine_grid(period, cell):
     # One grid of the same cells over the shortest period that still holds the long waves to 1 %.
     cells = 2 * round(0.5 * 96.0 / found)
     np.testing.assert_allclose(variance, mesh_slope_variance(SEA, cells * found, cells, 0.0), rtol=0.01)
-
-
-@pytest.mark.slow
-def test_facets_have_the_stated_slope_variance():
-    """Over 12 seas, along and across the wind."""
-    mean_squares = []
-    for seed in range(12):
-        waves, cell, variance = realise_heights(SEA, 64.0, 0.03, seed, STILL, 0.0)
-        mean_squares.append([np.mean(slopes**2) for slopes in facet_slopes(waves, cell, 300, 300 * seed)])
-    assert_equal(mean_squares, variance, error=0.07)
 
 
 @pytest.mark.slow
@@ -58,14 +40,6 @@ def test_long_waves_are_those_of_a_coarse_sea():
         assert len(coarse.parts) == 1
         assert spacing == 0.25
         assert low < np.corrcoef(averaged.ravel(), coarse.sample(lines, lines).ravel())[0, 1] < high
-
-
-def test_sea_of_bands_repeats_after_its_period():
-    waves, cell, _ = realise_heights(SEA, 128.0, 0.06, 1, STILL, 0.0)
-    lines = cell * np.arange(50)
-    period = round(128.0 / cell) * cell
-    assert period == pytest.approx(128.0, abs=1e-9)
-    np.testing.assert_allclose(waves.sample(lines, lines), waves.sample(lines + period, lines - period), atol=1e-9)
 
 
 @pytest.mark.slow

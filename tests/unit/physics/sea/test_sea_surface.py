@@ -1,22 +1,13 @@
 """Seas of different cells: the same waves, the same slope variance, and the same surface echo."""
 
-import math
-
 import numpy as np
 import pytest
-from oracles.two_scale import two_scale_ratio
-from scipy.ndimage import gaussian_filter
-from significance import assert_equal
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.realization import Band, Motion, realise_heights
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
-
-PERIOD = 32.0
 
 
 def read(**parameters):
@@ -36,10 +27,7 @@ def variance_of_long_waves(wind, shortest):
 @pytest.mark.parametrize("wind", [3.0, 6.0, 12.0])
 @pytest.mark.parametrize("shortest", [4.0, 1.5])
 def test_facets_have_the_slope_variance_of_the_waves_that_they_hold(wind, shortest):
-    """From the integral of the spectrum; a facet of size d loses k^2 d^2/12 to the ripples: little, and less if halved.
-
-    A wave in three cells, as before, would lose a quarter.
-    """
+    """From the integral of the spectrum; a facet of size d loses k^2 d^2/12 to the ripples, and less if halved."""
     expected = np.array(variance_of_long_waves(wind, shortest))
     lost = []
     for cells_per_wave in (12, 24):
@@ -58,88 +46,6 @@ def test_a_breath_of_wind_makes_no_waves(wind):
     """The wavenumber of its peak overflows."""
     sea = read(spectrum="elfouhaily", wind_speed=wind)
     assert np.all(sea.heights(np.arange(5.0), np.arange(4.0)) == 0)
-
-
-def test_finer_cells_show_the_same_waves():
-    """Points of both grids: the same heights, whether in one grid or, too fine for one, as a sum of waves."""
-    spectrum = MatchedSpectrum(ElfouhailySpectrum(6.0), *cox_munk(6.0))
-    still = Motion(3.0, 1e4, (0.5, 0.0))
-    coarse, fine, finest = (
-        realise_heights(spectrum, 64.0, cell, 4, still, 0.0, 1.0)[0] for cell in (0.25, 0.0625, 0.015625)
-    )
-    assert isinstance(finest.parts[0], Band)
-    lines = 0.25 * np.arange(-20, 20)
-    expected = coarse.sample(lines, lines)
-    assert expected.std() > 0.03
-    for waves in (fine, finest):
-        np.testing.assert_allclose(waves.sample(lines, lines), expected, atol=1e-12)
-    other = realise_heights(spectrum, 64.0, 0.25, 4, still, 0.0, 0.6)[0].sample(lines, lines)
-    assert 1e-4 < np.std(other - expected) < 0.1 * expected.std()
-
-
-def slopes_of(sea):
-    """Return the slopes along x and y of both triangles of each cell over one period."""
-    lines = np.arange(round(PERIOD / sea.cell_size) + 1) * sea.cell_size
-    heights = sea.heights(lines, lines)
-    right, up = (np.diff(heights, axis=axis) / sea.cell_size for axis in (1, 0))
-    return (right[:-1], up[:, :-1]), (right[1:], up[:, 1:])
-
-
-def glints(sea, slopes, angle):
-    """Return the surface echo per horizontal area of each cell with these slopes, over that of Gaussian slopes.
-
-    Light comes and returns at an angle from the vertical [rad], against the wind; each facet of normal n sends back
-    D / (4 n_z) with the ripples' distribution of normals D, see `two_scale_ratio`.
-    """
-    along, across = sea.ripple_variance
-    sin, cos = math.sin(angle), math.cos(angle)
-    total = 0.0
-    for x, y in slopes:
-        length = np.sqrt(1 + x**2 + y**2)
-        incidence = np.maximum((cos + x * sin) / length, 1e-6)
-        first = (x * cos - sin) ** 2 / (1 + x**2)
-        second = np.maximum(1 - incidence**2 - first, 0)
-        exponent = -0.5 * (first / along + second / across) / incidence**2
-        total = total + 0.5 * np.exp(exponent) * length / (math.sqrt(along * across) * incidence**4)
-    up_wind, cross_wind = cox_munk(sea.wind_speed)
-    return total * math.sqrt(up_wind * cross_wind) * math.exp(0.5 * math.tan(angle) ** 2 / up_wind) * cos**4
-
-
-@pytest.mark.parametrize("wind", [pytest.param(6.0, marks=pytest.mark.slow), pytest.param(3.0, marks=pytest.mark.long)])
-def test_echo_does_not_depend_on_the_cells(wind):
-    """Mean over 8 seas: the closed form. One place, averaged over a beam of 1 m: changes by less than 2 % if halved.
-
-    That is half of what remains where three cells hold the shortest wave (negative control), and less than the standard
-    error of 3 % to which renders go by default.
-    """
-    angles = [math.radians(degrees) for degrees in ((0.0, 10.0, 20.0) if wind < 6 else (0.0, 20.0))]
-    means, maps = {}, {}
-    for seed in range(8):
-        for cells_per_wave in (3, 12, 24):
-            sea = read(
-                **{"wind_speed": wind, "surface_seed": seed, "period": PERIOD, "refined_size": 8.0},
-                **{"cell_size": 1.0 / cells_per_wave, "shortest_wave": 1.0},
-            )
-            slopes = slopes_of(sea)
-            for angle in angles:
-                echo = glints(sea, slopes, angle)
-                maps.setdefault((angle, cells_per_wave), []).append(under_beams(echo, cells_per_wave))
-                ratio = two_scale_ratio(sea.resolved_variance, sea.ripple_variance, angle)
-                means.setdefault((angle, cells_per_wave), []).append([echo.mean() / ratio])
-    for angle in angles:
-        for cells_per_wave in (12, 24):
-            assert_equal(means[angle, cells_per_wave], [1.0], error=0.15)
-        coarse, fine, finer = (np.array(maps[angle, cells]) for cells in (3, 12, 24))
-        changes = [np.sqrt(np.mean((one / finer - 1) ** 2)) for one in (coarse, fine)]
-        assert changes[1] < 0.02
-        assert changes[0] > 4 * changes[1]
-
-
-def under_beams(echo, cells_per_wave):
-    """Return the echo under Gaussian beams of 1 m, 4 m apart, each between cells, at the same places for all."""
-    step = len(echo) // 8
-    padded = gaussian_filter(echo, cells_per_wave, mode="wrap")
-    return 0.25 * sum(np.roll(padded, (i, j), (0, 1)) for i in (0, 1) for j in (0, 1))[::step, ::step]
 
 
 def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
@@ -163,12 +69,3 @@ def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
     for half, position in zip(np.split(np.arange(len(mesh.vertices)), 2), positions, strict=True):
         offsets = np.clip(plain.vertices[half, :2] - position, -4.0, 4.0)
         np.testing.assert_allclose((mesh.vertices - plain.vertices)[half, 2], offsets @ slopes, atol=1e-9)
-
-
-def test_a_flat_sea_with_a_mean_slope_is_a_plane_and_slopes_are_limited():
-    mesh = read(spectrum="flat", slope_x_deg=3.0, refined_size=6.0, cell_size=0.5, size=20.0).mesh()
-    inside = np.abs(mesh.vertices[:, 0]) <= 3.0
-    np.testing.assert_allclose(mesh.vertices[inside, 2], np.tan(np.radians(3.0)) * mesh.vertices[inside, 0], atol=1e-12)
-    assert len(read(spectrum="flat", size=20.0).mesh().faces) == 4
-    with pytest.raises(UserError, match="slope_y_deg = 16 must lie between -15 and 15"):
-        read(slope_y_deg=16.0)

@@ -5,6 +5,7 @@ from importlib import resources
 import numpy as np
 import pytest
 from oracles.phase import henyey_greenstein
+from rows import each_row
 
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio, petzold_average_particle
 from mitransient_lidar.physics.water.phase_file import read_phase_table
@@ -35,15 +36,6 @@ def test_henyey_greenstein_at_uneven_angles(tmp_path, g):
     assert integral == pytest.approx(1, abs=3e-3)
 
 
-def test_angles_in_rad(tmp_path):
-    degrees = uneven_angles()
-    values = henyey_greenstein(np.radians(degrees), 0.9)
-    expected = read_phase_table(write(tmp_path / "degrees.csv", degrees, values))
-    path = write(tmp_path / "rad.csv", np.radians(degrees), values)
-    path.write_text("theta [rad], vsf [1/sr]\n" + path.read_text())
-    np.testing.assert_allclose(read_phase_table(path).table.value, expected.table.value, rtol=1e-9)
-
-
 @pytest.mark.parametrize("factor", [3.0, 4 * np.pi, 0.15])
 def test_factor_of_unnormalised_values(tmp_path, factor):
     degrees = uneven_angles()
@@ -68,20 +60,6 @@ def test_petzold_file_equals_the_shipped_table():
     assert table.backscatter_ratio == pytest.approx(shipped.backscatter_ratio, rel=1e-4)
 
 
-def test_power_towards_zero_is_that_of_the_first_angles(tmp_path):
-    degrees = np.geomspace(0.5, 180, 30)
-    table, _ = read_phase_table(write(tmp_path / "power.txt", degrees, degrees**-1.5, " "))
-    core = table.eval(np.radians([0.001, 0.01, 0.1]))
-    np.testing.assert_allclose(core[:-1] / core[1:], 10**1.5, rtol=1e-4)
-
-
-def test_values_that_fall_towards_zero_end_flat(tmp_path):
-    degrees = np.geomspace(0.5, 180, 30)
-    table, _ = read_phase_table(write(tmp_path / "hole.txt", degrees, degrees**0.5, "\t"))
-    core = table.eval(np.radians([0.001, 0.1, 0.5, 1.0]))
-    np.testing.assert_allclose(core / core[2], [1, 1, 1, 2**0.5], rtol=1e-3)
-
-
 def test_an_angle_of_zero_is_used(tmp_path):
     """Between 0 and the next angle ln p is linear in theta^2: half-way a quarter of the drop."""
     degrees = np.array([0.0, *np.linspace(5, 180, 36)])
@@ -98,18 +76,10 @@ def test_last_value_is_continued_to_180_degrees(tmp_path):
     np.testing.assert_allclose(read, 2 - np.array([168, 170, 170, 170]) / 180, rtol=1e-3)
 
 
-def test_headings_and_comments_are_skipped(tmp_path):
-    rows = [f"{angle}\t{200 - angle} # seen" for angle in range(10, 190, 10)]
-    path = tmp_path / "table.txt"
-    path.write_text("\n".join(["# a cruise", "", "angle (deg), value (1/sr)", *rows]), "utf-8-sig")
-    table, integral = read_phase_table(path)
-    assert table.eval(np.radians(90)) * integral == pytest.approx(110, rel=1e-3)
-
-
 GOOD = [f"{angle} 1" for angle in range(10, 190, 10)]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("lines", "message"),
     [
         ([], "phase.txt has 0 angles but must have at least 10"),
@@ -131,11 +101,3 @@ def test_invalid_tables_are_rejected(tmp_path, lines, message):
     path.write_text("\n".join(lines))
     with pytest.raises(ValueError, match=message):
         read_phase_table(path)
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(ValueError, match=r"cannot read .*none.txt: No such file or directory"):
-        read_phase_table(tmp_path / "none.txt")
-    (tmp_path / "phase.txt").write_bytes(b"\xff")
-    with pytest.raises(ValueError, match=r"phase.txt is not a text file in UTF-8"):
-        read_phase_table(tmp_path / "phase.txt")

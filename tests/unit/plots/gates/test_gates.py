@@ -1,15 +1,8 @@
 """Figures and animations of gate stacks: contents, positions and colours."""
 
-import math
-import stat
-import sys
-
-import matplotlib as mpl
 import numpy as np
 import pytest
 from figure_inputs import stack
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm
 from PIL import Image
 
 from mitransient_lidar.core.errors import UserError
@@ -30,15 +23,6 @@ def make(gates=12, energy=None, **options):
 
 def images(figure):
     return [ax.get_images()[0] for ax in figure.axes if ax.get_images()]
-
-
-def colour_at(figure, ax, x, y):
-    """Return the colour (red, green, blue) at a position in the axes."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    picture = np.asarray(canvas.buffer_rgba())
-    column, row = ax.transData.transform((x, y))
-    return picture[picture.shape[0] - 1 - int(row), int(column), :3]
 
 
 @pytest.mark.slow
@@ -72,31 +56,6 @@ def test_bright_spot_of_less_than_a_hundredth_of_the_image_is_clipped():
 
 
 @pytest.mark.slow
-def test_logarithmic_colours():
-    energy = np.full((ROWS, COLUMNS, 6), 1e-15)
-    energy[..., 3], energy[..., 4] = 1e-20, 0.0
-    energy[0, 0, 5] = np.nan
-    figure = plot_gates(make(6, energy), log=True)
-    drawn = images(figure)
-    norm = drawn[0].norm
-    assert isinstance(norm, LogNorm)
-    assert norm.vmax / norm.vmin == pytest.approx(1000.0)
-    # Zero is dark, not missing; NaN is grey.
-    assert colour_at(figure, drawn[4].axes, 0.0, 2.0).sum() < 30
-    np.testing.assert_allclose(colour_at(figure, drawn[5].axes, 6.0, 6.0), 153, atol=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("gates", "shown"), [(36, 36), (37, 19), (64, 32), (200, 34), (1, 1)])
-def test_at_most_36_gates_evenly(gates, shown):
-    drawn = images(plot_gates(make(gates)))
-    numbers = [int(image.axes.get_title().split()[0].lstrip("#")) for image in drawn]
-    assert len(numbers) == shown
-    assert set(np.diff(numbers)) <= {math.ceil(gates / 36)}
-    assert [image.get_array()[0, 0] for image in drawn] == pytest.approx([number + 1.0 for number in numbers])  # fJ
-
-
-@pytest.mark.slow
 def test_gif_has_one_frame_a_gate(tmp_path):
     energy = np.full((ROWS, COLUMNS, 5), 1e-18)
     for k in range(5):
@@ -116,51 +75,6 @@ def test_gif_has_one_frame_a_gate(tmp_path):
     # The text below the colour bar does not move.
     assert ((frames[1][500:] < 128) == (frames[3][500:] < 128)).all()
     assert (frames[1][500:] < 128).any()
-
-
-FAKE_FFMPEG = """#!/bin/sh
-for last; do :; done
-cat > "$last"
-exit {status}
-"""
-
-
-@pytest.fixture
-def fake_ffmpeg(tmp_path):
-    """Replace ffmpeg by a program that stores the raw frames."""
-
-    def install(status):
-        program = tmp_path / "ffmpeg"
-        program.write_text(FAKE_FFMPEG.format(status=status))
-        program.chmod(program.stat().st_mode | stat.S_IXUSR)
-        return mpl.rc_context({"animation.ffmpeg_path": str(program)})
-
-    return install
-
-
-@pytest.mark.long
-def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
-    with fake_ffmpeg(status=0):
-        animate_gates(make(3), tmp_path / "a.mp4")
-    assert (tmp_path / "a.mp4").stat().st_size == 3 * 840 * 540 * 4  # raw frames
-
-
-@pytest.mark.slow
-def test_mp4_needs_no_program_besides_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    animate_gates(make(3), tmp_path / "a.mp4")
-    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"  # the first box of an MP4 file
-
-
-@pytest.mark.long
-def test_failing_or_missing_ffmpeg(tmp_path, fake_ffmpeg, monkeypatch):
-    with fake_ffmpeg(status=3), pytest.raises(UserError, match=r"a\.mp4: ffmpeg ended with the error 3"):
-        animate_gates(make(3), tmp_path / "a.mp4")
-    missing = {"animation.ffmpeg_path": str(tmp_path / "none")}
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with mpl.rc_context(missing), pytest.raises(UserError, match=r"needs the program ffmpeg.*choose \.gif"):
-        animate_gates(make(3), tmp_path / "a.mp4")
-    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 def test_depth_map_begins_below_the_latest_surface_of_lit_pixels():
@@ -200,14 +114,3 @@ def test_wrong_files_and_datasets(tmp_path):
         animate_gates(make(pixels=True), tmp_path / "a.gif")
     with pytest.raises(UserError, match="No such file"):
         plot_gates(make(1), tmp_path / "missing" / "a.png")
-
-
-def test_the_label_of_a_sheet_is_below_its_ticks():
-    angle_x, angle_y = np.meshgrid(np.linspace(15, -15, 8), np.linspace(15, -15, 8), indexing="ij")
-    made = make(12, energy=np.ones((ROWS, COLUMNS, 12))).isel(row=[0] * 8, column=[0] * 8)
-    made = made.assign_coords(angle_x=(("row", "column"), angle_x), angle_y=(("row", "column"), angle_y))
-    figure = plot_gates(made)
-    FigureCanvasAgg(figure).draw()
-    ticks = [text.get_window_extent().y0 for ax in figure.axes[8:12] for text in ax.get_xticklabels()]  # the last row
-    label = next(text for text in figure.texts if text.get_text().startswith("to the left")).get_window_extent()
-    assert label.y1 < min(ticks)

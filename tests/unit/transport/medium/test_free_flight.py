@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from frequencies import assert_uniform, misfit, uniform_counts
 from kernel_arrays import array
+from rows import each_row
 from significance import largest_chi2
 
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -43,7 +44,7 @@ def exact(column, depth, downward, length):
     return column.optical_depth(depth, np.asarray(depth) + downward * np.asarray(length), length)
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+@each_row("name", COLUMNS)
 def test_optical_depth_is_the_sum_over_the_layers(name):
     """A difference of cumulative depths over the slope would be 0/0 for level rays, and noise below a slope of 1e-3."""
     column = COLUMNS[name]
@@ -54,7 +55,7 @@ def test_optical_depth_is_the_sum_over_the_layers(name):
     assert np.all(np.abs(np.array(got) - expected) <= tolerance)
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+@each_row("name", COLUMNS)
 def test_distance_inverts_the_optical_depth(name):
     column = COLUMNS[name]
     depth, downward, wanted = rays([1e-3, 0.1, 1.0, 4.0])
@@ -107,24 +108,7 @@ def test_light_that_ends_in_clear_water_goes_on_for_ever():
     assert float(clear.optical_depth(array(1), array(0.5), array(100))[0]) == 0
 
 
-def test_clear_water_above_the_light_lets_it_out():
-    flight = LayeredFlight(WaterColumn.from_text("0, 2", "0, 0.5", "0", "0"))
-    distance = np.array(flight.distance(array([4, 4]), array([-1, -1]), array([0.9, 1.1])))
-    np.testing.assert_allclose(distance, [1.8, np.inf], rtol=1e-6)
-
-
-def test_equal_layers_are_one():
-    one = LayeredFlight(WaterColumn.from_text("0", "0.4", "0.2", "0.01"))
-    many = LayeredFlight(WaterColumn.from_text("0, 1, 1.5, 4", "0.4", "0.2", "0.01"))
-    rng = np.random.default_rng(3)
-    depth, downward, drawn = (array(v) for v in (6 * rng.random(1000), 2 * rng.random(1000) - 1, rng.random(1000)))
-    first, second = (np.array(flight.distance(depth, downward, drawn)) for flight in (one, many))
-    # Slopes down to 1e-3 in float32 depths of some metres.
-    np.testing.assert_allclose(first, second, rtol=2e-3)
-    assert np.median(np.abs(second / first - 1)) < 1e-6
-
-
-@pytest.mark.parametrize("name", COLUMNS)
+@each_row("name", COLUMNS)
 def test_a_layer_owns_its_upper_edge_and_the_first_one_the_crests(name):
     column = COLUMNS[name]
     flight = LayeredFlight(column)
