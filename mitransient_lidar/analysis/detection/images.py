@@ -24,6 +24,7 @@ from mitransient_lidar.physics.receiver.electronics import Expected
 
 _TOLERANCE, _MOST_STEPS = 1e-4, 200  # of weights in noise that pixels share; what they detect is exact for any weights
 _ROUNDING = 1e-9
+_TUNINGS = 3  # steps in which the shares of the covariances are found
 
 
 class GateImages(NamedTuple):
@@ -121,6 +122,8 @@ class ImageTrial:
         Pulses of a frame.
     sky : float
         Power of the daylight on each pixel [W].
+    target_share : float
+        Share of the noise with the target in the covariance D that the filters are for, 0 to 1.
     """
 
     light: FloatArray
@@ -129,6 +132,26 @@ class ImageTrial:
     open_ns: float
     pulses: int
     sky: float
+    target_share: float = 0.5
+
+    def tuned(self, frames: int, pfa: float, pd: float) -> ImageTrial:
+        """Return the trial whose filters are the best ones for two probabilities, of false alarm and of detection.
+
+        Notes
+        -----
+        Of all weighted sums, with noise that differs with the target: each covariance counts by the quantile of its
+        error over the deviation of the sum (T. W. Anderson and R. R. Bahadur, Ann. Math. Stat. 33, 420 (1962),
+        doi:10.1214/aoms/1177704568), which is found in a few steps.
+        """
+        from scipy.special import ndtri
+
+        trial = self
+        for _ in range(_TUNINGS):
+            if (found := trial.products.statistic(frames)) is None:
+                break
+            alarm, miss = -ndtri(pfa) / found.null_sd, max(ndtri(pd), 0.0) / found.target_sd
+            trial = replace(trial, target_share=float(miss / (alarm + miss)))
+        return trial
 
     def widened(self, count: int, apart: int) -> ImageTrial:
         """Return the trial with gates that are sums of `count` gates, each `apart` steps after the former."""
@@ -152,8 +175,9 @@ class ImageTrial:
             yield GateImages(vectors, self._filters(vectors, noises), noises, expected)
 
     def _filters(self, vectors: FloatArray, noises: Sequence[Noise]) -> FloatArray:
-        """Return D^-1 times vectors, D being the mean covariance of noises, by conjugate gradients."""
-        mean = Noise(*(0.5 * (one + other) for one, other in zip(*noises, strict=True)))
+        """Return D^-1 times vectors, D being the covariance of both noises by their shares, by conjugate gradients."""
+        share = self.target_share
+        mean = Noise(*((1 - share) * null + share * target for null, target in zip(*noises, strict=True)))
         diagonal = mean.own + mean.shared
         inverse = _ratio(np.ones_like(diagonal), diagonal)
         found = vectors * inverse

@@ -1,5 +1,7 @@
 """Detection in gated images: predictions against drawn frames of cameras, and closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
@@ -101,6 +103,25 @@ def test_deflection_in_closed_form_grows_with_the_root_of_the_frames():
     assert 2 < needed < 20
     assert quantile(own, needed - 1) < ndtri(0.9999) <= quantile(own, needed)
     assert found["detection"][1][0] == pytest.approx(float(ndtr(quantile(own, 1))))
+
+
+def test_filters_for_two_probabilities_detect_most():
+    """A target of which some parts are far brighter than the water: no other share of the two covariances is better."""
+    own = trial(replace(CAMERAS["direct"][0], read_noise=1.0, offset_dn=9.0), 2.0)
+    own.light[0] = own.light[1] * np.geomspace(1, 300, SIZE)[:, None, None]
+    pfa, pd = 1e-3, 0.9
+
+    def root_of_frames(trial):
+        """Return the root of the number of frames that a filter needs."""
+        one = trial.products.statistic(1)
+        return (norm.isf(pfa) * one.null_sd + norm.ppf(pd) * one.target_sd) / (one.target_mean - one.null_mean)
+
+    shares = np.linspace(0, 1, 21)
+    needed = [root_of_frames(replace(own, target_share=share)) for share in shares]
+    best = own.tuned(1, pfa, pd)
+    assert root_of_frames(best) == pytest.approx(min(needed), rel=2e-3)
+    assert abs(best.target_share - shares[np.argmin(needed)]) < 0.06
+    assert min(needed) < 0.98 * needed[10]
 
 
 def test_a_shadow_alone_is_detected():
