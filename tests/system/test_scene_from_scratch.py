@@ -32,7 +32,18 @@ def test_every_line_of_the_text_is_in_the_scenes():
         for line in map(words, snippet.splitlines()):
             assert line in quoted
     commands = re.findall(r"^mitransient-lidar (\S+)", text, flags=re.MULTILINE)
-    assert commands == ["render", "echoes", "render", "shots", "retrieve", "record", "echoes", "render", "gates", "frames"]
+    assert commands == [
+        "render",
+        "echoes",
+        "render",
+        "shots",
+        "retrieve",
+        "record",
+        "echoes",
+        "render",
+        "gates",
+        "frames",
+    ]
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport import contacts
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 BOTTOM = -8.0
@@ -96,3 +97,17 @@ def test_solids_that_coincide_without_order_are_refused(lidar_scene, extra, name
     with pytest.raises(UserError, match=f"shapes '.*' and '.*' coincide in a face.*{reason}") as refusal:
         moves(lidar_scene(extra=extra))
     assert all(repr(name) in str(refusal.value) for name in names)
+
+
+def test_many_solids_are_compared_in_few_scenes(lidar_scene, monkeypatch):
+    count, built, real = 60, [], contacts.scene_of_shapes
+    monkeypatch.setattr(contacts, "scene_of_shapes", lambda *parts: built.append(parts) or real(*parts))
+    places = np.random.default_rng(5).permutation(100)[:count]
+    cubes = {
+        f"cube{number}": solid("cube", 0.05, 0.12 * (place // 10), 0.12 * (place % 10), BOTTOM + 0.05)
+        for number, place in enumerate(places)
+    }
+    _, moved = moves(lidar_scene(extra=cubes))
+    assert moved.keys() == cubes.keys()
+    np.testing.assert_allclose([*moved.values()], [(0, 0, 0.11)] * count, atol=0.02)
+    assert len(built) < 30

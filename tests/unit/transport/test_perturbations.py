@@ -9,7 +9,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
 from mitransient_lidar.transport.paths.histogram import TransientHistogram
-from mitransient_lidar.transport.perturbations import LayerChange, Perturbation, Perturbations
+from mitransient_lidar.transport.perturbations import LayerChange, Perturbation, Perturbations, joined
 
 TOPS = (0.0, 1.5, 4.0)
 EDGES = (-np.inf, 1.5, 4.0, np.inf)
@@ -51,6 +51,12 @@ def test_events_count_where_their_layer_is():
     np.testing.assert_allclose(found[0], wanted, rtol=1e-3, atol=1e-6)
     half = changes.at_event(changes.start(), mi.Float(depth), mi.Vector3f(0, 0, 1), after, share=mi.Float(0.5))
     np.testing.assert_allclose(half[0], 0.5 * wanted, rtol=1e-3, atol=1e-6)
+
+
+def test_channels_are_derivatives():
+    changes = Perturbations([Perturbation(), Perturbation()])
+    sums = joined([mi.Float(-1.5), mi.Float(0.5)], [mi.Float(0.5), mi.Float(1.5)])
+    np.testing.assert_allclose([one[0] for one in changes.channels(mi.Float(3.0), sums)], [-3.0, 6.0], rtol=1e-6)
 
 
 def test_histograms_sum_perturbations_of_both_signs():

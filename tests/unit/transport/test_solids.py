@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -44,6 +45,21 @@ def test_solids_without_effect_change_no_light(lidar_scene, passes, integrator):
     few = {"type": integrator, "paths_per_pass": 2**12}
     plain, veiled = (passes(lidar_scene(integrator=few, extra=extra), 1) for extra in ({}, plates(UNSEEN)))
     np.testing.assert_allclose(veiled, plain, rtol=1e-5, atol=1e-6 * plain.max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
+def test_panes_that_reflect_nothing_change_no_light(lidar_scene, passes, integrator):
+    """Paths cross them one by one, since their index is not quite that of the water."""
+    bsdf = {"type": "thindielectric", "int_ior": 1.34001, "ext_ior": 1.34}
+    panes = plates({f"pane_{number}": bsdf for number in range(4)})
+    engine = {"type": integrator, "paths_per_pass": 2**14}
+    # After the surface echo.
+    column = (
+        passes(lidar_scene(integrator=engine, extra=extra), 12, 100 * len(extra))[..., 50:] for extra in ({}, panes)
+    )
+    plain, veiled = (energy.reshape(12, 4, -1, 11).sum(axis=(1, 3)) for energy in column)
+    significance.assert_same(veiled, plain, error=0.01, known=0.1)
 
 
 @pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 from oracles.refracted_path import refracted_path
+from rows import each_row
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -49,6 +51,14 @@ def test_first_light_comes_from_a_crest_at_the_near_edge(off_nadir_deg, crest):
     found = lidar(cone(off_nadir_deg), cone(off_nadir_deg, 25.0), heights=(-crest, crest)).limits([])
     edge = math.radians(off_nadir_deg) - math.atan(15e-3)
     assert found.first_ns == pytest.approx(2 * NS * (200 - crest) / math.cos(max(edge, 0.0)), rel=1e-6)
+
+
+@each_row(("view", "beam"), [(15.0, 500.0), (500.0, 15.0), (15.0, 15.0)])
+def test_light_is_that_of_directions_in_view_and_beam(view, beam):
+    found = lidar(cone(45.0, view), cone(45.0, beam)).limits([plane(1.0)])
+    for time, side in zip(found.surface_ns, (-1, 1), strict=True):
+        edge = math.radians(45.0) + side * math.atan(15e-3)
+        assert time == pytest.approx(2 * NS * 200 / math.cos(edge), rel=1e-4)
 
 
 @pytest.mark.parametrize("depth", [0.5, 8.0, 60.0])
@@ -95,6 +105,14 @@ def test_light_crosses_the_water_to_the_edge_of_the_view(half_mrad, distance):
     assert found[1] - direct[1] - (found[0] - direct[0]) == pytest.approx(NS * GROUP * distance, abs=0.05)
 
 
+def test_beam_and_view_without_a_common_place():
+    """The legs of both, without the way between them, which `scene_checks` compares with the record."""
+    view, beam = cone(0.0, 5.0), cone(0.0, 5.0, x=30.0)
+    found = lidar(view, beam).limits([plane(8.0)])
+    assert found.first_ns == pytest.approx(2 * NS * 200, rel=1e-6)
+    assert found.surface_ns[1] == pytest.approx(2 * NS * 200 * math.hypot(1, 5e-3), rel=1e-6)
+
+
 def test_the_depth_is_that_of_a_slope_in_view():
     """At nadir the view reaches 3 m, and scattered light 0.3 of the depth farther, to 8.7 m of a slope of 0.1."""
     found = lidar(cone(0.0), cone(0.0, 25.0)).limits([plane(8.0, 0.1)], direct=True)
@@ -102,6 +120,25 @@ def test_the_depth_is_that_of_a_slope_in_view():
     water_ns = 2 * NS * GROUP * deepest / math.sqrt(1 - (15e-3 / N) ** 2)
     assert found.last_ns - found.surface_ns[1] < water_ns
     assert found.last_ns - found.surface_ns[1] > 2 * NS * GROUP * (8 + 0.1 * 3)
+
+
+def test_a_solid_out_of_view_does_not_count():
+    hole = np.array([[[50.0, 50, -90], [60, 50, -90], [60, 60, -90]]])
+    scene = lidar(cone(0.0), cone(0.0, 25.0))
+    alone = scene.limits([plane(8.0)])
+    assert scene.limits([plane(8.0), Solid("hole", hole)]) == alone
+
+
+def test_a_target_without_a_bottom_does_not_end_the_axis():
+    target = np.array([[[-1.0, -1, -5], [1, -1, -5], [1, 1, -5]]])
+    scene = lidar(cone(0.0), cone(0.0, 25.0), water(0.2))
+    depth = 0.5 * math.log(1e6) / 0.2
+    direct = (
+        NS * 2 * (200 * math.hypot(1, 15e-3) + GROUP * depth / math.sqrt(1 - (math.sin(math.atan(15e-3)) / N) ** 2))
+    )
+    assert scene.limits([Solid("target", target)]).last_ns == pytest.approx(direct, rel=1e-4)
+    assert scene.limits([]).end.startswith("at a depth of 34.5 m")
+    assert scene.limits([Solid("target", target)], direct=True).end == "after the echo of shape 'target'"
 
 
 def test_the_column_falls_through_layers():
@@ -114,13 +151,63 @@ def test_the_column_falls_through_layers():
     assert water(0.0)[1].depth_of(10.0) == 0.0
 
 
+@each_row(("attenuation", "is_seen"), [(0.2, True), (0.5, False)])
+def test_an_invisible_bottom(attenuation, is_seen):
+    found = lidar(cone(0.0), cone(0.0, 25.0), water(attenuation)).limits([plane(40.0)])
+    assert ("bottom" in found.end) == is_seen
+    assert (found.last_ns > 2 * NS * (200 + GROUP * 40)) == is_seen
+
+
+def test_a_scene_without_water():
+    """A plate in the air: nothing of the sea level below it."""
+    air = water(0.0, indices=(1.0,), group=(1.0,))
+    plate = np.array([[[-50.0, -50, 20], [50, -50, 20], [50, 50, 30]], [[-50, -50, 20], [50, 50, 30], [-50, 50, 30]]])
+    found = lidar(cone(0.0), cone(0.0, 25.0), air, column=None).limits([Solid("plate", plate)])
+    assert 2 * NS * 170 < found.first_ns < 2 * NS * 175.1
+    assert 2 * NS * 174.9 < found.last_ns < 2 * NS * 180.1
+
+
 def test_a_target_above_the_sea_comes_first():
     tower = np.array([[[-1.0, -1, 12], [1, -1, 12], [1, 1, 12]]])
     found = lidar(cone(0.0), cone(0.0, 25.0)).limits([plane(8.0), Solid("tower", tower)])
     assert found.first_ns == pytest.approx(2 * NS * 188, rel=1e-6)
 
 
+def test_light_towards_the_horizon_ends_with_the_scene():
+    found = lidar(cone(88.0, 100.0, 15.0), cone(88.0, 100.0, 15.0), reach=600.0).limits([])
+    assert found.surface_ns[1] == pytest.approx(2 * NS * math.hypot(600, 15), rel=1e-6)
+
+
+def test_a_square_view_reaches_its_corners():
+    square = lidar(cone(0.0, 100.0, is_round=False), cone(0.0, 500.0)).limits([])
+    assert square.surface_ns[1] == pytest.approx(2 * NS * 200 * math.sqrt(1 + 2 * 0.01), rel=1e-4)
+
+
+@each_row(
+    ("first", "last", "width", "start", "count"),
+    [
+        (1396.2, 1552.0, 1.0, 1395.0, 160),
+        (1396.2, 1552.0, 0.25, 1395.0, 640),
+        (1396.2, 1552.0, 10.0, 1390.0, 17),
+        (-7.0, 33.0, 0.5, -7.0, 80),
+        (1396.2, 1552.0, 0.3, 1392.0, 540),
+        (1396.2, 1552.0, 1000.0, 1000.0, 1),
+        (3.33562e6, 3.33577e6, 1.0, 3335620.0, 150),
+    ],
+)
+def test_start_and_number_of_bins_are_readable(first, last, width, start, count):
+    axis = TimeAxis.covering(first, last, width)
+    assert (axis.start_ns, axis.bin_count) == (pytest.approx(start), count)
+    assert axis.start_ns <= first < last <= axis.end_ns + 1e-9
+    assert axis.start_ns / width == pytest.approx(round(axis.start_ns / width), abs=1e-9)
+
+
 def test_a_given_number_wins():
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=1380.3) == TimeAxis(1380.3, 1.0, 175)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, bin_count=40) == TimeAxis(1395.0, 1.0, 40)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=2000.0).bin_count == 5
+
+
+def test_too_many_bins():
+    with pytest.raises(UserError, match=r"bin_width_ns = 1e-05 divides the time axis .* at least 0\.00016, for"):
+        TimeAxis.covering(1396.2, 1552.0, 1e-5)

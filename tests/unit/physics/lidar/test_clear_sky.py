@@ -17,11 +17,25 @@ def test_sun_of_the_standard_atmosphere():
     assert sky.direct == pytest.approx(sky.direct_normal * np.cos(np.radians(48.19)))
 
 
+def test_no_sky_without_an_atmosphere():
+    sky = clear_sky_irradiance(30.0, aerosol_optical_depth=0.0, ozone_cm=0.0, pressure_hpa=0.0)
+    assert sky.diffuse == 0
+    assert sky.direct_normal == pytest.approx(1.90)
+
+
 def test_half_of_rayleigh_scattering_goes_down():
     """Without aerosol and ozone, the model gives one half, except for its power 0.95."""
     sky = clear_sky_irradiance(20.0, aerosol_optical_depth=0.0, ozone_cm=0.0)
     missing = 1.90 * np.cos(np.radians(20)) - sky.direct
     assert sky.diffuse == pytest.approx(0.475 * missing, rel=0.01)
+
+
+def test_sky_fraction_grows_with_the_zenith_angle():
+    share = [s.diffuse / (s.diffuse + s.direct) for s in map(clear_sky_irradiance, (0.0, 30.0, 60.0, 75.0, 89.0))]
+    assert np.all(np.diff(share) > 0)
+    # Gregg and Carder 1990: about a sixth of visible light with a high sun in clear maritime air, all at the horizon.
+    assert 0.12 < share[0] < 0.2
+    assert share[-1] > 0.8
 
 
 def test_background_power():

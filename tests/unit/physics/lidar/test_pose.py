@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pose import Pose
 
 
@@ -52,3 +53,13 @@ def test_rotations_and_displacements_move_what_a_pose_sees():
         one = moved.part(row)
         np.testing.assert_allclose(one.frame @ one.frame.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(one.directions(angles), pose.directions(angles) @ rotation[row].T, atol=1e-12)
+
+
+def test_matrices_with_shear_are_refused():
+    pose = Pose.from_angles(200.0, 20.0, 1.0, 2.0)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([3 * pose.left, 3 * pose.far, 3 * pose.axis, pose.origin], axis=1)
+    np.testing.assert_allclose(Pose.from_matrix("to_world", matrix).frame, pose.frame, atol=1e-12)
+    matrix[0, 1] += 1
+    with pytest.raises(UserError, match="to_world must be a rotation and a translation"):
+        Pose.from_matrix("to_world", matrix)

@@ -32,6 +32,15 @@ def test_sampled_pulse_is_shifted_and_normalised():
     assert pulse.cumulative(1.5) == pytest.approx(0.25 + 1.5 * 0.375)
 
 
+@each_row(
+    ("times", "power", "width"),
+    [([10, 11, 14], [0, 6, 0], 2.0), ([0, 4], [1, 1], 4.0), ([0, 4], [0, 1], 2.0), ([0, 1, 3, 4], [0, 1, 1, 0], 3.0)],
+)
+def test_width_of_few_samples(times, power, width):
+    """Half of the maximum is crossed between samples: samples above it alone would give 0 and 2 ns."""
+    assert Pulse.sampled(times, power).fwhm_ns == pytest.approx(width)
+
+
 def test_pulse_file_of_an_oscilloscope(tmp_path, caplog):
     """The noise below 0 is cut off; a pulse of the wrong sign is refused."""
     path = tmp_path / "pulse.txt"
@@ -108,3 +117,29 @@ def test_waveform_matches_direct_sum_within_the_record(longest_direct, monkeypat
                 expected[:, t] += energy[:, t - (m - 7)] * w
     np.testing.assert_allclose(waveform(energy, 2.0, kernel), expected / 2e-9, rtol=1e-12)
     np.testing.assert_array_equal(waveform(energy, 2.0, (25, np.ones(3))), 0)
+
+
+@each_row("sign", [1.0, -1.0])
+def test_transforms_light_no_bins_that_no_energy_reaches(sign, monkeypatch):
+    """Rounding of the largest power would be light before the surface that is the same in each pass."""
+    monkeypatch.setattr(pulse, "_LONGEST_DIRECT", 0)
+    energy = np.zeros((2, 300))
+    energy[0, 100], energy[1, 200] = sign, np.nan
+    power = waveform(energy, 1.0, (-10, np.linspace(1.0, 2.0, 31)))
+    assert np.flatnonzero(power[0]).tolist() == list(range(90, 121))
+    assert np.flatnonzero(np.isnan(power[1])).tolist() == list(range(190, 221))
+
+
+@each_row(
+    ("call", "message"),
+    [
+        (lambda: Pulse.sampled([0, 1, 1], [0, 1, 0]), "must increase strictly"),
+        (lambda: Pulse.sampled([0, 1], [0, -1]), "power = -1 must not be negative"),
+        (lambda: Pulse.sampled([0, 1], [0, 0]), "power must be greater than 0 somewhere"),
+        (lambda: Pulse.sampled([0], [1]), "times_ns of shape \\(1,\\) must be a list of at least 2"),
+        (lambda: waveform(1.0, 1.0, (0, np.ones(1))), "time axis"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -4,9 +4,21 @@ import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns, layered_time_ns
 
-from mitransient_lidar.physics.lidar.refraction import fresnel, refract, snell, solid_angle_per_area, surface_time_ns
+from mitransient_lidar.physics.lidar.refraction import (
+    fresnel,
+    refract,
+    refract_level,
+    snell,
+    solid_angle_per_area,
+    surface_time_ns,
+)
 
 THETA, N, HEIGHT = np.radians(20), 1.34, 200.0
+
+
+def test_snell():
+    assert np.degrees(snell(THETA, N)) == pytest.approx(14.78774, abs=1e-5)
+    assert snell(np.pi / 2, N) == pytest.approx(np.arcsin(1 / N))
 
 
 def test_refraction_of_a_ray_at_a_slope():
@@ -17,6 +29,13 @@ def test_refraction_of_a_ray_at_a_slope():
     ray, unit = refract(down, normal, N), normal / np.linalg.norm(normal)
     assert np.linalg.norm(ray) == pytest.approx(1)
     np.testing.assert_allclose(np.cross(down, unit), N * np.cross(ray, unit), atol=1e-12)
+
+
+def test_refraction_at_the_level_surface():
+    down = np.array([[np.sin(THETA), 0, -np.cos(THETA)], [0, 0, -1], [0.6, -0.8, 0]])
+    level = refract_level(down, N)
+    np.testing.assert_allclose(level[0], [np.sin(snell(THETA, N)), 0, -np.cos(snell(THETA, N))], rtol=1e-14)
+    np.testing.assert_allclose(level, refract(down, np.array([[0, 0, 2.0]]), N), atol=1e-14)
 
 
 def test_fresnel():

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -16,6 +17,7 @@ from mitransient_lidar.physics.receiver.detectors import (
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 SHOTS = 10_000
 ELECTRON = 1.602176634e-19
@@ -128,6 +130,57 @@ def test_noise_of_steady_light_does_not_depend_on_the_bins(width, response):
     assert abs(found / expected - 1) < largest_z(shots, 4) * np.sqrt(2 / shots)
 
 
+def test_snr_of_photons_and_of_saturated_samples():
+    # n photoelectrons on a background of m: n/sqrt(n + m).
+    chain = ReceiverChain(LinearDetector(1.0))
+    watt = PHOTON / 1e-9
+    np.testing.assert_allclose(chain.snr([9 * watt, 0], 1.0, 16 * watt), [9 / 5, 0], rtol=1e-9)
+    stuck = ReceiverChain(DIODE, Amplifier(1e4, 5.0, limit_v=1e-3))
+    assert np.isnan(stuck.snr([1e-4], 1.0)[0])
+
+
+@pytest.mark.slow
+def test_seeds():
+    chain, light = RECEIVERS["apd"], power(scale=1e-7)
+    one, two, three = (chain.apply(light, 1.0, 30, seed) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.signal, two.signal)
+    assert not np.array_equal(one.signal, three.signal)
+    # More shots than one block holds: they differ, but for equal codes of the digitiser by chance.
+    many = chain.apply(np.full(4096, 1e-7), 1.0, 600, 5).signal
+    assert len(np.unique(many[:, 100:104], axis=0)) > 590
+
+
+def test_shapes_and_background_per_record():
+    chain = replace(RECEIVERS["pmt"], digitiser=Digitiser(10, 1.0, -0.05, sampling_ghz=0.25))
+    record = chain.apply(np.zeros((2, 3, 30)), 1.0, 7, 1, np.full((2, 3), 1e-9))
+    assert record.signal.shape == (7, 2, 3, 8)
+    assert record.signal.dtype == np.float32
+    assert record.saturated.shape == record.signal.shape
+    expected = chain.expected(np.zeros((2, 3, 30)), 1.0, 1e-7 * np.arange(6).reshape(2, 3))
+    assert expected.mean.shape == (2, 3, 8)
+    np.testing.assert_allclose(np.diff(expected.mean[..., 4].ravel()), expected.mean[0, 1, 4] - expected.mean[0, 0, 4])
+    assert chain.units == "V"
+    assert RECEIVERS["spad"].units == "1"
+
+
+@each_row(
+    ("call", "message"),
+    [
+        (lambda: ReceiverChain(DIODE, digitiser=Digitiser(8, 1.0)), "digitiser needs an amplifier"),
+        (lambda: ReceiverChain(DIODE, logarithm=LogAmplifier(0.2, 1e-3)), "logarithm needs an amplifier"),
+        (
+            lambda: ReceiverChain(SinglePhotonDetector(0.5, 20.0), Amplifier(1.0)),
+            "SinglePhotonDetector, which outputs counts",
+        ),
+        (lambda: RECEIVERS["apd"].apply(1.0, 1.0, 1, 1), "time axis"),
+        (lambda: RECEIVERS["apd"].apply([1e-9], 1.0, 1, 1, [1e-9, 1e-9]), r"background of shape \(2,\)"),
+    ],
+)
+def test_invalid_values_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
 def test_fitting_gain_and_attenuation_in_closed_form():
     """Shot noise alone: N photons reach N + 6 sqrt(N) electrons, and N/a + 6 sqrt(N/a) are those of the limit."""
     bins, limit = 1.0, 0.5
@@ -174,3 +227,21 @@ def test_gain_of_a_photomultiplier_is_that_of_its_dynodes():
     assert chain.fitting_gain(1e4 * light, 1.0) == 0
     with pytest.raises(ValueError, match="largest_current_ma = 0 must be greater than 0"):
         LinearDetector.photomultiplier(0.2, (5.0,), largest_current_ma=0.0)
+
+
+def test_noise_of_the_avalanche_photodiode():
+    """Data sheet of C30902EH: 15 nA, and 0.23 pA per root Hz, whose square is 2 e (I + i M^2 F), at a gain of 150."""
+    diode = RECEIVERS["apd"].detector
+    assert diode.leakage_current_na + diode.gain * diode.dark_current_na == pytest.approx(15, rel=0.01)
+    current = 1e-9 * (diode.leakage_current_na + diode.dark_current_na * diode.gain**2 * diode.excess_noise)
+    assert np.sqrt(2 * 1.602176634e-19 * current) == pytest.approx(0.23e-12, rel=0.01)
+
+
+def test_chains_without_limits_need_no_attenuation():
+    for chain in (RECEIVERS["ideal"], RECEIVERS["spad"], ReceiverChain(LinearDetector(1.0), Amplifier(1e3))):
+        assert chain.fitting_attenuation([1.0], 1.0) == chain.fitting_gain([1.0], 1.0) == 1
+    # Noise above the range cannot be attenuated.
+    noisy = ReceiverChain(LinearDetector(1.0), Amplifier(1e9, 1e3, limit_v=1e-3))
+    assert noisy.fitting_attenuation([1e-6], 1.0) == np.inf
+    with pytest.raises(UserError, match="gain = 2 needs an amplifier"):
+        RECEIVERS["spad"].with_gain(2)

@@ -5,11 +5,13 @@ import pytest
 from rows import each_row
 from significance import largest_z
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
     SinglePhotonDetector,
+    avalanche_excess_noise,
     dynode_excess_noise,
     photons_per_joule,
 )
@@ -27,6 +29,14 @@ def assert_moments(samples, mean, variance):
 
 def test_photons_of_green_light():
     assert photons_per_joule(532.0) == pytest.approx(2.67815e18, rel=1e-5)
+
+
+def test_excess_noise_of_avalanche():
+    # Limits of McIntyre's formula: one carrier, and both alike; 0.02 * 150 + 0.98 * (2 - 1/150) between them.
+    assert avalanche_excess_noise(20, 0) == pytest.approx(1.95)
+    assert avalanche_excess_noise(20, 1) == pytest.approx(20)
+    assert avalanche_excess_noise(150, 0.02) == pytest.approx(4.953467, rel=1e-6)
+    assert avalanche_excess_noise(1, 0.3) == pytest.approx(1)
 
 
 def test_excess_noise_of_dynodes_against_a_cascade():
@@ -189,3 +199,10 @@ def test_counts_of_live_shots_give_the_events(dead):
     assert np.max(np.abs(found - events[kept]) / error[kept]) < largest_z(shots, kept.sum())
     # Without the correction the histogram is far off.
     assert np.max(np.abs(counts / shots - events)[kept] / error[kept]) > 20
+
+
+def test_what_no_detector_can_do_is_refused():
+    with pytest.raises(UserError, match="dynode_gains"):
+        LinearDetector.photomultiplier(0.2, [4.0, 1.0])
+    with pytest.raises(UserError, match=r"dead_time_ns = 0\.5 .* narrower bins"):
+        SinglePhotonDetector(0.5, 0.5).moments(np.ones(3), 1.0, 1)

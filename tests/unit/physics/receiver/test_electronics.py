@@ -6,7 +6,8 @@ from rows import each_row
 from scipy.stats import norm
 from significance import largest_z
 
-from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
 
 
 @pytest.mark.parametrize("response", ["single_pole", "gaussian"])
@@ -59,6 +60,24 @@ def test_thermal_noise_behind_the_bandwidth(response, factor, width):
     rho = np.exp(-angle) if response == "single_pole" else np.exp(-(angle**2) / (4 * np.log(2)))
     assert np.sum(weights**2) == pytest.approx(1)
     assert np.sum(weights[1:] * weights[:-1]) == pytest.approx(rho, abs=1e-6)
+
+
+def test_amplifier_noise_without_a_low_pass_is_that_of_the_bins():
+    # White noise averaged over 1 ns has the bandwidth of 500 MHz; 3 and 4 pA/sqrt(Hz) together are 5.
+    density = 4 * 1.380649e-23 * 293.15 / (4e-12) ** 2
+    amplifier = Amplifier(1e3, noise_pa_per_rthz=3.0, load_ohm=density)
+    deviation, weights = amplifier.noise(1.0, 5)
+    assert deviation == pytest.approx(1e3 * 5e-12 * np.sqrt(5e8))
+    assert weights == np.ones(1)
+    record = np.arange(6.0)
+    np.testing.assert_array_equal(amplifier.low_pass(1.0).sampled(record, 1), record)
+
+
+def test_filtered_is_causal_and_ordered():
+    record = np.zeros((2, 8))
+    record[1, 3] = 2.0
+    np.testing.assert_allclose(filtered(record, np.array([0.5, 0.3, 0.2]))[1], [0, 1.0, 0.6, 0.4, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(filtered(record, np.array([2.0])), 2 * record)
 
 
 def test_logarithm():
@@ -126,3 +145,31 @@ def test_logarithm_of_noise(mean):
     assert found.mean[0] == pytest.approx(samples.mean(), abs=2e-5)
     assert found.variance[0] == pytest.approx(samples.var(), rel=1e-4, abs=1e-15)
     assert found.saturation[0] == pytest.approx(saturated.mean(), abs=1e-5)
+
+
+def test_logarithm_saturates_at_its_input():
+    # 0.3 V a decade and the top code at 0.6 V: ten to the 2 times the knee.
+    stage = Readout(None, LogAmplifier(0.3, 1e-3), Digitiser(16, 0.6, 0.0))
+    samples, saturated = stage.read(np.array([0.09, 0.11, -1e-3]))
+    np.testing.assert_array_equal(saturated, [False, True, True])
+    assert samples[1] == pytest.approx(0.6, rel=1e-4)
+    still = stage.expected(np.array([0.09, 0.11, -1e-3]), np.zeros(3))
+    np.testing.assert_allclose(still.mean, samples, atol=1e-5)
+    np.testing.assert_array_equal(still.saturation, [0, 1, 1])
+
+
+def test_samples_fall_on_bins():
+    assert Digitiser(8, 1.0).stride(0.3) == 1
+    assert Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.25) == 4
+    assert Digitiser(8, 1.0, sampling_ghz=0.3).stride(1 / 0.3) == 1
+    with pytest.raises(ValueError, match=r"sampling_ghz = 1 must give an integer number of bins of 0.3 ns .* 3.33333"):
+        Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
+    with pytest.raises(ValueError, match="sampling_ghz = 2"):
+        Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
+
+
+def test_stages_that_lack_another_are_refused():
+    with pytest.raises(UserError, match="block_after = 5 needs block_threshold_v"):
+        Digitiser(8, 1.0, block_after=5)
+    with pytest.raises(UserError, match="response = 'boxcar'"):
+        Amplifier(1.0, response="boxcar")

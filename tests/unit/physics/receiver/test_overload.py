@@ -3,11 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from significance import largest_z
 
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, photons_per_joule
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
+from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
+from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
 ELECTRON = 1.602176634e-19
 OHM, COUPLING = 1e4, 300.0
@@ -34,6 +37,30 @@ def test_baseline_behind_an_echo():
     np.testing.assert_allclose(direct[:15], OHM * current, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_records_behind_a_capacitor():
+    """Mean and variance of 10 000 records in closed form, and those of the bounds, whose covariance is exact."""
+    shots, light = 10_000, echo(3e4)
+    expected = CHAIN.expected(light, 1.0, 1e-8)
+    record = CHAIN.apply(light, 1.0, shots, 3, 1e-8).signal.astype(np.float64)
+    limit = largest_z(shots, 400)
+    assert np.max(np.abs(record.mean(axis=0) - expected.mean) / np.sqrt(expected.variance / shots)) < limit
+    found = record.var(axis=0, ddof=1)
+    assert np.max(np.abs(found / expected.variance - 1)) < limit * np.sqrt(2 / shots)
+    exact = sample_moments(CHAIN, light, light[None], 1.0, 1e-8)
+    np.testing.assert_allclose(exact.mean, expected.mean, atol=1e-12)
+    # The stated neglect: a share of the response time (1.6 ns) over 300 ns of the signal's own variance.
+    ratio = np.diagonal(exact.covariance) / expected.variance
+    assert np.all((ratio > 1 - 2 * 1.6 / 300) & (ratio < 1.0 + 1e-9))
+
+
+def test_a_clipped_echo_leaves_its_whole_baseline():
+    limited = replace(CHAIN, amplifier=replace(AMPLIFIER, limit_v=0.05))
+    plain, clipped = (chain.expected(echo(1e6), 1.0) for chain in (CHAIN, limited))
+    assert clipped.saturation[30] == 1
+    np.testing.assert_allclose(clipped.mean[60:], plain.mean[60:], rtol=1e-6)
+
+
 def test_blind_after_an_overload():
     """A sample above the limit holds the 12 samples after it there; the logarithm and the converter follow."""
     volts = np.zeros((2, 60))
@@ -44,6 +71,15 @@ def test_blind_after_an_overload():
     assert not saturated[1].any()
     np.testing.assert_allclose(samples[0, 20:37], stage.read(np.full(1, 1.0))[0][0])
     np.testing.assert_allclose(samples[0, 37:], 0, atol=3e-4)
+
+
+def test_time_of_recovery_in_samples():
+    chain = RECEIVERS["pmt"]
+    chain = replace(chain, amplifier=replace(chain.amplifier, recovery_ns=10.0))
+    # Samples are 1 ns apart, two bins of 0.5 ns.
+    assert chain.readout(0.5).hold == 10
+    assert replace(chain, digitiser=None).readout(0.5).hold == 20
+    assert RECEIVERS["pmt"].readout(0.5).hold == 0
 
 
 def test_moments_of_samples_after_an_overload():

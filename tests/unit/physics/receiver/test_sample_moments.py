@@ -6,9 +6,10 @@ from differentiated import PHOTON
 from rows import each_row
 from significance import largest_z
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
-from mitransient_lidar.physics.receiver.electronics import Amplifier
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
@@ -63,3 +64,25 @@ def test_derivatives_are_those_of_the_closed_forms(name):
         np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
     assert not moments.mean_derivatives[1].any()
     assert not moments.covariance_derivatives[1].any()
+
+
+def test_samples_are_taken_at_the_rate_of_the_converter():
+    chain = ReceiverChain(LinearDetector(1.0), Amplifier(1e4, 1.0), digitiser=Digitiser(12, 1.0, sampling_ghz=0.5))
+    moments = sample_moments(chain, PHOTON * PULSE, PHOTON * PULSE[None], 0.5)
+    assert moments.covariance.shape == (6, 6)
+    np.testing.assert_allclose(moments.mean, moments.mean_derivatives[0])
+    assert np.argmax(moments.mean) == np.argmax(PULSE[::4])
+
+
+@each_row(
+    ("power", "directions", "message"),
+    [
+        (-PULSE, PULSE[None], "power = -1 must not be negative"),
+        (PULSE[None], PULSE[None], r"power of shape \(1, 24\) must be one record"),
+        (PULSE, PULSE, r"directions of shape \(24,\) must have shape \(direction, 24\)"),
+        (PULSE, np.nan * PULSE[None], "directions holds nan"),
+    ],
+)
+def test_invalid_input(power, directions, message):
+    with pytest.raises(UserError, match=message):
+        sample_moments(RECEIVERS["ideal"], power, directions, 1.0)

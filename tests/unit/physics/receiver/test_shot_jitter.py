@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from rows import each_row
 from significance import largest_z
 
@@ -36,6 +37,21 @@ def assert_variance(samples, variance):
     assert abs(samples.var(ddof=1) / variance - 1) < largest_z(shots) * np.sqrt(2 / shots), samples.var() / variance
 
 
+@pytest.mark.slow
+def test_energy_of_an_echo():
+    """Counts of the mean N have the variance N + (e N)^2; the background does not change."""
+    shots, rms = 20_000, 0.05
+    light, sky = echoes(60.0, photons=1000.0), 1e-9
+    record = jittered(energy_rms=rms).apply(light, WIDTH, shots, 1, sky).signal[:, 0].astype(np.float64)
+    steady = sky * photons_per_joule(532.0) * WIDTH * 1e-9
+    total = record.sum(axis=1)
+    mean, variance = 1000 + BINS * steady, 1000 + BINS * steady + (rms * 1000) ** 2
+    assert abs(total.mean() - mean) < largest_z(shots) * np.sqrt(variance / shots)
+    assert_variance(total, variance)
+    dark = record[:, TIME < 40].sum(axis=1)
+    assert_variance(dark, (TIME < 40).sum() * steady)
+
+
 def test_trigger_is_common_to_channels_and_clocks_are_not():
     """Times of echoes: shot noise s^2/N, trigger and clock in each channel; the trigger cancels between channels."""
     shots, trigger, clock = 5000, 0.1, 0.06
@@ -67,6 +83,26 @@ def test_shots_of_a_series_have_their_own_trigger():
         assert np.max(np.abs(between - np.eye(3))) < largest_z(1000, 3) / np.sqrt(1000)
 
 
+def test_seed_of_what_channels_share():
+    chain, light = jittered(trigger_ns=0.2), echoes(60.0)
+    one, other = (centroids(chain.apply(light, WIDTH, 200, seed, common_seed=7).signal) for seed in (1, 2))
+    # Only shot noise of 0.006 ns differs.
+    assert np.abs(one - other).max() < 0.05
+    assert np.abs(one - one.mean()).max() > 0.3
+    repeated = chain.apply(light, WIDTH, 200, 1, common_seed=7).signal
+    np.testing.assert_array_equal(centroids(repeated), one)
+
+
+def test_zero_jitter_changes_only_the_random_numbers():
+    """Energies of 1 and delays of 0 leave the light as it is."""
+    energy, delay = ShotJitter().draw(5, (2, 3), True, 1, 2)
+    assert energy.shape == delay.shape == (5, 2, 3)
+    assert np.all(energy == 1)
+    assert np.all(delay == 0)
+    light = echoes(60.0, 63.0)
+    np.testing.assert_array_equal(delayed(light, np.zeros((4, 2))), np.broadcast_to(light, (4, 2, BINS)))
+
+
 @each_row("bins", [-300.0, -7.25, -0.4, 0.0, 0.75, 3.0, 11.5, 300.0])
 def test_delays_keep_energy_and_move_the_centroid(bins):
     light = echoes(60.0, 63.0)
@@ -76,3 +112,9 @@ def test_delays_keep_energy_and_move_the_centroid(bins):
         return
     np.testing.assert_allclose(found.sum(axis=1), light.sum(axis=1), rtol=1e-9)
     np.testing.assert_allclose(centroids(found), centroids(light) + WIDTH * bins, rtol=1e-9)
+
+
+def test_edges_of_a_record_are_dark():
+    ramp = np.arange(1.0, 5.0)[None]
+    np.testing.assert_allclose(delayed(ramp, np.array([[1.5]]))[0, 0], [0, 0.5, 1.5, 2.5])
+    np.testing.assert_allclose(delayed(ramp, np.array([[-2.5]]))[0, 0], [3.5, 2.0, 0, 0])

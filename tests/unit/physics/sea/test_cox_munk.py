@@ -47,6 +47,46 @@ def test_series_at_20_degrees(wind, nadir, looking_upwind, looking_downwind):
     assert series.ratio(0.0, -slope) == pytest.approx(looking_downwind, abs=5e-3)
 
 
+def normal_grid(reach=9.0, count=721):
+    """Return crosswind and upwind slopes over their standard deviations, and the Gaussian's integral of each node."""
+    nodes = np.linspace(-reach, reach, count)
+    x, y = np.meshgrid(nodes, nodes)
+    return x, y, np.exp(-0.5 * (x**2 + y**2)) / (2 * np.pi) * (nodes[1] - nodes[0]) ** 2
+
+
+def test_series_has_the_moments_of_its_terms():
+    series = GramCharlierSeries(-0.05, -0.16, 0.4, 0.12, 0.23)
+    x, y, gaussian = normal_grid()
+    density = gaussian * series.ratio(x, y)
+
+    def mean(values):
+        return float(np.sum(density * values))
+
+    found = [mean(one) for one in (np.ones_like(x), x, y, x * x, y * y, x * y, x * x * y, y**3, x**3)]
+    assert found == pytest.approx([1, 0, 0, 1, 1, 0, 0.05, 0.16, 0], abs=1e-9)
+    assert [mean(x**4) - 3, mean(x * x * y * y) - 1, mean(y**4) - 3] == pytest.approx([0.4, 0.12, 0.23], abs=1e-9)
+    for angle in (0.3, 2.0, 4.5):
+        across, up = np.sin(angle), np.cos(angle)
+        slope = across * x + up * y
+        wanted = mean(slope**3), mean(slope**4) - 3
+        assert series.along(across, up) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_waves_and_ripples_together_have_the_series():
+    """The ripples' density, averaged over Gaussian slopes of waves, is the whole series."""
+    total, part = cox_munk(6.0), (0.6 * cox_munk(6.0)[0], 0.7 * cox_munk(6.0)[1])
+    series = GramCharlierSeries.of_clean_sea(6.0)
+    ripples = series.of_part(total, part)
+    x, y, gaussian = normal_grid(reach=7.0, count=281)
+    sigma = np.sqrt(np.array([total, part, np.subtract(total, part)]))
+    for up, across in ((0.0, 0.0), (0.3, 0.1), (-0.25, 0.2)):
+        u, c = ((slope - sigma[2, i] * node) / sigma[1, i] for slope, node, i in ((up, y, 0), (across, x, 1)))
+        density = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[1].prod()) * ripples.ratio(c, u)
+        u, c = up / sigma[0, 0], across / sigma[0, 1]
+        wanted = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[0].prod()) * series.ratio(c, u)
+        assert np.sum(gaussian * density) == pytest.approx(wanted, rel=1e-6)
+
+
 def test_series_of_strong_wind_or_a_small_part_is_refused():
     with pytest.raises(UserError, match="slope_distribution 'gram_charlier' = 15 must lie"):
         GramCharlierSeries.of_clean_sea(15)

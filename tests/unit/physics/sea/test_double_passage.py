@@ -24,6 +24,12 @@ def test_independent_slopes_enhance_nothing(displacement):
     np.testing.assert_allclose(found, 1, atol=2e-3)
 
 
+def test_far_ways_are_independent():
+    structure = gaussian_structure(0.02, 0.1)
+    assert structure.enhancement(0.5, 4.0) == pytest.approx(1, abs=2e-3)
+    assert structure.enhancement(0.5, 0.0) > 1.3
+
+
 def test_structures_of_a_sea_have_its_variances():
     """At large distances twice the variance; without ripples of their own, ripples differ at any distance."""
     upwind, crosswind = cox_munk(6.0)
@@ -37,6 +43,17 @@ def test_structures_of_a_sea_have_its_variances():
     assert drawn.along[0] == pytest.approx(ripples, rel=1e-3)
     # Waves of the mesh alone, where ripples no longer differ less.
     np.testing.assert_allclose(whole.across[far], drawn.across[far], rtol=0.01)
+
+
+def test_table_follows_the_integral():
+    structure = gaussian_structure(0.02, 0.1)
+    depths = np.geomspace(0.25, 30, 24)
+    table = EnhancementTable.of(structure, depths, 0.28)
+    for depth, displacement in ((0.7, 0.0), (3.1, 0.004), (3.1, 0.06), (12.0, 0.2)):
+        wanted = structure.enhancement(0.28 * depth, displacement)
+        assert table.at(depth, displacement) == pytest.approx(wanted, rel=0.02)
+    assert table.at(0.0, 0.0) == 1
+    assert table.at(0.125, 0.0) == pytest.approx(0.5 * (1 + table.at(0.25, 0.0)))
 
 
 @pytest.mark.parametrize("wind", [1.5, 3.0, 6.0])

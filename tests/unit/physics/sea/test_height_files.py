@@ -372,6 +372,13 @@ def test_declared_holes_are_refused_or_filled(tmp_path, kind, content, options):
     assert found.filled.sum() == 12
 
 
+def test_a_deep_sea_is_no_missing_value(tmp_path):
+    """Depths about 9999 m, as in a trench, are depths."""
+    values = -9999.0 + 10 * HEIGHTS + 50
+    values[0, 0] = -9999.0
+    assert read(tmp_path, "tif", Content(values)).heights.min() == -9999
+
+
 def test_the_log_states_what_the_file_does(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     content = Content(HEIGHTS / FTUS, 1 / FTUS, STATE_PLANE, "EPSG:2263+6360")

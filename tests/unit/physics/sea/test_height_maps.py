@@ -56,6 +56,13 @@ def test_npy_is_centred_on_the_origin(tmp_path):
     assert_is_the_map(read_height_map(str(path), 6), y=[-2, 0, 2])
 
 
+def test_npz_with_and_without_positions(tmp_path):
+    path = write_npz(tmp_path / "map.npz", heights=HEIGHTS, x=X, y=Y)
+    assert_is_the_map(read_height_map(path))
+    path = write_npz(tmp_path / "map.npz", heights=HEIGHTS.astype(int))
+    assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
+
+
 @each_row("kind", [np.float32, np.float16, np.uint32])
 @each_row(("wanted", "others"), [("depth", []), ("Y", ["stderr"]), ("R", ["G", "B"]), ("Z", ["A"]), ("Y", ["R", "Z"])])
 def test_top_row_of_an_exr_image_has_the_largest_y(tmp_path, kind, wanted, others):
@@ -73,6 +80,13 @@ def test_netcdf_with_coordinates_in_either_order(tmp_path, name, dims):
     assert_is_the_map(read_height_map(path))
 
 
+def test_netcdf_without_coordinates_needs_a_size(tmp_path):
+    path = write_netcdf(tmp_path / "map.nc", HEIGHTS, ("row", "column"))
+    assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
+    with pytest.raises(ValueError, match=r"map.nc has no positions of its heights: give the size"):
+        read_height_map(path)
+
+
 def test_sample_returns_the_map_at_its_points_and_planes_between():
     # h = 2 + 3x - y + xy is bilinear.
     x, y = np.linspace(-3, 4, 8), np.linspace(10, 12, 5)
@@ -80,6 +94,14 @@ def test_sample_returns_the_map_at_its_points_and_planes_between():
     np.testing.assert_array_equal(surface.sample(x, y), surface.heights)
     east, north = np.array([-2.9, 0.3, 3.99]), np.array([10.0, 10.2, 11.99, 12])
     np.testing.assert_allclose(surface.sample(east, north), 2 + 3 * east - north[:, None] + east * north[:, None])
+
+
+def test_sample_outside_has_the_height_of_the_nearest_point_of_the_edge():
+    surface = HeightMap(HEIGHTS, X, Y)
+    np.testing.assert_array_equal(
+        surface.sample([-100, -3, 0, 3, 100], [-100, 5.25, 100]),
+        [[0, 0, 1.5, 3, 3], [5, 5, 6.5, 8, 8], [20, 20, 21.5, 25, 25]],
+    )
 
 
 def with_holes():
@@ -111,6 +133,14 @@ def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
     assert "\n" not in str(error.value)
 
 
+def test_holes_of_an_image_are_counted_from_the_smallest_y(tmp_path):
+    image = HEIGHTS[::-1].astype(np.float32)
+    image[0, 1] = np.nan
+    path = write_exr(tmp_path / "map.exr", {"Y": image})
+    with pytest.raises(ValueError, match="1 of 12 heights, the first in row 2 and column 1"):
+        read_height_map(path, 6.0)
+
+
 @each_row(
     ("positions", "message"),
     [
@@ -129,6 +159,21 @@ def test_invalid_positions_are_rejected(tmp_path, positions, message):
     with pytest.raises(UserError) as error:
         read_height_map(path)
     assert message in str(error.value)
+
+
+def test_files_without_one_map_are_rejected(tmp_path):
+    path = write_npz(tmp_path / "map.npz", depths=HEIGHTS)
+    with pytest.raises(ValueError, match=r"map.npz must have an array heights, and may have x and y"):
+        read_height_map(path)
+    path = write_exr(tmp_path / "map.exr", dict.fromkeys("AB", HEIGHTS.astype(np.float32)))
+    with pytest.raises(ValueError, match="has the channels A, B: it must have only one, or one called Y, R or Z"):
+        read_height_map(path)
+    path = write_netcdf(tmp_path / "map.nc", HEIGHTS, name="a", b=(("y", "x"), HEIGHTS))
+    with pytest.raises(ValueError, match="has 2 variables that may be the heights"):
+        read_height_map(path)
+    path = write_netcdf(tmp_path / "map.nc", HEIGHTS[0], dims=("x",), name="a")
+    with pytest.raises(ValueError, match="has 0 variables that may be the heights"):
+        read_height_map(path)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".exr", ".nc"])
@@ -217,6 +262,12 @@ def test_holes_have_the_value_of_the_nearest_cell(tmp_path, caplog):
     assert "2 of 12 heights are missing, filled from the nearest cells" in caplog.text
 
 
+def test_holes_of_oblong_cells_are_filled_along_the_short_side(tmp_path):
+    rows = np.array([[1.0, 2, 3], [4, -9999, 6], [7, 8, 9]])
+    path = write_ascii_grid(tmp_path / "map.asc", rows, ncols=3, cellsize=None, dx=1, dy=3)
+    assert read_height_map(path, holes="fill").heights[1, 1] in (4, 6)
+
+
 @each_row(
     ("changes", "message"),
     [
@@ -232,6 +283,38 @@ def test_holes_have_the_value_of_the_nearest_cell(tmp_path, caplog):
 def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):
         read_height_map(write_ascii_grid(tmp_path / "map.asc", **changes))
+
+
+@each_row(
+    ("options", "message"),
+    [
+        ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
+        (
+            {"origin": (6000007.5, 500001)},
+            r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is 499998 to",
+        ),
+        ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
+        ({"origin": (np.nan, 0)}, "origin_x = nan must be finite"),
+        ({"values": "fathoms"}, "map_values = 'fathoms' must be heights or depths"),
+        ({"holes": "keep"}, "map_holes = 'keep' must be refuse or fill"),
+    ],
+)
+def test_invalid_placements_are_rejected(tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
+
+
+def test_an_origin_beside_the_map_is_warned_of(tmp_path, caplog):
+    """A lidar aims there by default; a survey may count its places from any round number."""
+    found = read_height_map(write_ascii_grid(tmp_path / "map.asc"), origin=(499990.0, 6000000.0))
+    assert (found.x[0], found.y[0]) == (8, 5.5)
+    assert "do not contain x = y = 0, where the lidar aims by default" in caplog.text
+
+
+def test_origin_needs_positions(tmp_path):
+    path = write_npy(tmp_path / "map.npy", HEIGHTS)
+    with pytest.raises(UserError, match=r"origin_x and origin_y must not be given: .*map.npy has no positions"):
+        read_height_map(path, 6.0, (0.0, 0.0))
 
 
 def write_geotiff(path, heights=HEIGHTS[::-1], count=1, transform=(2, 0, 499997, 0, -2, 6000010.5), crs=32633, **tags):

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from rows import each_row
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 
 GRAVITY = 9.81
@@ -73,3 +75,75 @@ def test_wake_turns_and_moves_with_the_ship(bearing):
     expected = at_points(ahead, port, 4.0, 0.0, **ship)
     assert np.abs(expected).max() > 0.05
     assert heights[pick[1], pick[0]] == pytest.approx(expected, abs=1e-5)
+
+
+def test_waves_grow_from_amidships_to_the_stern():
+    length, x, y = 20.0, np.linspace(-40, 40, 161), np.linspace(-10, 10, 41)
+    heights = kelvin_wake(x, y, 6.0, 0.0, length)
+    assert np.all(heights[:, x >= 0] == 0)
+    # The wake is symmetric about its track.
+    assert heights == pytest.approx(heights[::-1], abs=1e-12)
+    # A step in the heights amidships would be a wall of water; at a fifth of the way there are 6 % of them.
+    assert np.abs(heights[:, (x < 0) & (x >= -2)]).max() < 0.06 * np.abs(heights).max()
+
+
+@pytest.mark.parametrize("speed", [3.0, 8.0, 25.0])
+def test_heights_do_not_depend_on_the_extent_of_the_grid(speed):
+    # A larger grid has finer nodes of the integral: twice as many here.
+    small = np.linspace(-40, 40, 81)
+    large = np.linspace(-160, 160, 321)
+    inner = slice(120, 201)
+    part = kelvin_wake(small, small, speed, 0.4, 15.0)
+    full = kelvin_wake(large, large, speed, 0.4, 15.0)[inner, inner]
+    assert np.abs(part - full).max() < 2e-5 * np.abs(full).max()
+
+
+def test_coarse_lines_show_no_waves_that_they_cannot_resolve():
+    fine = np.linspace(-30, 10, 161)
+    coarse = np.concatenate([[-160, -130, -100, -70, -50, -40], fine])
+    speed = 3.0  # waves of 5.8 m at most
+    uneven = kelvin_wake(coarse, fine, speed, 0.0, 8.0)
+    even = kelvin_wake(fine, fine, speed, 0.0, 8.0)
+    # The first fine line counts its coarse neighbour.
+    assert uneven[:, 7:] == pytest.approx(even[:, 1:], abs=1e-5 * np.abs(even).max())
+    assert np.all(uneven[:, :7] == 0)
+    assert np.abs(even[:, 0]).max() > 0.1 * np.abs(even).max()
+
+
+def test_short_waves_fade_and_slow_ships_leave_nothing():
+    x = np.linspace(-20, -10, 401)
+    y = np.linspace(-3, 3, 241)
+    heights = kelvin_wake(x, y, 4.0, 0.0, 6.0, smallest_wavelength=1.0)
+    window = np.hanning(x.size) * np.hanning(y.size)[:, None]
+    kx, ky = (2 * np.pi * np.fft.fftfreq(lines.size, 0.025) for lines in (x, y))
+    power = np.abs(np.fft.fft2(heights * window)) ** 2
+    short = np.hypot(kx, ky[:, None]) > 2 * np.pi / 1.0 + 3
+    assert power[short].sum() < 1e-4 * power.sum()
+    # 2 pi U^2/g = 0.16 m
+    assert np.all(kelvin_wake(x, y, 0.5, 0.0, 6.0, smallest_wavelength=0.17) == 0)
+
+
+def test_heights_grow_as_the_beam():
+    x, y = np.linspace(-30, -10, 41), np.linspace(-8, 8, 33)
+    default = kelvin_wake(x, y, 4.0, 0.0, 8.0)
+    assert default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, 1.0, 0.4), rel=1e-12)
+    assert 2 * default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, beam=2.0), rel=1e-12)
+
+
+@each_row(
+    ("change", "message"),
+    [
+        ({"x": [1.0]}, "x of shape (1,) must be a list of at least 2 numbers"),
+        ({"y": [[0, 1]]}, "y of shape (1, 2) must be a list of at least 2 numbers"),
+        ({"y": [0, 2, 2]}, "y must increase strictly, but 2 is followed by 2"),
+        (
+            {"x": [0, 0.05], "y": [0, 0.05], "ship_x": 1e6},
+            "wake_x, wake_y: the wake spreads over 3.54e+05 m before this sea, too far for waves of 0.1 m",
+        ),
+    ],
+)
+def test_errors(change, message):
+    given = {"x": [0, 1], "y": [0, 1], "speed": 5, "bearing": 0, "length": 10, **change}
+    with pytest.raises(UserError) as error:
+        kelvin_wake(**given)
+    assert str(error.value) == message

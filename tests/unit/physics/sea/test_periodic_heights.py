@@ -42,6 +42,14 @@ def test_long_waves_are_those_of_a_coarse_sea():
         assert low < np.corrcoef(averaged.ravel(), coarse.sample(lines, lines).ravel())[0, 1] < high
 
 
+def test_sea_of_bands_repeats_after_its_period():
+    waves, cell, _ = realise_heights(SEA, 128.0, 0.06, 1, STILL, 0.0)
+    lines = cell * np.arange(50)
+    period = round(128.0 / cell) * cell
+    assert period == pytest.approx(128.0, abs=1e-9)
+    np.testing.assert_allclose(waves.sample(lines, lines), waves.sample(lines + period, lines - period), atol=1e-9)
+
+
 @pytest.mark.slow
 def test_waves_of_all_bands_move():
     """A current of 3 m/s carries a frozen sea: nearly the same after 0.01 s at a place 3 cm further on."""

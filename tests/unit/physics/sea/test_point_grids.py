@@ -1,6 +1,7 @@
 """Tables of points: headings, separators, missing values, their own grids, and triangulation."""
 
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -76,6 +77,13 @@ def test_other_tables_are_refused(tmp_path, monkeypatch, text, message):
         read_points(tmp_path / "a.csv")
 
 
+def test_a_table_of_a_billion_points_is_refused_by_its_size(tmp_path):
+    (tmp_path / "a.csv").touch()
+    os.truncate(tmp_path / "a.csv", 30 * 10**9)
+    with pytest.raises(UserError, match=r"a\.csv has 2\.861e\+04 MiB: a table may have 512 MiB"):
+        read_points(tmp_path / "a.csv")
+
+
 def write_points(path, points):
     path.write_text("\n".join(" ".join(f"{one:.4f}" for one in row) for row in points))
     return path
@@ -115,6 +123,19 @@ def test_scattered_points_are_interpolated_linearly(tmp_path, caplog):
     coarse = read_height_map(tmp_path / "a.csv", origin=(500010.0, 6000005.0), cell=4.0)
     np.testing.assert_allclose(np.diff(coarse.x), 4.0)
     assert coarse.heights.shape == (6, 11)
+
+
+def test_cells_outside_the_hull_are_holes_that_do_not_cover(tmp_path):
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-10, 10, (3000, 2))
+    places = places[np.hypot(*places.T) < 10]
+    path = write_points(tmp_path / "a.txt", np.column_stack([places, np.full(len(places), -6.0)]))
+    with pytest.raises(UserError, match="has holes"):
+        read_height_map(path)
+    read = read_height_map(path, origin=(0.0, 0.0), holes="fill", values="heights")
+    np.testing.assert_allclose(read.heights, -6.0)
+    assert read.covers([0, 9, 9, 0], [0, 0, 9, 11]).tolist() == [True, True, False, False]
+    assert read.covers(np.zeros((2, 3)), np.full((2, 3), np.nan)).tolist() == [[False] * 3] * 2
 
 
 @each_row(

@@ -8,6 +8,7 @@ from rows import each_row
 from scipy import stats
 from significance import largest_z
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import angular_frequency
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -124,6 +125,11 @@ def test_current_carries_the_sea_along(kind):
     np.testing.assert_allclose(carried, np.roll(still, (-2, 4), (0, 1)), atol=1e-12)
 
 
+def test_the_longest_waves_of_a_wide_patch_have_no_negative_variance():
+    """Far below the peak Delta rounds to 1, and the density across the wind to either side of 0."""
+    assert np.all(np.isfinite(realise(ElfouhailySpectrum(3), 2700, 128, 1)))
+
+
 def test_facet_slopes_have_the_predicted_variance():
     size, n, wind_direction = 8.0, 32, 0.6
     spectrum = ElfouhailySpectrum(6, direction=wind_direction)
@@ -150,9 +156,34 @@ def test_facet_slopes_have_the_predicted_variance():
     assert unfiltered - expected[1] > 8 * error[1]
 
 
+def test_grids_without_a_middle_are_refused():
+    for cells in (15, 0):
+        with pytest.raises(UserError, match=f"cells = {cells} must be an even integer of at least 2"):
+            realise(ElfouhailySpectrum(5), 10, cells, 1)
+
+
 def single_wave(wavelength, direction):
     """Return swell that is one wave of a period of 64 m."""
     return SwellSpectrum(0.5, wavelength, direction, relative_bandwidth=1e-3, directional_spread=1e-3)
+
+
+G = 9.81
+
+
+def test_angular_frequency_in_its_limits():
+    assert angular_frequency(0.1) ** 2 == pytest.approx(G * 0.1, rel=1e-6)
+    # The slowest wave has 23 cm/s at 370 rad/m: slower than its neighbours.
+    speeds = angular_frequency([365.0, 370.0, 375.0]) / [365.0, 370.0, 375.0]
+    assert speeds[1] == pytest.approx(np.sqrt(2 * G / 370))
+    assert speeds[1] == pytest.approx(0.23, abs=1e-3)
+    assert speeds[1] < min(speeds[0], speeds[2])
+    # Ripples of 1 mm: surface tension of clean water, 0.0728 N/m
+    assert angular_frequency(6283.0) ** 2 == pytest.approx(0.0728e-3 * 6283.0**3, rel=0.03)
+    # Shallow: all waves travel at sqrt(g h)
+    assert angular_frequency(0.001, depth=2.0) / 0.001 == pytest.approx(np.sqrt(G * 2), rel=1e-5)
+    assert angular_frequency(0.5, depth=2.0) ** 2 == pytest.approx(G * 0.5 * np.tanh(1.0), rel=1e-5)
+    assert angular_frequency(0.0) == angular_frequency(0.0, 3.0) == 0
+    np.testing.assert_array_equal(angular_frequency([[0.1, 2.0]], 1e4), angular_frequency([[0.1, 2.0]]))
 
 
 @pytest.mark.slow

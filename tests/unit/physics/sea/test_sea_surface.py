@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.physics.sea.realization import Band, Motion, realise_heights
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
@@ -48,6 +50,23 @@ def test_a_breath_of_wind_makes_no_waves(wind):
     assert np.all(sea.heights(np.arange(5.0), np.arange(4.0)) == 0)
 
 
+def test_finer_cells_show_the_same_waves():
+    """Points of both grids: the same heights, whether in one grid or, too fine for one, as a sum of waves."""
+    spectrum = MatchedSpectrum(ElfouhailySpectrum(6.0), *cox_munk(6.0))
+    still = Motion(3.0, 1e4, (0.5, 0.0))
+    coarse, fine, finest = (
+        realise_heights(spectrum, 64.0, cell, 4, still, 0.0, 1.0)[0] for cell in (0.25, 0.0625, 0.015625)
+    )
+    assert isinstance(finest.parts[0], Band)
+    lines = 0.25 * np.arange(-20, 20)
+    expected = coarse.sample(lines, lines)
+    assert expected.std() > 0.03
+    for waves in (fine, finest):
+        np.testing.assert_allclose(waves.sample(lines, lines), expected, atol=1e-12)
+    other = realise_heights(spectrum, 64.0, 0.25, 4, still, 0.0, 0.6)[0].sample(lines, lines)
+    assert 1e-4 < np.std(other - expected) < 0.1 * expected.std()
+
+
 def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
     """The plane is added to the waves, ends at the patch, and leaves the variance of slopes as it is."""
     options = {
@@ -69,3 +88,12 @@ def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
     for half, position in zip(np.split(np.arange(len(mesh.vertices)), 2), positions, strict=True):
         offsets = np.clip(plain.vertices[half, :2] - position, -4.0, 4.0)
         np.testing.assert_allclose((mesh.vertices - plain.vertices)[half, 2], offsets @ slopes, atol=1e-9)
+
+
+def test_a_flat_sea_with_a_mean_slope_is_a_plane_and_slopes_are_limited():
+    mesh = read(spectrum="flat", slope_x_deg=3.0, refined_size=6.0, cell_size=0.5, size=20.0).mesh()
+    inside = np.abs(mesh.vertices[:, 0]) <= 3.0
+    np.testing.assert_allclose(mesh.vertices[inside, 2], np.tan(np.radians(3.0)) * mesh.vertices[inside, 0], atol=1e-12)
+    assert len(read(spectrum="flat", size=20.0).mesh().faces) == 4
+    with pytest.raises(UserError, match="slope_y_deg = 16 must lie between -15 and 15"):
+        read(slope_y_deg=16.0)

@@ -17,6 +17,7 @@ from mitransient_lidar.physics.sea.wind_spectra import (
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
     ShallowSpectrum,
+    inverse_wave_age,
 )
 
 G = 9.81
@@ -96,6 +97,52 @@ def test_elfouhaily_against_the_formula(wind):
     assert spectrum.peak_wavenumber == pytest.approx(peak)
 
 
+@each_row(("fetch", "heights"), [(20e3, (0.158, 0.405, 0.723)), (100e3, (0.217, 0.674, 1.43))], ids=["20km", "100km"])
+def test_elfouhaily_heights_at_a_fetch(fetch, heights):
+    for wind, height in zip((3, 6, 10), heights, strict=True):
+        spectrum = ElfouhailySpectrum(wind, inverse_wave_age(wind, fetch))
+        # The heights are given with three digits.
+        assert significant_wave_height(spectrum) == pytest.approx(height, abs=0.5 * 10 ** (-2 if height > 1 else -3))
+
+
+def test_inverse_wave_age_ends_at_full_development_and_at_the_youngest_sea():
+    assert inverse_wave_age(5, 1e9) == pytest.approx(0.84)
+    assert inverse_wave_age(0, 1e3) == 0.84
+    with pytest.raises(ValueError, match=r"fetch = 100 must be at least (\d+) m at a wind speed of 10 m/s") as error:
+        inverse_wave_age(10, 100)
+    shortest = float(str(error.value).split("at least ")[1].split()[0])
+    assert inverse_wave_age(10, 1.01 * shortest) == pytest.approx(5, rel=0.02)
+
+
+@each_row("wind", [1e-6, 0.5, 1.5, 30])
+def test_extreme_winds_stay_finite_and_non_negative(wind):
+    for spectrum in (
+        ElfouhailySpectrum(wind, inverse_wave_age=2.0),
+        PiersonMoskowitzSpectrum(wind),
+        JonswapSpectrum(wind, 1000 * wind**2 / G),
+        MatchedSpectrum(ElfouhailySpectrum(wind), *cox_munk(wind)),
+    ):
+        k = np.geomspace(1e-4, 1e5, 500)
+        s = spectrum.omnidirectional(k)
+        assert np.all(np.isfinite(s))
+        assert np.all(s >= 0)
+        assert np.all(np.abs(spectrum.spreading(k)) <= 1)
+        assert spectrum.omnidirectional([0, -1]) == pytest.approx([0, 0], abs=0)
+
+
+def test_no_wind_gives_a_flat_sea():
+    for spectrum in (
+        ElfouhailySpectrum(0),
+        PiersonMoskowitzSpectrum(0),
+        MatchedSpectrum(ElfouhailySpectrum(0), *cox_munk(0)),
+        SwellSpectrum(0, 10),
+    ):
+        assert spectrum.slope_variance() == (0, 0)
+        assert significant_wave_height(spectrum) == 0
+        assert not directional(spectrum, [0.0, 1.0], 1.0).any()
+    assert ElfouhailySpectrum(0).peak_wavenumber == PiersonMoskowitzSpectrum(0).peak_wavenumber == np.inf
+
+
 @pytest.mark.parametrize(("wind", "height", "slope"), [(3, 0.202, 0.0161), (6, 0.808, 0.0217), (10, 2.245, 0.0258)])
 def test_pierson_moskowitz(wind, height, slope):
     spectrum = PiersonMoskowitzSpectrum(wind)
@@ -155,6 +202,14 @@ def test_shallow_water_limits_the_long_waves():
     assert shallow.omnidirectional(5.0) == pytest.approx(deep.omnidirectional(5.0), rel=1e-9)
 
 
+def test_jonswap_ends_where_the_sea_is_fully_developed():
+    """100 km at 3 m/s would make waves of 0.735 m, three times those of a fully developed sea."""
+    with pytest.raises(ValueError, match=r"fetch = 100000 must not exceed 1\.56e\+04 m .* sea is fully developed"):
+        JonswapSpectrum(3, 1e5)
+    oldest = JonswapSpectrum(3, 15.6e3)
+    assert oldest.peak_wavenumber == pytest.approx(PiersonMoskowitzSpectrum(3).peak_wavenumber, rel=2e-3)
+
+
 def test_swell_has_the_given_height_and_length():
     swell = SwellSpectrum(2.0, 80.0, 0.3, relative_bandwidth=0.05, directional_spread=0.1)
     assert significant_wave_height(swell) == pytest.approx(2.0, rel=1e-7)
@@ -164,6 +219,34 @@ def test_swell_has_the_given_height_and_length():
     curvature = 0.25 * swell.peak_wavenumber**2 * (1 + 0.05**2)
     assert along + across == pytest.approx(curvature, rel=1e-6)
     assert along - across == pytest.approx(curvature * np.exp(-2 * 0.1**2), rel=1e-6)
+
+
+def test_swell_variance_is_conserved_in_a_short_period():
+    """Sampled at the waves of the period, swell of 60 m would be 0.2 m or 30 m high in periods of a few lengths."""
+    swell = SwellSpectrum(1.0, 60.0, 0.4, relative_bandwidth=0.02, directional_spread=0.03)
+    index = np.arange(-60, 61)
+    for period in (61, 200, 256, 1100):
+        variances = swell.mode_variances(index, index, 2 * np.pi / period)
+        assert 4 * np.sqrt(variances.sum()) == pytest.approx(1.0, rel=1e-6)
+        np.testing.assert_array_equal(variances, variances[::-1, ::-1])
+    # The nearest wave has most of the variance: 256/60 = 4.3 periods along 0.4 rad
+    variances = swell.mode_variances(index, index, 2 * np.pi / 256)
+    j, i = np.unravel_index(np.argmax(variances), variances.shape)
+    assert (abs(index[i]), abs(index[j])) == (4, 2)
+    assert index[i] * index[j] > 0
+
+
+@each_row(("period", "cell_integrals"), [(850.0, True), (950.0, False)])
+def test_swell_at_dense_waves_has_its_slopes(period, cell_integrals):
+    """Cells as wide as the hump agree with points except for the variance dk^2/12 of k within a cell (Sheppard)."""
+    swell = SwellSpectrum(1.0, 30.0, 0.0, relative_bandwidth=0.0335, directional_spread=0.1)
+    index, dk = np.arange(-60, 61), 2 * np.pi / period
+    variances = swell.mode_variances(index, index, dk)
+    assert variances.sum() == pytest.approx(1 / 16, rel=1e-5)
+    along, across = swell.slope_variance()
+    within = variances.sum() * dk**2 / 12 if cell_integrals else 0
+    assert np.sum(variances * (index * dk) ** 2) == pytest.approx(along + within, rel=3e-5)
+    assert np.sum(variances.T * (index * dk) ** 2) == pytest.approx(across + within, rel=1e-3)
 
 
 @each_row("kind", SPECTRA)
@@ -202,6 +285,15 @@ def test_opposite_waves_have_equal_density(kind):
     there, back = directional(spectrum, kx, ky), directional(spectrum, -kx, -ky)
     np.testing.assert_allclose(there, back, rtol=1e-12)
     assert there.any()
+
+
+@each_row("kind", ["elfouhaily", "pierson_moskowitz", "jonswap", "matched", "swell"])
+def test_mode_variances_are_the_directional_spectrum(kind):
+    """For these as fast as each |k| is looked up once; a mirrored or turned lookup would show."""
+    spectrum = SPECTRA[kind]
+    ix, iy, dk = np.arange(0, 40), np.r_[0:20, -20:0], 0.011
+    expected = directional(spectrum, ix * dk, iy[:, None] * dk) * dk**2
+    np.testing.assert_allclose(spectrum.mode_variances(ix, iy, dk), expected, rtol=1e-9, atol=1e-18)
 
 
 def test_sea_is_the_sum_of_its_components_along_the_axes_of_the_first():
@@ -244,3 +336,56 @@ def test_matched_totals(kind, wind):
     if plain.peak_wavenumber < 2 * np.pi:
         total = sum(trapezoid(matched.omnidirectional(k) * k**3, np.log(k)) for k in (long, short))
         assert total == pytest.approx(sum(cox_munk(wind)), rel=1e-5 if kind is ElfouhailySpectrum else 1e-4)
+
+
+@each_row(
+    ("plain", "upwind", "crosswind"),
+    [
+        (ElfouhailySpectrum(6), 0.0010, 0.0005),  # less than the waves longer than 1 m have
+        (ElfouhailySpectrum(6), 0.0300, 0.0105),  # ratios that clip some waves
+        (ElfouhailySpectrum(1), 0.0030, 0.0011),
+        (PiersonMoskowitzSpectrum(6), 0.004, 0.011),
+    ],
+)
+def test_matched_totals_far_from_the_spectrum(plain, upwind, crosswind):
+    matched = MatchedSpectrum(plain, upwind, crosswind)
+    assert matched.slope_variance() == pytest.approx((upwind, crosswind), rel=1e-10)
+    assert min(matched.scales) >= 0
+    assert np.all(np.abs(matched.spreading(np.geomspace(0.01, 1000, 500))) <= 1)
+    k = 0.99 * matched.scaled_from
+    assert matched.omnidirectional(k) == plain.omnidirectional(k)
+    assert matched.scaled_from <= 2 * np.pi
+
+
+@each_row("wind", [0.01, 0.1, 0.2, 0.35])
+def test_matched_totals_are_not_exceeded_where_no_waves_can_have_them(wind):
+    """Cox and Munk leave 0.003 crosswind at no wind; the density of no wave is more than cos^2 across the wind."""
+    wanted = cox_munk(wind)
+    matched = MatchedSpectrum(ElfouhailySpectrum(wind), *wanted)
+    along, across = matched.slope_variance()
+    assert along <= wanted[0] * (1 + 1e-9)
+    assert across <= 3 * wanted[0] * (1 + 1e-9) < wanted[1]
+    if wind > 0.05:
+        assert (along, across) == pytest.approx((wanted[0], 3 * wanted[0]), rel=1e-6)
+    else:
+        assert (along, across) == (0, 0)
+
+
+def test_matched_totals_of_too_large_a_ratio_miss_the_larger():
+    assert MatchedSpectrum(ElfouhailySpectrum(6), 0.03, 0.005).slope_variance() == pytest.approx((0.015, 0.005))
+    assert MatchedSpectrum(ElfouhailySpectrum(6), 0.005, 0.03).slope_variance() == pytest.approx((0.005, 0.015))
+
+
+@each_row(
+    ("call", "message"),
+    [
+        (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
+        (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
+        (lambda: SeaState(()), "components must hold at least one"),
+        (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
+        (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -32,6 +32,10 @@ def test_layer_is_as_deep_as_the_wind_makes_it(wind, depth):
     assert WindBubbles.of_wind(wind).depth == pytest.approx(depth)
 
 
+def test_there_are_no_bubbles_without_wind():
+    assert WindBubbles.of_wind(0.0).scattering == 0
+
+
 @pytest.mark.parametrize("backscatter", [100.0, CLEAN_BACKSCATTER, 1445.0])
 def test_phase_function_scatters_back_as_the_bubbles_do(backscatter):
     bubbles = WindBubbles.of_wind(12.0)

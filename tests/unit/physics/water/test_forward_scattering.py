@@ -1,6 +1,7 @@
 """Displacements by forward scattering, against their moments."""
 
 import numpy as np
+import pytest
 import significance
 from oracles.phase import henyey_greenstein
 
@@ -45,3 +46,11 @@ def test_layers_scatter_by_their_optical_depth():
     found = mean_squares(column, [table(0.9), table(0.995), table(0.9)], np.array([10.0]), 1)
     wanted = mean_square_tangent(0.995) * (7.0**3 - 6.0**3) / 3
     significance.assert_equal(found[:, 0, 1], wanted, error=0.08, bias=2e-3)
+
+
+def test_depth_above_all_scattering():
+    column = WaterColumn([0.0, 3.0], [0.2, 0.5], [0.0, 0.4], [0.0, 1e-3])
+    moved = displacements(column, [table(0.9)] * 2, np.array([2.0]), 2, 100, np.random.default_rng(1))
+    assert np.all(np.isfinite(moved))
+    assert moved.shape == (1, 3, 100)
+    assert np.abs(moved[0, 0]).max() == pytest.approx(0)

@@ -6,7 +6,7 @@ from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
+from mitransient_lidar.physics.water.sediments import BOTTOMS, HapkeSurface, bottom_reflectance
 
 #: Lobes towards the source and away from it, narrow and wide opposition effects.
 SURFACES = [HapkeSurface(0.7), HapkeSurface(0.5, 0.5, 0.8, 1.0, 0.02), HapkeSurface(0.9, 0.4, 0.2, 0.0, 0.1)]
@@ -61,6 +61,11 @@ def test_opposition_effect_doubles_single_scattering_and_falls_to_half_its_heigh
     np.testing.assert_allclose(surge, [1.0, 0.5, 0.02 / (0.02 + np.tan(0.5))], rtol=1e-12)
 
 
+def test_is_reciprocal():
+    surface = SURFACES[1]
+    assert surface.brdf(0.9, 0.3, 1.0) == pytest.approx(surface.brdf(0.3, 0.9, 1.0), rel=1e-14)
+
+
 @each_row("wanted", [0.0, 0.05, 0.1, 0.43, 0.8])
 def test_albedo_follows_from_the_reflectance(wanted):
     found = HapkeSurface(0.0, 0.3, 0.6, 0.8, 0.05).of_reflectance("reflectance", wanted)
@@ -72,6 +77,12 @@ def test_more_light_than_arrives_is_refused():
         HapkeSurface(0.0, 0.8, 0.0, 0.0).of_reflectance("reflectance", 0.95)
     with pytest.raises(UserError, match=r"they would reflect 1\.\d+ of the light that arrives at"):
         HapkeSurface(0.0).of_albedo("single_scattering_albedo", 1.0)
+
+
+def test_bottoms_by_name_have_the_values_of_the_table():
+    """At 530 nm, and between it and 540 nm (Maritorena et al. 1994, fig. 6)."""
+    assert [bottom_reflectance("reflectance", name, 530.0) for name in BOTTOMS] == [0.429, 0.246, 0.044, 0.075]
+    assert bottom_reflectance("reflectance", "coral_sand") == pytest.approx(0.8 * 0.429 + 0.2 * 0.442)
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,18 @@ def test_properties_per_layer(layered):
     np.testing.assert_allclose(layered.edge_optical_depth, [0, 2.7])
 
 
+def test_clear_water_has_no_albedo():
+    water = WaterColumn.from_text(0, 0, 0, 0)
+    assert water.albedo[0] == 0
+    assert water.backscatter_ratio[0] == 0
+
+
 def test_layer_owns_its_upper_edge_and_first_layer_fills_crests(layered):
     np.testing.assert_array_equal(layered.layer_at([-1, 0, 2.999, 3, 100]), [0, 0, 0, 1, 1])
+
+
+def test_cumulative_is_piecewise_linear(layered):
+    np.testing.assert_allclose(layered.cumulative([-1, 0, 1, 3, 5]), [-0.9, 0, 0.9, 2.7, 3.7], atol=1e-15)
 
 
 def test_shares_of_the_layers_in_the_water_above_a_depth(layered):
@@ -36,6 +46,15 @@ def test_slanted_segment_is_independent_of_direction(layered):
     # 2 m of the upper and 2 m of the lower layer, stretched by 1.25: (2 * 0.9 + 2 * 0.5) * 1.25
     assert layered.optical_depth(1, 5, 5) == pytest.approx(3.5)
     assert layered.optical_depth(5, 1, 5) == pytest.approx(3.5)
+
+
+def test_level_and_nearly_level_segments_agree(layered):
+    # A difference of cumulative depths would lose all digits here.
+    level = layered.optical_depth(1.0, 1.0, 10.0)
+    nearly = layered.optical_depth(1.0, np.nextafter(1.0, 2), 10.0)
+    assert level == 9.0
+    assert nearly == pytest.approx(9.0, rel=1e-14)
+    assert layered.optical_depth(3.0, 3.0, 10.0) == 5.0
 
 
 @each_row(

@@ -75,3 +75,9 @@ def test_between_angles_and_below_the_first_it_is_a_power(name):
     # From theta^-2 on the integral would diverge.
     assert power > -2
     assert p(0.0) == np.inf
+
+
+def test_absorption_and_scattering_add_up_to_the_attenuation():
+    assert PETZOLD_WATERS.keys() == REPORT.keys()
+    for name, (absorption, scattering) in PETZOLD_WATERS.items():
+        assert absorption + scattering == pytest.approx(REPORT[name][0], abs=1e-12)

@@ -1,12 +1,16 @@
 """Phase functions of particles in closed form, and their tables."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from oracles.phase import henyey_greenstein
-from scipy.integrate import simpson
+from oracles.phase import henyey_greenstein, two_term_henyey_greenstein
+from rows import each_row
+from scipy.integrate import quad, simpson
 
 from mitransient_lidar.physics.water.phase import (
     fournier_forand,
+    fournier_forand_backscatter_ratio,
     fournier_forand_cdf,
     fournier_forand_parameters,
     henyey_greenstein_backscatter_ratio,
@@ -56,6 +60,15 @@ def test_fournier_forand_family(ratio, mu, n, p180, p90):
     assert table.backscatter_ratio == pytest.approx(ratio, rel=1e-4)
 
 
+@each_row(("ratio", "g"), [(0.03, 0.89464), (0.04, 0.86658), (0.05, 0.83992), (0.0183, 0.93000)])
+def test_fournier_forand_mean_cosine(ratio, g):
+    n, mu = fournier_forand_parameters(ratio)
+    # <cos> = 1 - 2 <s> = 1 - 2 int_0^1 (1 - F) ds counts the light within a nanoradian, too.
+    beyond = quad(lambda s: 1 - fournier_forand_cdf(2 * np.arcsin(np.sqrt(s)), n, mu), 0, 1, points=[1e-4, 1e-2])[0]
+    assert 1 - 2 * beyond == pytest.approx(g, abs=1e-5)
+    assert PowerLawTable.fournier_forand(n, mu).mean_cosine == pytest.approx(1 - 2 * beyond, abs=1e-5)
+
+
 def test_fournier_forand_values_and_cumulative():
     theta = np.radians(PETZOLD_LIKE[:, 0])
     np.testing.assert_allclose(fournier_forand(theta, 1.10, 3.5835), PETZOLD_LIKE[:, 1], rtol=5e-6)
@@ -63,6 +76,12 @@ def test_fournier_forand_values_and_cumulative():
     table = PowerLawTable.fournier_forand(1.10, 3.5835)
     np.testing.assert_allclose(table.eval(theta), PETZOLD_LIKE[:, 1], rtol=2e-4)
     np.testing.assert_allclose(table.cdf_s(np.sin(theta / 2) ** 2), PETZOLD_LIKE[:, 2], atol=3e-6)
+
+
+@each_row(("n", "mu", "ratio"), [(1.021, 3.0742, 1.03e-4), (1.08, 3.483, 1.0037e-2), (1.15, 4.874, 0.40052)])
+def test_fournier_forand_backscatter_ratio(n, mu, ratio):
+    assert fournier_forand_backscatter_ratio(n, mu) == pytest.approx(ratio, rel=5e-3)
+    assert integral(lambda t: fournier_forand(t, n, mu), np.pi / 2) == pytest.approx(ratio, rel=5e-3)
 
 
 @pytest.mark.parametrize(("n", "mu"), [(1.0664, 3.3656), (1.10, 3.5835), (1.175, 4.065)])
@@ -113,6 +132,14 @@ def tables():
     }
 
 
+@TABLES
+def test_cumulative_distribution_rises_to_one(name):
+    table = tables()[name]
+    s = np.concatenate((np.exp(np.linspace(-35, 0, 5001)), np.exp(table.log_s0 + table.step * np.arange(table.count))))
+    assert np.all(np.diff(table.cdf_s(np.sort(s))) >= 0)
+    assert table.cdf_s(1.0) == pytest.approx(1, abs=1e-14)
+
+
 TABLES = pytest.mark.parametrize(
     "name", ["fournier_forand", "petzold", "isotropic", "logarithmic", "henyey_greenstein"]
 )
@@ -136,6 +163,13 @@ def test_table_follows_closed_form_everywhere():
     )
 
 
+@each_row(("g_backward", "count"), [(0.3, 2048), (0.7, 16384)])
+def test_table_follows_a_backward_lobe(g_backward, count):
+    p = partial(two_term_henyey_greenstein, weight=0.97, g_forward=0.95, g_backward=g_backward)
+    theta = np.linspace(np.pi / 2, np.pi, 10_001)
+    np.testing.assert_allclose(PowerLawTable.from_function(p, count).eval(theta), p(theta), rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["fournier_forand", "petzold", "isotropic"])
 @pytest.mark.parametrize("chi", [0.1, 0.5, 2.0, 10.0])
 def test_value_at_180_degrees_by_its_ratio_to_the_backscattering(name, chi):
@@ -152,3 +186,20 @@ def test_value_at_180_degrees_by_its_ratio_to_the_backscattering(name, chi):
     # Half of the change is reached 5 degrees from the back: exp(-(5 / 6)^2).
     changes = after.eval(np.radians([175.0, 180.0])) / before.eval(np.radians([175.0, 180.0])) - change[1]
     assert changes[0] / changes[1] == pytest.approx(np.exp(-((5 / 6) ** 2)), abs=0.03)
+
+
+@each_row(
+    ("call", "message"),
+    [
+        (
+            lambda: tables()["isotropic"].with_chi(0.001),
+            "chi_p = 0.001 makes the phase function negative: .* than 0.00",
+        ),
+        (lambda: PowerLawTable.from_values([1.0, 0.0, 1.0]), "greater than 0 at every node"),
+        (lambda: PowerLawTable.from_values([1.0, np.nan]), "nan"),
+        (lambda: PowerLawTable.from_values([1e30, 1.0], -20.0), "exponent must be below 1"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,5 +1,7 @@
 """Continuous profiles: from files, and as layers whose optical depths are those of the linear profile."""
 
+import logging
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -81,6 +83,13 @@ def test_layers_keep_the_tolerance_and_use_it(profile, noisy, tolerance):
         assert worst <= 1 + 1e-6
 
 
+def test_clear_water_needs_the_floors():
+    """Towards 0 a relative tolerance alone would never end."""
+    profile = Profile([0, 4, 8], [0.05, 0.05, 0], [0.1, 0, 0], [0.002, 0, 0])
+    assert profile.layers(0.01).count < 1000
+    assert deviations(profile, 0.01).max() <= 1 + 1e-6
+
+
 @each_row("nodes", [2, 50, 1000])
 @each_row("order", [1, -1])
 def test_fewest_layers_of_a_straight_profile(nodes, order):
@@ -89,6 +98,26 @@ def test_fewest_layers_of_a_straight_profile(nodes, order):
     b = np.linspace(0.1, 0.8, nodes)[::order]
     count = Profile(z, b, b, 0.02 * b).layers(0.01).count
     assert count == np.ceil(np.log(8) / np.log(1.02)) + 1
+
+
+def test_constant_parts_are_one_layer():
+    assert Profile([1, 2], [0.2, 0.2], [0.1, 0.1], [0.002, 0.002]).layers().count == 1
+    water = Profile([3, 4, 5, 9], [0.2, 0.2, 0.1, 0.1], [0.1] * 4, [0.002] * 4).layers()
+    assert water.layer_tops[1] > 4
+    assert water.layer_tops[-1] == 5
+    np.testing.assert_allclose(water.attenuation[[0, -1]], [0.3, 0.2], rtol=2e-2)
+
+
+def test_a_steep_profile_has_layers_of_finite_thickness():
+    water = Profile([0, 3, 3 + 1e-9, 5], [0.4, 0.4, 0.1, 0.1], [0.5, 0.5, 0.4, 0.4], [0.01] * 4).layers()
+    np.testing.assert_allclose(water.layer_tops, [0, 3, 3 + 1e-9], atol=2e-4)
+    assert water.cumulative(5.0) == pytest.approx(0.9 * 3 + 0.5 * 2, rel=1e-6)
+
+
+@each_row("tolerance", [0, 0.6, np.nan])
+def test_tolerance_is_checked(profile, tolerance):
+    with pytest.raises(ValueError, match="tolerance = "):
+        profile.layers(tolerance)
 
 
 @each_row("names", ["ab", "ac", "bc", "a,omega", "b,omega", "c,omega", "abc", "ab,omega", "bc,omega", "abc,omega"])
@@ -145,6 +174,34 @@ def test_the_same_profile_in_any_form(tmp_path, text):
     np.testing.assert_allclose(read.absorption, [0.1, 0.2, 0.1], rtol=1e-14)
     np.testing.assert_allclose(read.scattering, [0.2, 0.4, 0.2], rtol=1e-14)
     np.testing.assert_allclose(read.backscattering, [0.01, 0.02, 0.01], rtol=1e-14)
+
+
+def test_what_is_done_to_a_file_is_told(tmp_path, caplog):
+    path = tmp_path / "water.csv"
+    path.write_text("z, time, a532, b\n-4,8,1,1\n-4,9,2,2\n-2,10,,1\n0,11,1,1\n-9,12,2,2\n")
+    with caplog.at_level(logging.INFO):
+        read = read_profile(path)
+    np.testing.assert_array_equal(read.depth, [0, 4, 9])
+    np.testing.assert_array_equal(read.absorption, [1, 1.5, 2])
+    assert caplog.messages == [
+        f"{path}: coefficients at 532 nm",
+        f"{path}: columns time are not used",
+        f"{path}: 1 of 5 rows left out for missing values, the first in line 4",
+        f"{path}: z is the height, from -9 to 0 m",
+        f"{path}: sorted by depth, as 1 of 4 rows lie above the row before",
+        f"{path}: 4 rows averaged to 3 different depths",
+    ]
+
+
+def test_one_of_several_wavelengths_is_read(tmp_path):
+    path = tmp_path / "water.csv"
+    path.write_text("depth,a488,a531.5,b488,b531.5,bb\n0,1,2,3,4,0.5\n5,1,2,3,4,0.5\n")
+    read = read_profile(path, 531.5)
+    np.testing.assert_array_equal(read.absorption, [2, 2])
+    np.testing.assert_array_equal(read.scattering, [4, 4])
+    np.testing.assert_array_equal(read.backscattering, [0.5, 0.5])
+    with pytest.raises(ValueError, match=r"has no columns for 532 nm but must: its wavelengths are 488, 531.5\."):
+        read_profile(path, 532.0)
 
 
 def test_units_of_netcdf_variables(tmp_path):
@@ -206,6 +263,13 @@ def test_invalid_csv_files_are_rejected(tmp_path, text, message):
         read_profile(path)
 
 
+def test_rounded_decimals_do_not_contradict(tmp_path):
+    path = tmp_path / "water.csv"
+    path.write_text("depth,a,b,c,omega\n0,0.16,0.155,0.31,0.49\n1,0,0,0,0.3")
+    read = read_profile(path)
+    np.testing.assert_allclose(read.attenuation, [0.315, 0])
+
+
 @pytest.mark.parametrize(
     ("positive", "sign", "name"), [("down", 1, "z"), ("up", -1, "z"), ("Up", -1, "depth"), ("down", 1, "depth")]
 )
@@ -218,6 +282,24 @@ def test_direction_of_netcdf_depths(tmp_path, positive, sign, name):
     xr.Dataset(water, {name: (name, [0.0, -4.0 * sign], {"positive": positive})}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(UserError, match="depth = -4 must not be negative"):
         read_profile(path)
+
+
+@each_row(
+    ("text", "message"),
+    [
+        ("z,a,b\n0,1,1\n-2,1,1\n-9999,1,1\n", "line 4: 1 depths of 9999 m, far from all others, must not stand for"),
+        ("depth_km,a,b\n0,1,1\n13,1,1\n", "line 3: 1 depths of 13000 m, beyond 12000 m, must not stand for missing"),
+    ],
+)
+def test_depths_of_no_sea_are_rejected(tmp_path, text, message):
+    (tmp_path / "water.csv").write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_profile(tmp_path / "water.csv")
+
+
+def test_depths_in_feet_of_us_surveys(tmp_path):
+    (tmp_path / "water.csv").write_text("Depth (ftUS);a;b\n0;0,1;0,2\n3937;0,1;NA\n3937;0,3;0,2\n")
+    np.testing.assert_allclose(read_profile(tmp_path / "water.csv").depth, [0, 1200], rtol=1e-15)
 
 
 def test_invalid_netcdf_files_are_rejected(tmp_path):

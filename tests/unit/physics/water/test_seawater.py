@@ -18,6 +18,11 @@ def test_refractive_index_is_quan_and_fry():
     np.testing.assert_allclose(n, [1.335035, 1.341510, 1.342395, 1.337056], rtol=0, atol=1e-6)
 
 
+def test_refractive_index_is_relative_to_air():
+    # Pure water at 20 degrees C and 589.3 nm has 1.33299 relative to air; relative to vacuum it would be 1.33336.
+    assert refractive_index(589.3, 20, 0) == pytest.approx(1.33299, abs=5e-5)
+
+
 def test_group_index_at_532():
     np.testing.assert_allclose(group_index(532, [20, 10], [35, 7]), [1.363796, 1.358813], rtol=0, atol=1e-6)
 
@@ -31,12 +36,27 @@ def test_group_index_is_the_derivative_of_the_index(wavelength, temperature, sal
     assert group_index(wavelength, temperature, salinity) == pytest.approx(float(expected), abs=2e-9)
 
 
+def test_indices_fall_with_wavelength_and_temperature_and_rise_with_salt():
+    for index in (refractive_index, group_index):
+        assert np.all(np.diff(index(np.linspace(400, 700, 31))) < 0)
+        assert np.all(np.diff(index(532, np.linspace(2, 30, 15))) < 0)
+        assert np.all(np.diff(index(532, 20, np.linspace(0, 40, 11))) > 0)
+
+
 def test_absorption_is_pope_and_fry():
     np.testing.assert_array_equal(
         water_absorption([525, 527.5, 530, 532.5, 535]), [0.0417, 0.0428, 0.0434, 0.0447, 0.0452]
     )
     np.testing.assert_array_equal(water_absorption([400, 600, 700]), [0.00663, 0.2224, 0.624])
     assert water_absorption(532) == pytest.approx(0.04444, abs=1e-8)
+
+
+def test_absorption_has_its_published_minimum():
+    # 0.0044 1/m at 418 nm (abstract)
+    wavelengths = np.linspace(400, 700, 601)
+    values = water_absorption(wavelengths)
+    assert wavelengths[np.argmin(values)] == pytest.approx(418, abs=1)
+    assert values.min() == pytest.approx(0.0044, abs=5e-5)
 
 
 def test_scattering_is_zhang_hu_and_he():
@@ -61,6 +81,14 @@ def test_depolarisation_raises_scattering_by_the_cabannes_factor():
     # (6 + 6 d)/(6 - 7 d) (2 + d)/(1 + d) at 0.09 over 0
     ratio = water_scattering(532, depolarisation=0.09) / water_scattering(532, depolarisation=0)
     assert ratio == pytest.approx((6 * 2.09) / (6 - 0.63) / 2, rel=1e-12)
+
+
+@each_row("depolarisation", [0.0, 0.039, 0.09])
+def test_phase_function_is_normalised_and_symmetric(depolarisation):
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    values = water_phase_function(np.arccos(nodes), depolarisation)
+    assert 2 * np.pi * np.sum(weights * values) == pytest.approx(1, rel=1e-13)
+    np.testing.assert_allclose(values, values[::-1], rtol=1e-13)
 
 
 def test_phase_function_is_rayleigh_without_depolarisation_and_morel_with_his():

@@ -43,6 +43,11 @@ def test_derived_properties():
     assert mixed.particle_backscatter_ratio == pytest.approx(0.02)
 
 
+def test_nothing_in_the_water():
+    water = InherentProperties(0, 0, 0)
+    assert (water.albedo, water.backscatter_ratio, water.kd) == (0, 0, 0)
+
+
 def test_pure_seawater_at_532():
     water = pure_seawater()
     assert water.absorption == pytest.approx(0.04444, abs=1e-6)
@@ -82,11 +87,36 @@ def test_chlorophyll_has_the_published_kd(concentration, kd):
     assert chlorophyll(concentration).kd == pytest.approx(kd, rel=0.01)
 
 
+def test_chlorophyll_at_a_node_of_the_table():
+    # Kd(550) = 0.0565 + bw/2 + 0.04111 C^0.64927
+    water = pure_seawater(550)
+    expected = 0.0565 + water.backscattering + 0.04111 * 2**0.64927
+    assert chlorophyll(2, 550).kd == pytest.approx(expected, rel=1e-9)
+
+
 def test_particle_scattering_at_550():
     water, sea = chlorophyll(0.1, 550), pure_seawater(550)
     particles = 0.416 * 0.1**0.766
     assert water.scattering - sea.scattering == pytest.approx(particles, rel=1e-12)
     assert water.backscattering - sea.backscattering == pytest.approx((0.002 + 0.01 * 0.75) * particles, rel=1e-12)
+
+
+def test_particle_scattering_in_the_blue():
+    # v = (lg 0.1 - 0.3)/2 = -0.65 below 2 mg/m^3, 0 from there on
+    clear, sea = chlorophyll(0.1, 440), pure_seawater(440)
+    particles = 0.416 * 0.1**0.766
+    assert clear.scattering - sea.scattering == pytest.approx(particles * 0.8**-0.65, rel=1e-12)
+    expected = (0.002 + 0.0075 * 0.8**-0.65) * particles
+    assert clear.backscattering - sea.backscattering == pytest.approx(expected, rel=1e-12)
+    assert chlorophyll(5, 440).scattering - sea.scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
+
+
+@each_row("wavelength", [400, 440, 532, 590, 700])
+def test_attenuation_increases_with_chlorophyll(wavelength):
+    waters = [chlorophyll(c, wavelength) for c in np.geomspace(0.01, 30, 20)]
+    assert waters[0].absorption >= water_absorption(wavelength)
+    assert np.all(np.diff([w.absorption for w in waters]) >= 0)
+    assert np.all(np.diff([w.scattering for w in waters]) > 0)
 
 
 @each_row("water_type", JERLOV_KD)
@@ -97,6 +127,13 @@ def test_kd_of_a_jerlov_type_gives_that_type(water_type):
     assert water.backscattering == pytest.approx(expected.backscattering, rel=1e-9)
 
 
+@each_row("kd", [0.0486, 0.05, 0.1, 0.6])
+def test_water_from_kd_has_that_kd(kd):
+    water = from_kd(kd)
+    assert water.kd == pytest.approx(kd, rel=1e-9)
+    assert water.absorption > water_absorption(532)
+
+
 @pytest.mark.parametrize("depth", [0.5, 5, 25])
 def test_water_from_secchi_depth_satisfies_both_rules(depth):
     water = from_secchi(depth)
@@ -104,6 +141,19 @@ def test_water_from_secchi_depth_satisfies_both_rules(depth):
     assert (water.attenuation + water.kd) * depth == pytest.approx(8.7, rel=1e-9)
     assert water.particle_backscatter_ratio == pytest.approx(0.0183, rel=1e-9)
     assert water.absorption > water_absorption(532)
+
+
+@each_row(
+    ("call", "message"),
+    [
+        (lambda: InherentProperties(0.1, 0.1, 0.2), r"backscattering = 0\.2 must not exceed scattering = 0\.1"),
+        (lambda: InherentProperties(0.1, 0.1, 0.01, 0.03), r"water_scattering = 0\.03 must not exceed .* twice back"),
+        (lambda: jerlov("IV"), "water_type = 'IV' must be one of I, IA, IB, II, III, 1C, 3C, 5C, 7C, 9C"),
+    ],
+)
+def test_bad_values_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def generators():

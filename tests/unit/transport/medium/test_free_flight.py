@@ -108,6 +108,23 @@ def test_light_that_ends_in_clear_water_goes_on_for_ever():
     assert float(clear.optical_depth(array(1), array(0.5), array(100))[0]) == 0
 
 
+def test_clear_water_above_the_light_lets_it_out():
+    flight = LayeredFlight(WaterColumn.from_text("0, 2", "0, 0.5", "0", "0"))
+    distance = np.array(flight.distance(array([4, 4]), array([-1, -1]), array([0.9, 1.1])))
+    np.testing.assert_allclose(distance, [1.8, np.inf], rtol=1e-6)
+
+
+def test_equal_layers_are_one():
+    one = LayeredFlight(WaterColumn.from_text("0", "0.4", "0.2", "0.01"))
+    many = LayeredFlight(WaterColumn.from_text("0, 1, 1.5, 4", "0.4", "0.2", "0.01"))
+    rng = np.random.default_rng(3)
+    depth, downward, drawn = (array(v) for v in (6 * rng.random(1000), 2 * rng.random(1000) - 1, rng.random(1000)))
+    first, second = (np.array(flight.distance(depth, downward, drawn)) for flight in (one, many))
+    # Slopes down to 1e-3 in float32 depths of some metres.
+    np.testing.assert_allclose(first, second, rtol=2e-3)
+    assert np.median(np.abs(second / first - 1)) < 1e-6
+
+
 @each_row("name", COLUMNS)
 def test_a_layer_owns_its_upper_edge_and_the_first_one_the_crests(name):
     column = COLUMNS[name]
