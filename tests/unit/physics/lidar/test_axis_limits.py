@@ -8,7 +8,6 @@ from oracles.refracted_path import refracted_path
 from rows import each_row
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -206,8 +205,3 @@ def test_a_given_number_wins():
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=1380.3) == TimeAxis(1380.3, 1.0, 175)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, bin_count=40) == TimeAxis(1395.0, 1.0, 40)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=2000.0).bin_count == 5
-
-
-def test_too_many_bins():
-    with pytest.raises(UserError, match=r"bin_width_ns = 1e-05 divides the time axis .* at least 0\.00016, for"):
-        TimeAxis.covering(1396.2, 1552.0, 1e-5)

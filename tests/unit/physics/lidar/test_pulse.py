@@ -128,18 +128,3 @@ def test_transforms_light_no_bins_that_no_energy_reaches(sign, monkeypatch):
     power = waveform(energy, 1.0, (-10, np.linspace(1.0, 2.0, 31)))
     assert np.flatnonzero(power[0]).tolist() == list(range(90, 121))
     assert np.flatnonzero(np.isnan(power[1])).tolist() == list(range(190, 221))
-
-
-@each_row(
-    ("call", "message"),
-    [
-        (lambda: Pulse.sampled([0, 1, 1], [0, 1, 0]), "must increase strictly"),
-        (lambda: Pulse.sampled([0, 1], [0, -1]), "power = -1 must not be negative"),
-        (lambda: Pulse.sampled([0, 1], [0, 0]), "power must be greater than 0 somewhere"),
-        (lambda: Pulse.sampled([0], [1]), "times_ns of shape \\(1,\\) must be a list of at least 2"),
-        (lambda: waveform(1.0, 1.0, (0, np.ones(1))), "time axis"),
-    ],
-)
-def test_bad_parameters_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from rows import each_row
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import SinglePhotonDetector
 
@@ -67,18 +65,3 @@ def test_without_afterpulses_the_recursion_is_that_of_dead_time():
     np.testing.assert_allclose(fired, plain, atol=1e-14)
     for found, expected in zip(covariances, dead_time.pair_covariances(events, plain, dead, 15), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-14)
-
-
-@each_row(
-    ("values", "message"),
-    [
-        ({"afterpulse_probability": 0.1}, "afterpulse_decay_ns is required"),
-        (
-            {"afterpulse_probability": 0.1, "afterpulse_decay_ns": 9.0, "paralyzable": True},
-            "afterpulse_probability = 0.1 must be 0 for a paralyzable detector",
-        ),
-    ],
-)
-def test_invalid_afterpulses_are_refused(values, message):
-    with pytest.raises(UserError, match=message):
-        SinglePhotonDetector(0.5, 10.0, **values)

@@ -5,7 +5,6 @@ import pytest
 from rows import each_row
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
@@ -199,10 +198,3 @@ def test_counts_of_live_shots_give_the_events(dead):
     assert np.max(np.abs(found - events[kept]) / error[kept]) < largest_z(shots, kept.sum())
     # Without the correction the histogram is far off.
     assert np.max(np.abs(counts / shots - events)[kept] / error[kept]) > 20
-
-
-def test_what_no_detector_can_do_is_refused():
-    with pytest.raises(UserError, match="dynode_gains"):
-        LinearDetector.photomultiplier(0.2, [4.0, 1.0])
-    with pytest.raises(UserError, match=r"dead_time_ns = 0\.5 .* narrower bins"):
-        SinglePhotonDetector(0.5, 0.5).moments(np.ones(3), 1.0, 1)

@@ -6,7 +6,6 @@ from rows import each_row
 from scipy.stats import norm
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
 
 
@@ -166,10 +165,3 @@ def test_samples_fall_on_bins():
         Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
     with pytest.raises(ValueError, match="sampling_ghz = 2"):
         Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
-
-
-def test_stages_that_lack_another_are_refused():
-    with pytest.raises(UserError, match="block_after = 5 needs block_threshold_v"):
-        Digitiser(8, 1.0, block_after=5)
-    with pytest.raises(UserError, match="response = 'boxcar'"):
-        Amplifier(1.0, response="boxcar")

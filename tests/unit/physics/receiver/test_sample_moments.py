@@ -6,7 +6,6 @@ from differentiated import PHOTON
 from rows import each_row
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
@@ -72,17 +71,3 @@ def test_samples_are_taken_at_the_rate_of_the_converter():
     assert moments.covariance.shape == (6, 6)
     np.testing.assert_allclose(moments.mean, moments.mean_derivatives[0])
     assert np.argmax(moments.mean) == np.argmax(PULSE[::4])
-
-
-@each_row(
-    ("power", "directions", "message"),
-    [
-        (-PULSE, PULSE[None], "power = -1 must not be negative"),
-        (PULSE[None], PULSE[None], r"power of shape \(1, 24\) must be one record"),
-        (PULSE, PULSE, r"directions of shape \(24,\) must have shape \(direction, 24\)"),
-        (PULSE, np.nan * PULSE[None], "directions holds nan"),
-    ],
-)
-def test_invalid_input(power, directions, message):
-    with pytest.raises(UserError, match=message):
-        sample_moments(RECEIVERS["ideal"], power, directions, 1.0)

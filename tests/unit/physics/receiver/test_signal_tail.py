@@ -8,13 +8,11 @@ from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar.analysis.detection import statistics
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver import sample_moments
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
-    SinglePhotonDetector,
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
@@ -123,19 +121,3 @@ def test_a_tube_at_another_voltage_keeps_its_tail():
     changed = TUBE.with_gain(0.5)
     assert changed.gain == pytest.approx(10.0)
     assert (changed.tail_fractions, changed.tail_decays_ns) == (FRACTIONS, DECAYS)
-
-
-@each_row(
-    ("values", "message"),
-    [
-        ({"tail_fractions": (0.1,)}, r"tail_decays_ns = \[\] must have as many numbers as tail_fractions, 1"),
-        ({"tail_fractions": (0.7, 0.6), "tail_decays_ns": (9.0, 8.0)}, "tail_fractions .* a sum of at most 1"),
-        (
-            {"tail_fractions": (0.1,), "tail_decays_ns": (9.0,), "tail_delays_ns": (1.0, 2.0)},
-            "tail_delays_ns = .* must have as many numbers as tail_fractions",
-        ),
-    ],
-)
-def test_invalid_tails_are_refused(values, message):
-    with pytest.raises(UserError, match=message):
-        SinglePhotonDetector(0.5, 10.0, **values)

@@ -133,14 +133,6 @@ def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
     assert "\n" not in str(error.value)
 
 
-def test_holes_of_an_image_are_counted_from_the_smallest_y(tmp_path):
-    image = HEIGHTS[::-1].astype(np.float32)
-    image[0, 1] = np.nan
-    path = write_exr(tmp_path / "map.exr", {"Y": image})
-    with pytest.raises(ValueError, match="1 of 12 heights, the first in row 2 and column 1"):
-        read_height_map(path, 6.0)
-
-
 @each_row(
     ("positions", "message"),
     [

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 
 GRAVITY = 9.81
@@ -128,22 +126,3 @@ def test_heights_grow_as_the_beam():
     default = kelvin_wake(x, y, 4.0, 0.0, 8.0)
     assert default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, 1.0, 0.4), rel=1e-12)
     assert 2 * default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, beam=2.0), rel=1e-12)
-
-
-@each_row(
-    ("change", "message"),
-    [
-        ({"x": [1.0]}, "x of shape (1,) must be a list of at least 2 numbers"),
-        ({"y": [[0, 1]]}, "y of shape (1, 2) must be a list of at least 2 numbers"),
-        ({"y": [0, 2, 2]}, "y must increase strictly, but 2 is followed by 2"),
-        (
-            {"x": [0, 0.05], "y": [0, 0.05], "ship_x": 1e6},
-            "wake_x, wake_y: the wake spreads over 3.54e+05 m before this sea, too far for waves of 0.1 m",
-        ),
-    ],
-)
-def test_errors(change, message):
-    given = {"x": [0, 1], "y": [0, 1], "speed": 5, "bearing": 0, "length": 10, **change}
-    with pytest.raises(UserError) as error:
-        kelvin_wake(**given)
-    assert str(error.value) == message

@@ -8,7 +8,6 @@ from rows import each_row
 from scipy import stats
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import angular_frequency
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -154,12 +153,6 @@ def test_facet_slopes_have_the_predicted_variance():
     across = cos * k[:, None] - sin * k
     unfiltered = np.sum(directional(spectrum, k, k[:, None]) * across**2) * (2 * np.pi / size) ** 2
     assert unfiltered - expected[1] > 8 * error[1]
-
-
-def test_grids_without_a_middle_are_refused():
-    for cells in (15, 0):
-        with pytest.raises(UserError, match=f"cells = {cells} must be an even integer of at least 2"):
-            realise(ElfouhailySpectrum(5), 10, cells, 1)
 
 
 def single_wave(wavelength, direction):

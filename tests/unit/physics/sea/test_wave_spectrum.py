@@ -236,19 +236,6 @@ def test_swell_variance_is_conserved_in_a_short_period():
     assert index[i] * index[j] > 0
 
 
-@each_row(("period", "cell_integrals"), [(850.0, True), (950.0, False)])
-def test_swell_at_dense_waves_has_its_slopes(period, cell_integrals):
-    """Cells as wide as the hump agree with points except for the variance dk^2/12 of k within a cell (Sheppard)."""
-    swell = SwellSpectrum(1.0, 30.0, 0.0, relative_bandwidth=0.0335, directional_spread=0.1)
-    index, dk = np.arange(-60, 61), 2 * np.pi / period
-    variances = swell.mode_variances(index, index, dk)
-    assert variances.sum() == pytest.approx(1 / 16, rel=1e-5)
-    along, across = swell.slope_variance()
-    within = variances.sum() * dk**2 / 12 if cell_integrals else 0
-    assert np.sum(variances * (index * dk) ** 2) == pytest.approx(along + within, rel=3e-5)
-    assert np.sum(variances.T * (index * dk) ** 2) == pytest.approx(across + within, rel=1e-3)
-
-
 @each_row("kind", SPECTRA)
 def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     """A direction counted clockwise, or along taken for across, changes the slopes by a fifth and more."""
@@ -374,18 +361,3 @@ def test_matched_totals_are_not_exceeded_where_no_waves_can_have_them(wind):
 def test_matched_totals_of_too_large_a_ratio_miss_the_larger():
     assert MatchedSpectrum(ElfouhailySpectrum(6), 0.03, 0.005).slope_variance() == pytest.approx((0.015, 0.005))
     assert MatchedSpectrum(ElfouhailySpectrum(6), 0.005, 0.03).slope_variance() == pytest.approx((0.005, 0.015))
-
-
-@each_row(
-    ("call", "message"),
-    [
-        (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
-        (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
-        (lambda: SeaState(()), "components must hold at least one"),
-        (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
-        (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
-    ],
-)
-def test_bad_parameters_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -186,20 +186,3 @@ def test_value_at_180_degrees_by_its_ratio_to_the_backscattering(name, chi):
     # Half of the change is reached 5 degrees from the back: exp(-(5 / 6)^2).
     changes = after.eval(np.radians([175.0, 180.0])) / before.eval(np.radians([175.0, 180.0])) - change[1]
     assert changes[0] / changes[1] == pytest.approx(np.exp(-((5 / 6) ** 2)), abs=0.03)
-
-
-@each_row(
-    ("call", "message"),
-    [
-        (
-            lambda: tables()["isotropic"].with_chi(0.001),
-            "chi_p = 0.001 makes the phase function negative: .* than 0.00",
-        ),
-        (lambda: PowerLawTable.from_values([1.0, 0.0, 1.0]), "greater than 0 at every node"),
-        (lambda: PowerLawTable.from_values([1.0, np.nan]), "nan"),
-        (lambda: PowerLawTable.from_values([1e30, 1.0], -20.0), "exponent must be below 1"),
-    ],
-)
-def test_bad_parameters_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -114,12 +114,6 @@ def test_a_steep_profile_has_layers_of_finite_thickness():
     assert water.cumulative(5.0) == pytest.approx(0.9 * 3 + 0.5 * 2, rel=1e-6)
 
 
-@each_row("tolerance", [0, 0.6, np.nan])
-def test_tolerance_is_checked(profile, tolerance):
-    with pytest.raises(ValueError, match="tolerance = "):
-        profile.layers(tolerance)
-
-
 @each_row("names", ["ab", "ac", "bc", "a,omega", "b,omega", "c,omega", "abc", "ab,omega", "bc,omega", "abc,omega"])
 def test_every_pair_gives_the_same_water(tmp_path, names):
     letters, _, omega = names.partition(",")

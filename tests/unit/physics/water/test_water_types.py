@@ -143,19 +143,6 @@ def test_water_from_secchi_depth_satisfies_both_rules(depth):
     assert water.absorption > water_absorption(532)
 
 
-@each_row(
-    ("call", "message"),
-    [
-        (lambda: InherentProperties(0.1, 0.1, 0.2), r"backscattering = 0\.2 must not exceed scattering = 0\.1"),
-        (lambda: InherentProperties(0.1, 0.1, 0.01, 0.03), r"water_scattering = 0\.03 must not exceed .* twice back"),
-        (lambda: jerlov("IV"), "water_type = 'IV' must be one of I, IA, IB, II, III, 1C, 3C, 5C, 7C, 9C"),
-    ],
-)
-def test_bad_values_are_rejected(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 def generators():
     return [np.random.default_rng([number, significance.seed_shift]) for number in range(16)]
 
