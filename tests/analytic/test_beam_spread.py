@@ -71,6 +71,15 @@ def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
         assert error < largest_error(16, 0.0029)
 
 
+@pytest.mark.slow
+def test_light_that_leaves_for_ever_is_counted(system):
+    # No bottom: the last leg of nearly all light, through the clear water below, has no end.
+    water = {"layer_tops": "0, 1", "attenuation": "0.2, 0", "scattering": "0, 0"}
+    down, up = fluxes(system({**MATCHED, **water}, bottom=None), [0.5, 2.0, 30.0], 4096, 2)
+    np.testing.assert_allclose(down, np.tile(np.exp([-0.1, -0.2, -0.2]), (2, 1)), rtol=1e-4)
+    assert np.all(up == 0)
+
+
 #: Mean cosine of the scattering angle, depth of the source [m], and distance of the points [m] in `moments`, b = 1 /m.
 MEAN_COSINE, SOURCE_DEPTH, STEP = 0.924, 150.0, 10.0
 
@@ -149,6 +158,17 @@ def test_white_bottom_returns_all_light(system):
     assert abs(returned.mean() - 1) < 0.001 + largest_z(passes) * error
     assert error < largest_error(passes, 0.002)
     assert first.mean() == pytest.approx(float(fresnel(0.0, 1.34)[0]), abs=0.001)
+
+
+@pytest.mark.slow
+def test_no_crossing_is_lost_or_counted_twice(system):
+    # Without absorption each path crosses every plane once more downwards than upwards if it ends on the black bottom,
+    # and as often if it leaves through the surface: net fluxes agree pass by pass.
+    water = {"layer_tops": "0, 3", "attenuation": "1, 2", "scattering": "1, 2", "phase_function": "hg", "phase_g": 0.7}
+    indices = {"refractive_index": "1.3, 1.4", "group_index": "1.3, 1.4"}
+    down, up = fluxes(system({**water, **indices}, bottom=5.0, rho=0.0), [0.5, 2.9, 3.0, 3.1, 4.999], 2**14, 2)
+    assert np.all(up[:, :-1] > 0.1)
+    np.testing.assert_allclose(down - up, np.tile((down - up)[:, :1], (1, 5)), rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """Properties that the estimator must have whatever the scene: sums, reciprocity, strategies that agree, energy."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from significance import assert_same, largest_error, largest_z
@@ -25,6 +27,17 @@ def compare(first, second, largest):
     assert np.all(np.hypot(*error) < limit * mean.max(axis=0)), np.hypot(*error) / mean.max(axis=0)
     z = (mean[0] - mean[1]) / np.hypot(*error)
     assert np.all(np.abs(z) < largest_z(min(len(first), len(second)), z.size)), z
+
+
+@pytest.mark.slow
+def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
+    """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
+    energies = []
+    for name in ("1x1", "2x2", "1x4"):
+        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**14})
+        energies.append(passes(scene, 1).sum(axis=1))
+    for parts in energies[1:]:
+        np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
 
 
 def with_total(energy):
@@ -98,6 +111,31 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
 
 
 @pytest.mark.slow
+def test_seeds_repeat_and_differ(lidar_scene, passes):
+    scene = lidar_scene(sea=WAVY, integrator={"paths_per_pass": 2**12})
+    first, again, other = passes(scene, 1, 7), passes(scene, 1, 7), passes(scene, 1, 8)
+    # Sums into one bin are atomic, and so their order is free: double precision leaves 1e-12.
+    np.testing.assert_allclose(first, again, rtol=1e-12)
+    assert np.mean(first == other) < 0.5
+
+
+@pytest.mark.slow
+def test_orders_of_scattering_add_up(lidar_scene, passes):
+    """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
+    energies = [
+        passes(lidar_scene(sea=ROUGH, integrator={"paths_per_pass": 2**13, "max_scatterings": limit}), 1)[0]
+        for limit in (0, 1, 2, 4, 1000, -1)
+    ]
+    for fewer, more in pairwise(energies):
+        assert np.all(more >= fewer * (1 - 1e-12))
+    np.testing.assert_allclose(energies[-2], energies[-1], rtol=1e-12)
+    totals = [energy.sum() for energy in energies]
+    # The water and, in the bottom echo, forward-scattered light: orders 1 and 2 are a large part of the whole.
+    assert totals[1] - totals[0] > 0.2 * totals[-1]
+    assert totals[2] - totals[1] > 0.1 * totals[-1]
+
+
+@pytest.mark.slow
 def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     energies = []
     for symbolic in (True, False):
@@ -106,6 +144,24 @@ def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     # Fused and separate kernels round differently, which now and then moves a path to the next bin.
     assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-3)
     assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.95
+
+
+@pytest.mark.slow
+def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, passes):
+    """Absorption alone, without scattering, leaves the surface echo and dims the bottom by exp(-2 da L)."""
+    bottoms = []
+    for attenuation in (0.1, 0.2):
+        water = {"attenuation": attenuation, "scattering": 0.0, "backscattering": 0.0}
+        # The record ends before light comes that the bottom has reflected twice.
+        film = {"time_start_ns": 1450.0, "bin_count": 60}
+        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**13})
+        bottoms.append(passes(scene, 32).sum(axis=(1, 2)))
+    path = 8 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
+    mean = [b.mean() for b in bottoms]
+    relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
+    assert relative < 1e-2
+    # Rays of the beam within 5 mrad cross 0.1 % more or less water.
+    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
 
 @pytest.mark.slow
@@ -122,3 +178,13 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
     energy = np.median(passes(scene, 8).sum(axis=(1, 2)))
     plate = 5e-3 * 0.81 * 0.9 * 0.025 * np.cos(np.radians(20)) / np.pi / (200 / np.cos(np.radians(20))) ** 2
     assert 0.3 * plate < energy < plate
+
+
+@pytest.mark.slow
+def test_sample_count_per_pixel_and_default(lidar_scene):
+    scene = lidar_scene(integrator={"paths_per_pass": 2**12})
+    # 1024 for each of four pixels are the 4096 paths of a pass; as many again are other paths.
+    default, same, more = (np.array(mi.render(scene, spp=spp, seed=1)) for spp in (0, 1024, 2048))
+    np.testing.assert_allclose(same, default, rtol=1e-5)
+    lit = default > 0
+    assert np.mean(np.isclose(more, default, rtol=1e-3, atol=0)[lit]) < 0.5

@@ -5,6 +5,7 @@ import pytest
 
 import mitransient_lidar
 from mitransient_lidar.studies.scattering_orders import scattering_orders
+from mitransient_lidar.transport.paths.path_classes import PathClasses
 
 PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}
 FEW = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
@@ -27,3 +28,19 @@ def test_parts_sum_to_the_whole(parts):
 def test_unscattered_light_is_reversed_once(parts):
     direct = parts["impulse_response"].sel(order=0).sum(("pixel", "time"))
     assert direct.sel(reversals="several") < 1e-3 * direct.sel(reversals="one")
+
+
+VOLPATH = {"type": "lidar_volpath", "paths_per_pass": 2**13}
+
+
+@pytest.mark.slow
+def test_single_scattering_is_that_of_paths_with_one_event(lidar_scene, passes):
+    """`lidar_volpath` with max_scatterings stops the paths instead of sorting them."""
+    one = {"layout": "1x1"}
+    scene = lidar_scene(integrator=VOLPATH, rx=one)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0], classes=PathClasses(3))
+    sorted_energy = np.array([renderer.render_pass(seed).histogram.energy() for seed in range(2)]).reshape(2, 2, 4, -1)
+    for most in (0, 1, 2):
+        limited = passes(lidar_scene(integrator={**VOLPATH, "max_scatterings": most}, rx=one), 2)[:, 0]
+        kept = sorted_energy[:, :, : most + 1].sum(axis=(1, 2))
+        np.testing.assert_allclose(kept.sum(axis=1), limited.sum(axis=1), rtol=1e-6)

@@ -65,6 +65,13 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scen
 
 
 @pytest.mark.slow
+def test_strata_of_one_index_are_one(lidar_scene, passes):
+    layered = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.34, 1.34"}
+    energies = [passes(lidar_scene(water=water), 2) for water in (layered, {"layer_tops": "0, 2, 5"})]
+    np.testing.assert_array_equal(*energies)
+
+
+@pytest.mark.slow
 def test_index_changes_within_the_waves_are_refused(lidar_scene, passes):
     water = {"layer_tops": "0, 0.01", "refractive_index": "1.335, 1.34"}
     scene = lidar_scene(sea={"spectrum": "elfouhaily", "wind_speed": 6.0, "size": 60.0}, water=water)

@@ -115,6 +115,14 @@ def test_rays_follow_the_intensity(tmp_path):
     )
 
 
+def test_spreads_are_those_of_the_narrow_and_the_wide_axis():
+    """Cells go by the narrow one, what covers the beam by the wide one."""
+    flat = laser(beam_profile="top_hat", divergence_mrad=2.0, divergence_across_mrad=12.0)
+    assert (flat.angular_spread, flat.widest_angular_spread) == (pytest.approx(0.5e-3), pytest.approx(3e-3))
+    assert laser().angular_spread == laser().widest_angular_spread == 5e-3
+    assert flat.divergence == pytest.approx(2e-3)
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
 def test_files_of_all_kinds_hold_the_same_beam(suffix, tmp_path):
     beam = laser(beam_profile="image", profile_file=image_file(tmp_path, suffix=suffix), profile_mrad=16.0)
@@ -148,6 +156,18 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
         # To rounding, where every sample carries the same energy.
         assert abs(share.mean() - own.mean()) < largest_z(COUNT, 3) * error + 1e-5
         assert error < 2e-3
+
+
+@each_row("count", [1, 3, 17])
+def test_any_number_of_photons_keeps_the_energy(count):
+    """Sums of the energies of few photons, of which some are drawn over a small view."""
+    sampler = BeamSampler(laser(), mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 2.0}).receiver)
+    assert sampler.use_view
+    shots = 2**16
+    index = dr.arange(mi.UInt32, shots * count) % count
+    _, energy = sampler.sample(index, count, pass_streams(2, 0, shots * count))
+    samples = np.array(energy, dtype=np.float64).reshape(shots, count).sum(axis=1) / 4.5e-3
+    assert abs(samples.mean() - 1) < largest_z(shots) * samples.std() / np.sqrt(shots) + 1e-5
 
 
 @each_row(

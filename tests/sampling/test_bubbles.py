@@ -41,6 +41,13 @@ def rays(count=4000, seed=1):
     return point, direction, mi.Point3f(point.T.copy()), mi.Vector3f(direction.T.copy())
 
 
+def test_bubbles_are_astern_of_the_ship_and_fewer_deeper_down():
+    point, _, lanes, _ = rays()
+    np.testing.assert_array_equal(np.array(PLUME.holds(lanes)), inside(point))
+    assert 0.05 < inside(point).mean() < 0.5
+    np.testing.assert_allclose(np.array(LAYER.scattering_at(lanes)), 0.8 * in_layer(point), rtol=1e-5)
+
+
 @pytest.mark.parametrize(("bubbles", "density", "error"), BUBBLES)
 def test_optical_depth_is_the_integral_along_the_ray(bubbles, density, error):
     point, direction, lanes, vectors = rays()
@@ -145,3 +152,8 @@ def test_layer_is_water_in_many_thin_layers(lidar_scene, passes, integrator):
     waters = ({**ALIKE, "attenuation": 0.35, "scattering": 0.2, **bubbles}, {**HG, **layers})
     film = {"time_start_ns": 1415.0, "bin_width_ns": 10.0, "bin_count": 9}
     assert_same(*energies(lidar_scene, passes, integrator, film, *waters), error=0.02, bias=0.002)
+
+
+def test_bubbles_of_waves_and_of_a_wake_are_alternatives():
+    with pytest.raises(RuntimeError, match=r"plume_scattering = 0\.5 must be 0 with bubbles of"):
+        mi.load_dict({"type": "layered_water", "bubble_wind_speed": 10.0, "plume_scattering": 0.5})

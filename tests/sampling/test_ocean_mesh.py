@@ -51,6 +51,18 @@ def test_inner_edges_join_two_facets(size):
     assert np.sum(counts == 1) == 4 * side
 
 
+def test_patch_is_periodic_and_centred():
+    vertices, _ = buffers(surface(refined_size=20.0, size=20.0, period=20.0, cell_size=20.0 / CELLS)[1])
+    grid = vertices.reshape(CELLS + 1, CELLS + 1, 3)
+    np.testing.assert_array_equal(grid[0, :, 2], grid[-1, :, 2])
+    np.testing.assert_array_equal(grid[:, 0, 2], grid[:, -1, 2])
+    assert vertices[:, :2].min() == pytest.approx(-10)
+    assert vertices[:, :2].max() == pytest.approx(10)
+    # The mean sea level is z = 0: the spectrum has no constant term.
+    assert abs(grid[:-1, :-1, 2].mean()) < 1e-6
+    assert grid[..., 2].std() > 0.01
+
+
 def test_rays_find_no_hole_and_facets_are_flat():
     """Interpolated normals would make other slopes than the facets', and lose energy."""
     scene, shape = surface(**PATCH)
@@ -111,6 +123,22 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
 
 
+def test_cells_grow_outside_the_patch_up_to_the_size():
+    vertices, faces = buffers(surface(refined_size=32.0, cell_size=0.25)[1])
+    lines = np.unique(vertices[:, 0])
+    assert lines[0] <= -500
+    assert lines[-1] >= 500
+    lengths = np.diff(lines)
+    inside = np.abs(lines[:-1] + 0.5 * lengths) < 16
+    np.testing.assert_array_equal(lengths[inside], 0.25)
+    ratio = lengths[1:] / lengths[:-1]
+    # The last cell ends with the surface.
+    assert np.all(ratio[1:-1] < 2.001)
+    assert np.all(ratio[1:-1] > 1 / 2.001)
+    # All of 1 km^2 for twice the triangles of 32 m x 32 m.
+    assert len(faces) < 2 * 2 * 128**2
+
+
 # The patch and what surrounds it.
 
 
@@ -127,6 +155,20 @@ def test_cells_are_chosen_by_footprint_and_range():
     mast = surface(**lidar | {"altitude": 10.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 10.0})[1].sea
     # The field of view reaches from 97 to 116 m, and 1.5 times the beam's divergence from 93 to 126 m.
     assert 2 * 20 < mast.refined_size < 80
+
+
+def test_height_maps_become_surfaces(tmp_path):
+    """A plane that rises by 0.1 along x: its slope is resolved, and the ripples are what is missing to the total."""
+    x = np.linspace(-10, 10, 81)
+    np.save(tmp_path / "plane.npy", np.tile(0.1 * x, (81, 1)))
+    scene, shape = surface(
+        spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", size=60.0
+    )
+    assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
+    assert shape.sea.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
+    x = np.random.default_rng(1).uniform(-28, 28, 1000)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(array(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
+    np.testing.assert_allclose(np.array(si.p.z), 0.1 * np.clip(x, -10, 10), atol=0.03)
 
 
 def test_swell_and_wake_lie_on_the_sea():
@@ -226,3 +268,12 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         assert shape.sea.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):
         np.testing.assert_array_equal(first, second)
+
+
+def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
+    own = {"spectrum": "elfouhaily", "refined_size": 8.0, "cell_size": 0.5, "centre_x": 1.0, "centre_y": 2.0}
+    loaded = lidar_scene(sea={**own, "shortest_wave": 1.0, "size": 50.0})
+    shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
+    sea = shape.sea
+    open_scene(loaded)
+    assert shape.sea is sea

@@ -166,3 +166,16 @@ def test_value_is_the_closed_form(name, reference):
     wo = frame.to_world(mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta))))
     value = np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)[1])
     np.testing.assert_allclose(value, reference(theta), rtol=1e-2 if name == "petzold" else 2e-3)
+
+
+def test_segments_of_tiny_probability_are_not_drawn_too_often():
+    """With bb/b = 0.3 only 1.2e-4 is scattered below 0.1 degree; the bits of one number alone would double it."""
+    plugin = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": 0.3})
+    count = 2**22
+    rng = np.random.default_rng(11)
+    u, v = (mi.Float(rng.random(count, dtype=np.float32)) for _ in range(2))
+    s = np.array(plugin.tabulated.sample(u, v)[0], dtype=np.float64)
+    for limit in (0.001, 0.1):
+        share = float(plugin.tabulated.table.cdf_s(np.sin(np.radians(limit) / 2) ** 2))
+        found = np.mean(s < np.sin(np.radians(limit) / 2) ** 2)
+        assert abs(found - share) < largest_z(count, 2) * np.sqrt(share / count) + 10 / count

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+from rows import each_row
 from significance import assert_distribution, largest_z
 
 OBLIQUE = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
@@ -52,6 +53,16 @@ def test_lobe_of_narrow_width_is_gaussian():
     side /= np.linalg.norm(side)
     aside = np.cos(sigma) * OBLIQUE + np.sin(sigma) * side
     assert value(bsdf, OBLIQUE, aside) == pytest.approx(peak * np.exp(-0.5), rel=1e-3)
+
+
+@each_row("width", [5.0, 40.0, 180.0])
+def test_is_reciprocal(width):
+    bsdf = surface(width_deg=width, diffuse_share=0.2)
+    for first, second in ((direction(0.2), direction(0.3, 0.1)), (direction(1.2, 1.0), direction(1.4, 1.3))):
+        there = value(bsdf, first, second) / second[2]
+        back = value(bsdf, second, first) / first[2]
+        assert there == pytest.approx(back, rel=1e-4)
+        assert there > 0
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,24 @@ def test_the_sky_gives_its_irradiance(sky):
     assert radiance(emitter, 91.0, 0.0) == 0
 
 
+def test_shapes_of_skies():
+    uniform = mi.load_dict({"type": "sky", "distribution": "uniform", "irradiance": np.pi})
+    assert radiance(uniform, 70.0, 10.0) == pytest.approx(1, rel=1e-5)
+    overcast = mi.load_dict({"type": "sky", "distribution": "overcast", "irradiance": 1.0})
+    # Zenith of the cardioidal sky: 9 / (7 pi).
+    assert radiance(overcast, 0.0, 0.0) == pytest.approx(9 / (7 * np.pi), rel=1e-5)
+    assert radiance(overcast, 60.0, 200.0) == pytest.approx(6 / (7 * np.pi), rel=1e-5)
+    clear = mi.load_dict({"type": "sky", "irradiance": 1.0, "sun_zenith_deg": 40.0, "sun_azimuth_deg": 90.0})
+    # Harrison and Coombes at two directions by hand: 50 deg opposite the sun, and 10 deg off it.
+    values = [radiance(clear, 10.0, 270.0), radiance(clear, 50.0, 90.0)]
+    angles, zeniths = np.radians([50.0, 10.0]), np.radians([10.0, 50.0])
+    around = 1.63 + 53.7 * np.exp(-5.49 * angles) + 2.04 * np.cos(angles) ** 2 * np.cos(np.radians(40))
+    shape = around * (1 - np.exp(-0.19 / np.cos(zeniths)))
+    assert values[1] / values[0] == pytest.approx(shape[1] / shape[0], rel=1e-4)
+    # Published for it: brighter at the horizon than overhead, brightest at the sun.
+    assert radiance(clear, 85.0, 270.0) > 2 * radiance(clear, 30.0, 270.0)
+
+
 def test_the_sun_is_an_even_disc():
     sun = mi.load_dict({"type": "sun", "zenith_deg": 40.0, "azimuth_deg": 120.0, "irradiance": 1.3})
     direction = sun.sample(random_points(3))

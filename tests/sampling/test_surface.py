@@ -148,3 +148,12 @@ def test_ripples_of_a_series_return_its_light(deg, azimuth_deg):
     found = float(shape.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(wi))[0][0])
     # Mitsuba's masking is a fit, of up to 0.35 % for one direction (Walter et al. 2007, equation 27).
     assert found == pytest.approx(float(wanted), rel=8e-3 if deg > 30 else 1e-4)
+
+
+def test_ripples_of_a_series_are_refused():
+    with pytest.raises(Exception, match=r"needs the slope_variance 'cox_munk', not '0\.02'"):
+        surface(**STEEP, slope_variance="0.02")
+    with pytest.raises(Exception, match="is one of ripples, which a nested bsdf replaces"):
+        surface(**STEEP, bsdf={"type": "dielectric"})
+    with pytest.raises(Exception, match=r"2[01] and 41 % of the slope variances .* longer shortest_wave than 0.25 m"):
+        surface(slope_distribution="gram_charlier", wind_speed=3.0, shortest_wave=0.25, refined_size=4.0)

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from oracles.phase import henyey_greenstein
 from rows import each_row
 from significance import largest_z
 
@@ -130,6 +131,12 @@ def test_any_phase_function_is_mixed_with_the_water(nested):
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
 
 
+def test_water_without_particles_scatters_as_water():
+    pure = {"scattering": 0.002, "backscattering": 0.001, "water_scattering": 0.002}
+    water = mi.load_dict({"type": "layered_water", **pure}).water
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), water_phase_function(THETA), rtol=1e-3)
+
+
 def test_each_layer_has_its_function_in_the_table():
     water = mi.load_dict(
         {"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"}
@@ -160,6 +167,21 @@ def test_samples_of_the_table_follow_each_function():
         # The mean of 1 / density over a hemisphere's samples is its solid angle.
         inverse = np.where(np.array(wo.z) < 0, 1 / np.array(pdf), 0)
         assert abs(inverse.mean() - 2 * np.pi) < largest_z(count, 2) * inverse.std() / np.sqrt(count)
+
+
+def test_functions_without_a_common_table_are_called_by_pointer():
+    water = mi.load_dict(
+        {
+            "type": "layered_water",
+            "layer_tops": "0, 1",
+            "phase_0": {"type": "hg", "g": 0.9},
+            "phase_1": {"type": "petzold"},
+        }
+    ).water
+    theta = np.radians([1.0, 90.0])
+    found = values(water.phases.at(mi.UInt32([0, 1])), theta)
+    expected = henyey_greenstein(theta[0], 0.9), closed_form.petzold_average_particle()(theta[1])
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 @each_row(

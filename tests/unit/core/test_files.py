@@ -1,5 +1,6 @@
 """Files that replace others alone or together, and the leftovers of killed processes."""
 
+import contextlib
 import errno
 import os
 import signal
@@ -131,6 +132,15 @@ def name_of(process, space=None):
     return f"{host}.{space or own}.{process}"
 
 
+def test_leftovers_of_a_dead_process_are_removed(tmp_path, dead):
+    (tmp_path / f"{dead}.{'b' * 32}.nc").write_text("half")
+    folder = tmp_path / f"{dead}.{'c' * 32}.zarr"
+    (folder / "waveform").mkdir(parents=True)
+    (folder / "zarr.json").write_text("{}")
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {"c": "new"}
+
+
 def test_no_leftover_moves_or_removes_a_file_of_another_name(tmp_path, dead):
     """A list of moves once did, in any folder that a command wrote into; a link would reach another folder."""
     victim = tmp_path / "victim"
@@ -144,6 +154,14 @@ def test_no_leftover_moves_or_removes_a_file_of_another_name(tmp_path, dead):
     write(out, "c")
     assert contents(victim) == {"a": "old"}
     assert contents(out) == {"evil": "new", "c": "new"}
+
+
+def test_leftovers_of_another_user_stay(tmp_path, dead, monkeypatch):
+    name = f"{dead}.{'a' * 32}.nc"
+    (tmp_path / name).write_text("theirs")
+    monkeypatch.setattr(files.os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {name: "theirs", "c": "new"}
 
 
 @pytest.fixture
@@ -185,6 +203,42 @@ def test_a_second_ctrl_c_acts_at_once(default_ctrl_c, presses, survived):
         press()
     assert len(done) == survived
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interruption_between_a_render_and_its_files_waits(tmp_path, default_ctrl_c):
+    def render():
+        with DeferredInterrupt(at_once=False):
+            with DeferredInterrupt() as passes, contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                passes.check()
+            os.kill(os.getpid(), signal.SIGINT)
+            write(tmp_path, "a")
+
+    with pytest.raises(KeyboardInterrupt):
+        render()
+    assert contents(tmp_path) == {"a": "new"}
+
+
+def test_files_of_running_processes_and_other_machines_stay(tmp_path):
+    number = "0" * 32
+    names = [f"{name_of(os.getppid())}.{number}.nc", f".mitransient-lidar.elsewhere.{'0' * 12}.1.{number}.nc"]
+    names += [".mitransient-lidar.nc", ".hidden.nc"]
+    for name in names:
+        (tmp_path / name).write_text("theirs")
+    write(tmp_path, "a")
+    assert contents(tmp_path) == {"a": "new"} | dict.fromkeys(names, "theirs")
+
+
+def test_leftovers_of_another_container_stay_for_a_week(tmp_path, dead, monkeypatch):
+    """Its host may have the same name, and the number of a process that runs there may be of none here."""
+    name = f"{name_of(dead.rsplit('.', 1)[1], space='0' * 12)}.{'a' * 32}.nc"
+    (tmp_path / name).write_text("theirs")
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {name: "theirs", "c": "new"}
+    now = files.time.time()
+    monkeypatch.setattr(files.time, "time", lambda: now + 8 * 24 * 3600)
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {"c": "new"}
 
 
 #: Runs a command where it has the process number 1, as in a container.

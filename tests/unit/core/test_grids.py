@@ -2,8 +2,10 @@
 
 import h5py
 import numpy as np
+import pyproj
 import pytest
 from array_inputs import write_bag
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.maps.grids import read_bag
@@ -21,6 +23,28 @@ def test_bag_has_its_first_row_in_the_south(tmp_path, corners):
     assert grid.centre == (500002.0, 6000000.0)
     np.testing.assert_array_equal(grid.positions["x"], [-2.0, 0.0, 2.0])
     np.testing.assert_array_equal(grid.positions["y"], [-0.75, 0.75])
+
+
+@each_row(
+    ("changes", "message"),
+    [
+        ({"corners": "0,0 7,1"}, r"has 3 cells along x, but corners that are 7 cells apart"),
+        ({"corners": "0 1"}, "has no map coordinates"),
+        ({"system": pyproj.CRS(4326).to_wkt("WKT1_GDAL")}, "has coordinates in degrees"),
+        ({"system": pyproj.CRS(4326).to_wkt("WKT2_2019")}, "has coordinates in degrees"),
+    ],
+)
+def test_bag_with_other_metadata_is_refused(tmp_path, changes, message):
+    write_bag(tmp_path / "a.bag", HEIGHTS, (0.0, 0.0), (1.0, 1.0), **changes)
+    with pytest.raises(UserError, match=message):
+        read_bag(tmp_path / "a.bag")
+
+
+def test_bag_states_its_datum_and_is_positive_up(tmp_path):
+    depth = 'VERT_CS["Mean Lower Low Water Depth",VERT_DATUM["MLLW",2005],UNIT["metre",1],AXIS["Depth",DOWN]]'
+    stated = read_bag(write_bag(tmp_path / "a.bag", HEIGHTS, (5e5, 6e6), (1.0, 1.0), datum=depth)).stated
+    assert (stated.unit, stated.is_down, stated.position_unit) == ("m", False, "metre")
+    assert stated.system.datum == "Mean Lower Low Water Depth"
 
 
 def test_bag_without_one_grid_is_refused(tmp_path, capfd):

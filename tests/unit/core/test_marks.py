@@ -90,6 +90,26 @@ def test_mark_of_a_figure_stands_where_its_format_allows(tmp_path):
     assert pdf[table : table + 4] == b"xref"
 
 
+def test_checksum_of_a_marked_file_is_checked(tmp_path):
+    path = tmp_path / "a.nc"
+    netcdf.write(xr.Dataset({"a": ("x", np.arange(1000.0))}), path)
+    write_mark(path, MARK)
+    assert netcdf.check_sum(path)
+    data = bytearray(path.read_bytes())
+    data[-3000] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="SHA-256"):
+        netcdf.check_sum(path)
+
+
+def test_long_options_are_left_out(tmp_path):
+    path = tmp_path / "a.html"
+    path.write_text("page")
+    write_mark(path, {**MARK, "options": {"places": ["0.123"] * 10_000}})
+    assert read_mark(path)["options"] == {}
+    assert read_mark(path)["command"] == "render"
+
+
 def test_what_is_no_regular_file_has_no_mark(tmp_path):
     assert not holds_mark(tmp_path / "table.csv")
     os.mkfifo(tmp_path / "a.png")

@@ -2,6 +2,7 @@
 
 import gc
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -36,6 +37,27 @@ def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
     assert after.shape[1] > 2 * before.shape[1]
 
 
+def sea_after(lidar_scene, name, change, rendered):
+    """Return a parameter of the sea that is changed before or after a scene is prepared, as a prepared scene has it."""
+    scene = lidar_scene(sea={"spectrum": "elfouhaily", "slope_variance": "cox_munk", "cell_size": 0.5})
+    if rendered:
+        scene.integrator().prepare(scene, scene.sensors()[0])
+    parameters = mi.traverse(scene)
+    parameters[f"sea.{name}"] = change(parameters[f"sea.{name}"])
+    parameters.update()
+    scene.integrator().prepare(scene, scene.sensors()[0])
+    return np.array(mi.traverse(scene)[f"sea.{name}"])
+
+
+def test_edits_of_the_sea_act_before_the_first_render_too(lidar_scene):
+    """The first render chooses the automatic mesh and its ripples, and edits before it were lost without a word."""
+    found = [sea_after(lidar_scene, "bsdf.alpha_u.value", lambda _: 0.3, late) for late in (False, True)]
+    assert found[0] == found[1] == np.float32(0.3)
+    with pytest.raises(UserError, match="'sea': vertex_positions was changed before the mesh was fitted"):
+        sea_after(lidar_scene, "vertex_positions", lambda value: value + 1, False)
+    assert sea_after(lidar_scene, "vertex_positions", lambda value: value * 0 + 1, True).max() == 1
+
+
 @pytest.mark.parametrize("bsdf", [None, {"type": "dielectric"}, {"type": "gram_charlier_dielectric", "int_ior": 1.4}])
 def test_the_sea_has_the_index_of_its_water(lidar_scene, bsdf):
     """Light was bent by the index of the surface, and timed and connected by that of the water."""
@@ -57,6 +79,21 @@ def test_seeds_and_numbers_of_paths_are_checked(lidar_scene):
     with pytest.raises(RuntimeError) as found:
         mi.render(scene, spp=-5)
     assert "spp = -5 must lie between 0" in str(found.value.__cause__)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_gradients_are_refused(lidar_scene, name):
+    scene = scene_with(lidar_scene, name)
+    with pytest.raises(UserError, match=f"{name} passes no gradients"):
+        scene.integrator().render_forward(scene, None)
+    parameters = mi.traverse(scene)
+    key = "bottom.bsdf.reflectance.value"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    energy = dr.sum(mi.render(scene, parameters, seed=1), axis=None)
+    with pytest.raises(UserError, match=f"{name} passes no gradients"):
+        dr.backward(energy)
 
 
 def living():

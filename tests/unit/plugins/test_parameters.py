@@ -157,6 +157,13 @@ def test_values_of_mitsubas_own_objects_are_kept():
     assert values["b"]["bsdf"]["own"]["width_deg"] == 3
 
 
+def test_unknown_parameters_are_still_refused():
+    """A plugin that reads all of its parameters does not hide one that it does not have."""
+    with pytest.raises(RuntimeError, match="unreferenced property"):
+        mi.load_dict({"type": "layered_water", "attenuaton": 0.5})
+    assert mi.load_dict({"type": "layered_water", "secchi": "", "attenuation": ""}).parameters["attenuation"] == 0.3
+
+
 def test_textures_of_every_kind_are_recorded(tmp_path):
     """Transforms of textures are 3x3: a scene with one ended in an error after its render."""
     mi.Bitmap(np.full((4, 4, 3), 128, dtype=np.uint8)).write(str(tmp_path / "grey.png"))

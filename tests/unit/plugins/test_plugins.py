@@ -258,6 +258,19 @@ def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
         find_lidar_scene(loaded, loaded.sensors()[0])
 
 
+def test_other_integrators_see_the_layers():
+    """Mitsuba's volumetric path tracers use null collisions up to the largest attenuation."""
+    water = mi.load_dict(
+        {"type": "layered_water", "layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.6, 0.2"}
+    )
+    mei = mi.MediumInteraction3f()
+    mei.p = mi.Point3f(0, 0, mi.Float([-1.0, -4.0]))
+    scattering, null, total = (np.array(c).ravel() for c in water.get_scattering_coefficients(mei))
+    np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("scattering", [0.004, "0.004, 0.1", 0.0])
 def test_water_of_a_phase_function_needs_no_backscattering(scattering):
     """It follows from the function: neither its default of 0.006 nor a given value refuses little scattering."""

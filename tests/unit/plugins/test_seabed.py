@@ -41,6 +41,29 @@ def test_slopes_rise_towards_positive_x_and_y():
     assert normal[0, 0] < 0 < normal[0, 1]
 
 
+def test_depth_is_that_at_the_origin_wherever_the_middle_lies():
+    z, _, _ = look_down(load(slope_x_deg=10.0, centre_x=20.0, size=100.0), [20.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(z, [-8 + 20 * np.tan(np.radians(10)), -8], rtol=1e-5)
+
+
+def test_bowl_rises_with_the_square_of_the_distance_and_ends_with_the_fine_square():
+    shape = load(curvature=0.04, centre_x=1.0, refined_size=20.0)
+    z, _, _ = look_down(shape, [1.0, 4.0, 1.0, 101.0], [0.0, 0.0, 5.0, 0.0])
+    np.testing.assert_allclose(z, [-8, -8 + 0.02 * 9, -8 + 0.02 * 25, -8 + 0.02 * 100], atol=1e-3)
+    mound, _, _ = look_down(load(curvature=-0.04), [3.0], [0.0])
+    np.testing.assert_allclose(mound, -8 - 0.02 * 9, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_ripples_have_their_height_length_and_bearing():
+    shape = load(ripple_height=0.1, ripple_length=0.5, ripple_bearing_deg=90.0)
+    y = np.arange(-2, 2, 0.0625)
+    z, _, _ = look_down(shape, np.full_like(y, 0.31), y)
+    np.testing.assert_allclose(z, -8 + 0.05 * np.cos(2 * np.pi * y / 0.5), atol=1e-4)
+    along, _, _ = look_down(shape, np.arange(-2, 2, 0.1), np.full(40, 0.25))
+    assert np.ptp(along) < 1e-4
+
+
 def test_height_map_is_added(tmp_path):
     x, y = np.linspace(-3, 4, 29), np.linspace(10, 13, 13)
     heights = 0.5 * x - 0.25 * y[:, None]
@@ -62,6 +85,20 @@ def test_the_same_map_is_at_the_same_depth_in_every_format(tmp_path):
     for suffix, more in ((".npy", {"map_size": 4.0}), (".npz", {}), (".asc", {}), (".nc", {})):
         shape = load(filename=str(tmp_path / f"map{suffix}"), **more)
         np.testing.assert_allclose(look_down(shape, [0.0, 1.5], [0.0, -1.5])[0], -7.25)
+
+
+def test_unit_and_missing_values_of_a_map_are_given(tmp_path):
+    np.savetxt(tmp_path / "map.csv", [[x, y, 10 if x + y else -999] for x in range(5) for y in range(5)], delimiter=",")
+    given = {"map_values": "depths", "map_unit": "ft", "map_no_data": -999.0, "map_holes": "fill"}
+    shape = load(filename=str(tmp_path / "map.csv"), **given)
+    np.testing.assert_allclose(look_down(shape, [0.0, -2.0], [0.0, -2.0])[0], -3.048)
+
+
+def test_height_map_about_the_sea_level(tmp_path):
+    np.save(tmp_path / "map.npy", np.full((5, 9), -7.25))
+    shape = load(filename=str(tmp_path / "map.npy"), map_size=16.0, depth=0.0)
+    assert shape.bottom.refined_size == 16
+    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 2.0])[0], -7.25)
 
 
 GRID = """ncols 5
@@ -102,6 +139,20 @@ def test_patches_have_their_reflectance_and_area():
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     _, reflectance, _ = look_down(load(patches="0 0 1 0.4", reflectance=0.2), x, y)
     assert reflectance.mean() == pytest.approx(0.2 + 0.2 * np.pi / 16, rel=2e-3)
+
+
+def test_fine_square_grows_to_hold_the_patches():
+    assert load(patches="30 0 2 0.4").bottom.refined_size == 64
+    assert load(patches="1 0 2 0.4").bottom.refined_size == 20
+
+
+def test_users_own_bsdf_wins_and_may_read_the_patches():
+    plastic = load(patches="0 0 1 0.4", bsdf={"type": "roughplastic"})
+    assert not mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.DiffuseTransmission)
+    assert mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.GlossyReflection)
+    texture = {"type": "mesh_attribute", "name": "vertex_reflectance", "scale": 0.5}
+    shape = load(patches="0 0 1 0.4", bsdf={"type": "diffuse", "reflectance": texture})
+    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 0.0])[1], [0.2, 0.05], rtol=1e-5)
 
 
 @each_row(

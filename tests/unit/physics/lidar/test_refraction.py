@@ -16,11 +16,6 @@ from mitransient_lidar.physics.lidar.refraction import (
 THETA, N, HEIGHT = np.radians(20), 1.34, 200.0
 
 
-def test_snell():
-    assert np.degrees(snell(THETA, N)) == pytest.approx(14.78774, abs=1e-5)
-    assert snell(np.pi / 2, N) == pytest.approx(np.arcsin(1 / N))
-
-
 def test_refraction_of_a_ray_at_a_slope():
     """Sines of the angles to the normal are in the ratio of the index, and the ray stays in their plane."""
     down = np.array([np.sin(0.35), 0.1, -1.0])

@@ -1,6 +1,5 @@
 """System attenuation against the limits of Gordon (1982) and numbers worked out by hand."""
 
-import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
@@ -20,13 +19,6 @@ def test_wide_spot_decays_with_kd():
 def test_between_the_limits():
     # c D = 1: exp(-0.85) = 0.42741; with the radius in place of the diameter it would be exp(-0.425) = 0.65377.
     assert system_attenuation(0.25, 0.05, 4.0) == pytest.approx(0.05 + 0.2 * 0.42741, rel=1e-5)
-
-
-def test_arrays_broadcast():
-    k = system_attenuation([[0.3], [1.5]], 0.15, [0.0, 2.0, 30.0])
-    assert k.shape == (2, 3)
-    assert k[:, 0] == pytest.approx([0.3, 1.5])
-    assert np.all(np.diff(k, axis=1) < 0)
 
 
 def test_diffuse_light_decays_no_faster_than_the_beam():

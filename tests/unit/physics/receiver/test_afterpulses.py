@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from significance import largest_z
 
-from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import SinglePhotonDetector
 
 # Dead for the rest of its bin and 9.5 bins of 1 ns: 10 bins.
@@ -55,13 +54,3 @@ def test_moments_in_changing_light(dead_ns, channels):
         often = shots * (covariance + mean[: len(t) - lag] * mean[lag:]) > 100
         error = products.std(axis=0) / np.sqrt(shots)
         assert np.all(np.abs(products.mean(axis=0) - covariance)[often] < limit * error[often]), lag
-
-
-def test_without_afterpulses_the_recursion_is_that_of_dead_time():
-    rng = np.random.default_rng(5)
-    events, dead = rng.exponential(0.1, (3, 60)), dead_time.dead_bins(6.3, 1.0)
-    fired, covariances = dead_time.afterpulse_moments(events, dead, np.zeros(20), 15)
-    plain, _ = dead_time.firing_probability(events, dead)
-    np.testing.assert_allclose(fired, plain, atol=1e-14)
-    for found, expected in zip(covariances, dead_time.pair_covariances(events, plain, dead, 15), strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-14)

@@ -149,19 +149,6 @@ def test_seeds():
     assert len(np.unique(many[:, 100:104], axis=0)) > 590
 
 
-def test_shapes_and_background_per_record():
-    chain = replace(RECEIVERS["pmt"], digitiser=Digitiser(10, 1.0, -0.05, sampling_ghz=0.25))
-    record = chain.apply(np.zeros((2, 3, 30)), 1.0, 7, 1, np.full((2, 3), 1e-9))
-    assert record.signal.shape == (7, 2, 3, 8)
-    assert record.signal.dtype == np.float32
-    assert record.saturated.shape == record.signal.shape
-    expected = chain.expected(np.zeros((2, 3, 30)), 1.0, 1e-7 * np.arange(6).reshape(2, 3))
-    assert expected.mean.shape == (2, 3, 8)
-    np.testing.assert_allclose(np.diff(expected.mean[..., 4].ravel()), expected.mean[0, 1, 4] - expected.mean[0, 0, 4])
-    assert chain.units == "V"
-    assert RECEIVERS["spad"].units == "1"
-
-
 def test_fitting_gain_and_attenuation_in_closed_form():
     """Shot noise alone: N photons reach N + 6 sqrt(N) electrons, and N/a + 6 sqrt(N/a) are those of the limit."""
     bins, limit = 1.0, 0.5

@@ -9,7 +9,6 @@ from significance import largest_z
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, photons_per_joule
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
-from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
 ELECTRON = 1.602176634e-19
@@ -71,15 +70,6 @@ def test_blind_after_an_overload():
     assert not saturated[1].any()
     np.testing.assert_allclose(samples[0, 20:37], stage.read(np.full(1, 1.0))[0][0])
     np.testing.assert_allclose(samples[0, 37:], 0, atol=3e-4)
-
-
-def test_time_of_recovery_in_samples():
-    chain = RECEIVERS["pmt"]
-    chain = replace(chain, amplifier=replace(chain.amplifier, recovery_ns=10.0))
-    # Samples are 1 ns apart, two bins of 0.5 ns.
-    assert chain.readout(0.5).hold == 10
-    assert replace(chain, digitiser=None).readout(0.5).hold == 20
-    assert RECEIVERS["pmt"].readout(0.5).hold == 0
 
 
 def test_moments_of_samples_after_an_overload():

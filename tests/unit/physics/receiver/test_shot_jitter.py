@@ -93,16 +93,6 @@ def test_seed_of_what_channels_share():
     np.testing.assert_array_equal(centroids(repeated), one)
 
 
-def test_zero_jitter_changes_only_the_random_numbers():
-    """Energies of 1 and delays of 0 leave the light as it is."""
-    energy, delay = ShotJitter().draw(5, (2, 3), True, 1, 2)
-    assert energy.shape == delay.shape == (5, 2, 3)
-    assert np.all(energy == 1)
-    assert np.all(delay == 0)
-    light = echoes(60.0, 63.0)
-    np.testing.assert_array_equal(delayed(light, np.zeros((4, 2))), np.broadcast_to(light, (4, 2, BINS)))
-
-
 @each_row("bins", [-300.0, -7.25, -0.4, 0.0, 0.75, 3.0, 11.5, 300.0])
 def test_delays_keep_energy_and_move_the_centroid(bins):
     light = echoes(60.0, 63.0)

@@ -56,13 +56,6 @@ def test_npy_is_centred_on_the_origin(tmp_path):
     assert_is_the_map(read_height_map(str(path), 6), y=[-2, 0, 2])
 
 
-def test_npz_with_and_without_positions(tmp_path):
-    path = write_npz(tmp_path / "map.npz", heights=HEIGHTS, x=X, y=Y)
-    assert_is_the_map(read_height_map(path))
-    path = write_npz(tmp_path / "map.npz", heights=HEIGHTS.astype(int))
-    assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
-
-
 @each_row("kind", [np.float32, np.float16, np.uint32])
 @each_row(("wanted", "others"), [("depth", []), ("Y", ["stderr"]), ("R", ["G", "B"]), ("Z", ["A"]), ("Y", ["R", "Z"])])
 def test_top_row_of_an_exr_image_has_the_largest_y(tmp_path, kind, wanted, others):
@@ -294,13 +287,6 @@ def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
 def test_invalid_placements_are_rejected(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
-
-
-def test_an_origin_beside_the_map_is_warned_of(tmp_path, caplog):
-    """A lidar aims there by default; a survey may count its places from any round number."""
-    found = read_height_map(write_ascii_grid(tmp_path / "map.asc"), origin=(499990.0, 6000000.0))
-    assert (found.x[0], found.y[0]) == (8, 5.5)
-    assert "do not contain x = y = 0, where the lidar aims by default" in caplog.text
 
 
 def test_origin_needs_positions(tmp_path):

@@ -37,17 +37,6 @@ def test_every_lidar_has_cells_within_their_limits():
         assert found.size >= max(1000.0, 2 * found.refined_size)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("wind", [0.0, 0.5, 6.0])
-@pytest.mark.parametrize(("divergence", "altitude"), [(5e-4, 200.0), (1e-3, 200.0), (2e-2, 5.0), (2e-2, 5e5)])
-def test_total_slope_variance_is_that_of_cox_and_munk(wind, divergence, altitude):
-    parameters = {"wind_speed": wind}
-    sea = SeaSurface.read(OCEAN_SURFACE.reader(parameters.get), lidar(altitude, divergence))
-    # The ripples' least variance of 1e-5 stands above 0 along calm water.
-    assert sea.slope_variance == pytest.approx(sum(cox_munk(wind)), abs=2e-5 if wind < 1 else 1e-9)
-    assert min(sea.ripple_variance) >= 1e-5
-
-
 def test_waves_and_cells_follow_the_beam_or_the_pixels():
     """Waves from 1.064 m or four pixels of 0.085 m at 213 m; never finer than 8 cm and 2 cm, nor for wide beams."""
     slant = 200.0 / math.cos(TILT)
@@ -59,13 +48,6 @@ def test_waves_and_cells_follow_the_beam_or_the_pixels():
     assert (finest.shortest_wave, finest.cell_size) == (0.08, 0.02)
     assert (coarsest.shortest_wave, coarsest.cell_size) == (2.0, 0.25)
     assert choose(lidar(), shortest_wave=0.48).cell_size == pytest.approx(0.04)
-
-
-def test_large_patches_have_fewer_cells_in_a_wave():
-    """42 m from a mast of 15 m at grazing angles: 512 cells a side instead of 1280."""
-    mast = choose(lidar(15.0, 5e-3, 10e-3, off_nadir=math.radians(84.6)))
-    assert mast.refined_size / mast.cell_size == pytest.approx(512)
-    assert 4 * mast.cell_size < mast.shortest_wave == pytest.approx(2.5e-3 * 15 / math.cos(math.radians(84.6)))
 
 
 def test_the_waves_do_not_depend_on_the_cells():
@@ -81,13 +63,6 @@ def test_waves_for_pixels_count_as_those_for_the_beam():
     assert choose(lidar(field_of_view=0.01, pixel=1e-5)).beam_wave == choose(lidar()).shortest_wave
     for same in (choose(lidar()), choose(lidar(), shortest_wave=0.3), choose(lidar(5e5, 1e-4)), choose([])):
         assert same.beam_wave == same.shortest_wave
-
-
-def test_narrow_beams_have_a_patch_of_many_fine_cells_and_wide_views_fewer():
-    """0.1 mrad in 200 mrad: the patch gives up the view, not the cells that resolve the beam."""
-    narrow = choose(lidar(divergence=1e-4, field_of_view=0.2))
-    assert narrow.cell_size == pytest.approx(0.5e-4 * 200 / math.cos(TILT))
-    assert narrow.refined_size == pytest.approx(1024 * narrow.cell_size)
 
 
 def test_patch_holds_beam_and_view_of_separate_instruments():

@@ -30,10 +30,6 @@ def test_layer_owns_its_upper_edge_and_first_layer_fills_crests(layered):
     np.testing.assert_array_equal(layered.layer_at([-1, 0, 2.999, 3, 100]), [0, 0, 0, 1, 1])
 
 
-def test_cumulative_is_piecewise_linear(layered):
-    np.testing.assert_allclose(layered.cumulative([-1, 0, 1, 3, 5]), [-0.9, 0, 0.9, 2.7, 3.7], atol=1e-15)
-
-
 def test_shares_of_the_layers_in_the_water_above_a_depth(layered):
     # Of 8 m, 3 m are the upper layer; mean values times depth are integrals.
     np.testing.assert_allclose(layered.layer_shares([-1, 0, 2, 8]), [[1, 0], [1, 0], [1, 0], [3 / 8, 5 / 8]])

@@ -100,14 +100,6 @@ def test_fewest_layers_of_a_straight_profile(nodes, order):
     assert count == np.ceil(np.log(8) / np.log(1.02)) + 1
 
 
-def test_constant_parts_are_one_layer():
-    assert Profile([1, 2], [0.2, 0.2], [0.1, 0.1], [0.002, 0.002]).layers().count == 1
-    water = Profile([3, 4, 5, 9], [0.2, 0.2, 0.1, 0.1], [0.1] * 4, [0.002] * 4).layers()
-    assert water.layer_tops[1] > 4
-    assert water.layer_tops[-1] == 5
-    np.testing.assert_allclose(water.attenuation[[0, -1]], [0.3, 0.2], rtol=2e-2)
-
-
 def test_a_steep_profile_has_layers_of_finite_thickness():
     water = Profile([0, 3, 3 + 1e-9, 5], [0.4, 0.4, 0.1, 0.1], [0.5, 0.5, 0.4, 0.4], [0.01] * 4).layers()
     np.testing.assert_allclose(water.layer_tops, [0, 3, 3 + 1e-9], atol=2e-4)

@@ -36,13 +36,6 @@ def test_group_index_is_the_derivative_of_the_index(wavelength, temperature, sal
     assert group_index(wavelength, temperature, salinity) == pytest.approx(float(expected), abs=2e-9)
 
 
-def test_indices_fall_with_wavelength_and_temperature_and_rise_with_salt():
-    for index in (refractive_index, group_index):
-        assert np.all(np.diff(index(np.linspace(400, 700, 31))) < 0)
-        assert np.all(np.diff(index(532, np.linspace(2, 30, 15))) < 0)
-        assert np.all(np.diff(index(532, 20, np.linspace(0, 40, 11))) > 0)
-
-
 def test_absorption_is_pope_and_fry():
     np.testing.assert_array_equal(
         water_absorption([525, 527.5, 530, 532.5, 535]), [0.0417, 0.0428, 0.0434, 0.0447, 0.0452]

@@ -111,14 +111,6 @@ def test_particle_scattering_in_the_blue():
     assert chlorophyll(5, 440).scattering - sea.scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
 
 
-@each_row("wavelength", [400, 440, 532, 590, 700])
-def test_attenuation_increases_with_chlorophyll(wavelength):
-    waters = [chlorophyll(c, wavelength) for c in np.geomspace(0.01, 30, 20)]
-    assert waters[0].absorption >= water_absorption(wavelength)
-    assert np.all(np.diff([w.absorption for w in waters]) >= 0)
-    assert np.all(np.diff([w.scattering for w in waters]) > 0)
-
-
 @each_row("water_type", JERLOV_KD)
 def test_kd_of_a_jerlov_type_gives_that_type(water_type):
     water, expected = from_kd(JERLOV_KD[water_type]), jerlov(water_type)
