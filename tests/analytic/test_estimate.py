@@ -60,11 +60,6 @@ def test_estimate_is_a_result_with_components():
     np.testing.assert_array_equal(again["waveform"], found["waveform"])
 
 
-def test_targets_are_left_out_with_a_word(caplog):
-    estimate("fig13_2x2", LEVEL, paths=2**9)
-    assert "the estimate leaves out 'target'" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("scene", "params", "message"),
     [

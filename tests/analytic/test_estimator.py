@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from significance import assert_same, largest_error, largest_z
@@ -33,11 +32,12 @@ def compare(first, second, largest):
 def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
     """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
     energies = []
-    for name in ("1x1", "2x2", "1x4"):
-        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**14})
-        energies.append(passes(scene, 1).sum(axis=1))
-    for parts in energies[1:]:
+    for name, seed in (("1x1", 0), ("2x2", 0), ("1x4", 0), ("1x1", 1)):
+        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**12})
+        energies.append(passes(scene, 1, seed).sum(axis=1))
+    for parts in energies[1:3]:
         np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
+    assert np.mean(energies[0] == energies[3]) < 0.6
 
 
 def with_total(energy):
@@ -111,15 +111,6 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
 
 
 @pytest.mark.slow
-def test_seeds_repeat_and_differ(lidar_scene, passes):
-    scene = lidar_scene(sea=WAVY, integrator={"paths_per_pass": 2**12})
-    first, again, other = passes(scene, 1, 7), passes(scene, 1, 7), passes(scene, 1, 8)
-    # Sums into one bin are atomic, and so their order is free: double precision leaves 1e-12.
-    np.testing.assert_allclose(first, again, rtol=1e-12)
-    assert np.mean(first == other) < 0.5
-
-
-@pytest.mark.slow
 def test_orders_of_scattering_add_up(lidar_scene, passes):
     """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
     energies = [
@@ -178,13 +169,3 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
     energy = np.median(passes(scene, 8).sum(axis=(1, 2)))
     plate = 5e-3 * 0.81 * 0.9 * 0.025 * np.cos(np.radians(20)) / np.pi / (200 / np.cos(np.radians(20))) ** 2
     assert 0.3 * plate < energy < plate
-
-
-@pytest.mark.slow
-def test_sample_count_per_pixel_and_default(lidar_scene):
-    scene = lidar_scene(integrator={"paths_per_pass": 2**12})
-    # 1024 for each of four pixels are the 4096 paths of a pass; as many again are other paths.
-    default, same, more = (np.array(mi.render(scene, spp=spp, seed=1)) for spp in (0, 1024, 2048))
-    np.testing.assert_allclose(same, default, rtol=1e-5)
-    lit = default > 0
-    assert np.mean(np.isclose(more, default, rtol=1e-3, atol=0)[lit]) < 0.5

@@ -229,18 +229,3 @@ def test_view_weights_add_up_to_the_solid_angle(view_mrad, aim_x):
         assert error < 4e-3 * expected
     error = weight.std() * np.sqrt(COUNT)
     assert abs(weight.sum() - 4 * expected) < largest_z(COUNT) * error + 1e-5 * expected
-
-
-@each_row("count", [1, 3, 17])
-def test_any_number_of_paths_covers_the_view(count):
-    """Sums of the weights of few paths, and of those in the far half of the view."""
-    receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 30.0}).receiver
-    view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
-    shots = 2**16
-    start = view.sample(dr.arange(mi.UInt32, shots * count) % count, count, pass_streams(6, 0, shots * count))
-    weight = np.array(start.weight, dtype=np.float64).reshape(shots, count)
-    far = np.array(start.pixel).reshape(shots, count) < 2
-    solid_angle = 2 * np.pi * (1 - 1 / np.sqrt(1 + 15e-3**2))
-    for share, kept in ((1.0, True), (0.5, far)):
-        samples = (weight * kept).sum(axis=1) / (0.025 * 0.9 * 0.9 * solid_angle * share)
-        assert abs(samples.mean() - 1) < largest_z(shots) * samples.std() / np.sqrt(shots)

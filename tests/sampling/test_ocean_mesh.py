@@ -123,22 +123,6 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
 
 
-def test_cells_grow_outside_the_patch_up_to_the_size():
-    vertices, faces = buffers(surface(refined_size=32.0, cell_size=0.25)[1])
-    lines = np.unique(vertices[:, 0])
-    assert lines[0] <= -500
-    assert lines[-1] >= 500
-    lengths = np.diff(lines)
-    inside = np.abs(lines[:-1] + 0.5 * lengths) < 16
-    np.testing.assert_array_equal(lengths[inside], 0.25)
-    ratio = lengths[1:] / lengths[:-1]
-    # The last cell ends with the surface.
-    assert np.all(ratio[1:-1] < 2.001)
-    assert np.all(ratio[1:-1] > 1 / 2.001)
-    # All of 1 km^2 for twice the triangles of 32 m x 32 m.
-    assert len(faces) < 2 * 2 * 128**2
-
-
 # The patch and what surrounds it.
 
 
@@ -268,12 +252,3 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         assert shape.sea.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):
         np.testing.assert_array_equal(first, second)
-
-
-def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
-    own = {"spectrum": "elfouhaily", "refined_size": 8.0, "cell_size": 0.5, "centre_x": 1.0, "centre_y": 2.0}
-    loaded = lidar_scene(sea={**own, "shortest_wave": 1.0, "size": 50.0})
-    shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
-    sea = shape.sea
-    open_scene(loaded)
-    assert shape.sea is sea

@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from oracles.phase import henyey_greenstein
 from rows import each_row
 from significance import largest_z
 
@@ -167,21 +166,6 @@ def test_samples_of_the_table_follow_each_function():
         # The mean of 1 / density over a hemisphere's samples is its solid angle.
         inverse = np.where(np.array(wo.z) < 0, 1 / np.array(pdf), 0)
         assert abs(inverse.mean() - 2 * np.pi) < largest_z(count, 2) * inverse.std() / np.sqrt(count)
-
-
-def test_functions_without_a_common_table_are_called_by_pointer():
-    water = mi.load_dict(
-        {
-            "type": "layered_water",
-            "layer_tops": "0, 1",
-            "phase_0": {"type": "hg", "g": 0.9},
-            "phase_1": {"type": "petzold"},
-        }
-    ).water
-    theta = np.radians([1.0, 90.0])
-    found = values(water.phases.at(mi.UInt32([0, 1])), theta)
-    expected = henyey_greenstein(theta[0], 0.9), closed_form.petzold_average_particle()(theta[1])
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 @each_row(

@@ -102,14 +102,6 @@ def test_checksum_of_a_marked_file_is_checked(tmp_path):
         netcdf.check_sum(path)
 
 
-def test_long_options_are_left_out(tmp_path):
-    path = tmp_path / "a.html"
-    path.write_text("page")
-    write_mark(path, {**MARK, "options": {"places": ["0.123"] * 10_000}})
-    assert read_mark(path)["options"] == {}
-    assert read_mark(path)["command"] == "render"
-
-
 def test_what_is_no_regular_file_has_no_mark(tmp_path):
     assert not holds_mark(tmp_path / "table.csv")
     os.mkfifo(tmp_path / "a.png")

@@ -63,12 +63,6 @@ def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
     np.testing.assert_array_equal(table.columns["b"], [-9999, 3])
 
 
-def test_empty_files_have_no_rows(path):
-    path.write_text("# only a comment\n")
-    times, values = read_time_samples(path, POWER)
-    assert times.shape == values.shape == (0,)
-
-
 @each_row(
     ("text", "message"),
     [

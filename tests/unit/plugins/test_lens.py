@@ -42,11 +42,6 @@ def test_points_fall_into_the_pixel_that_holds_them():
     assert np.array(outside).tolist() == [0, 0]
 
 
-def test_square_detector_and_the_circle_within():
-    assert receiver(layout="16x16").pixels.field_of_view_shape == "square"
-    assert receiver(layout="16x16", field_of_view_shape="circle").pixels.area == pytest.approx(np.pi / 4 * 3.2e-3**2)
-
-
 def test_fill_factor_keeps_the_pitch():
     pixels = receiver(layout="4x8", fill_factor=0.25).pixels
     assert pixels.area == pytest.approx(0.25 * 8e-4 * 1.6e-3)

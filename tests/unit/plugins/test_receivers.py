@@ -10,7 +10,6 @@ from significance import largest_z
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import pass_streams, stratified_point
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 COUNT = 2**20
 COLLECTION = 0.025 * 0.9 * 0.9
@@ -33,16 +32,6 @@ def test_gx_points_away_from_nadir_and_gy_along_y(angle):
     assert far[0] > axis[0]
     assert left[1] == pytest.approx(0.01 / np.hypot(1, 0.01), rel=1e-6)
     np.testing.assert_allclose(axis, [np.sin(np.radians(angle)), 0, -np.cos(np.radians(angle))], atol=1e-7)
-
-
-def test_look_at_gives_the_axes_of_the_angles():
-    """Position and target alone; scaling the transform changes nothing."""
-    wanted = KernelPose.from_angles(120.0, 25.0, 2.0, 1.0)
-    look = mi.ScalarTransform4f().look_at(origin=wanted.origin.tolist(), target=[2.0, 1.0, 0.0], up=[0, 0, 1])
-    for to_world in (look, look @ mi.ScalarTransform4f().scale(3.0)):
-        pose = mi.load_dict({"type": "multipixel_receiver", "to_world": to_world}).receiver.pose
-        for name in ("origin", "axis", "far", "left"):
-            np.testing.assert_allclose(getattr(pose, name), getattr(wanted, name), atol=2e-5, err_msg=name)
 
 
 def test_a_reflected_pose_is_refused():
@@ -79,14 +68,6 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-def test_view_leaves_a_footprint_alone_that_it_does_not_see():
-    receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 10.0}).receiver
-    uses = [
-        SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter", "aim_y": y})).use_footprint for y in (0, 30)
-    ]
-    assert uses == [True, False]
-
-
 @each_row("count", [4096, 5000])
 def test_stratified_points_cover_the_square_evenly(count):
     """In 16 x 16 cells 4096 points fall 16 into each, and of 5000 nearly as many: random ones would spread by 4."""
@@ -118,19 +99,6 @@ def test_imager_rows_go_from_far_to_near_and_columns_from_left_to_right(lidar_sc
     arrival = [(energy[row].sum(axis=0) * ticks).sum() / energy[row].sum() for row in range(4)]
     # 7.5 mrad a row are 3.9 ns, 7.7 bins.
     assert np.all(np.diff(arrival) < -4)
-
-
-@pytest.mark.slow
-def test_film_keeps_the_last_pass(lidar_scene):
-    scene = lidar_scene(rx={"layout": "5x5"}, film={"bin_count": 40, "time_start_ns": 1410.0})
-    energy = np.array(mi.render(scene, seed=3))
-    film = scene.sensors()[0].film()
-    assert energy.shape == (5, 5, 40)
-    np.testing.assert_array_equal(np.array(film.develop()), energy)
-    np.testing.assert_allclose(film.energy(), energy, rtol=1e-6)
-    np.testing.assert_array_equal(np.array(film.bitmap()), energy.reshape(25, 40))
-    film.clear()
-    assert not film.energy().any()
 
 
 def test_foreign_integrators_are_refused():

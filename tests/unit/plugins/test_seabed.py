@@ -94,13 +94,6 @@ def test_unit_and_missing_values_of_a_map_are_given(tmp_path):
     np.testing.assert_allclose(look_down(shape, [0.0, -2.0], [0.0, -2.0])[0], -3.048)
 
 
-def test_height_map_about_the_sea_level(tmp_path):
-    np.save(tmp_path / "map.npy", np.full((5, 9), -7.25))
-    shape = load(filename=str(tmp_path / "map.npy"), map_size=16.0, depth=0.0)
-    assert shape.bottom.refined_size == 16
-    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 2.0])[0], -7.25)
-
-
 GRID = """ncols 5
 nrows 3
 xllcorner 512340.25
@@ -139,20 +132,6 @@ def test_patches_have_their_reflectance_and_area():
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     _, reflectance, _ = look_down(load(patches="0 0 1 0.4", reflectance=0.2), x, y)
     assert reflectance.mean() == pytest.approx(0.2 + 0.2 * np.pi / 16, rel=2e-3)
-
-
-def test_fine_square_grows_to_hold_the_patches():
-    assert load(patches="30 0 2 0.4").bottom.refined_size == 64
-    assert load(patches="1 0 2 0.4").bottom.refined_size == 20
-
-
-def test_users_own_bsdf_wins_and_may_read_the_patches():
-    plastic = load(patches="0 0 1 0.4", bsdf={"type": "roughplastic"})
-    assert not mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.DiffuseTransmission)
-    assert mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.GlossyReflection)
-    texture = {"type": "mesh_attribute", "name": "vertex_reflectance", "scale": 0.5}
-    shape = load(patches="0 0 1 0.4", bsdf={"type": "diffuse", "reflectance": texture})
-    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 0.0])[1], [0.2, 0.05], rtol=1e-5)
 
 
 @each_row(

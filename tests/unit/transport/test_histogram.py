@@ -91,14 +91,6 @@ def test_energy_that_is_not_finite_marks_its_bin():
         np.testing.assert_array_equal(energy, [[0, 0, 0], [np.nan, 0, np.nan]])
 
 
-def test_images_have_rows_and_columns():
-    sums = histogram(5, (2, 3))
-    sums.add(mi.UInt32(4), mi.Float(1391.1e-9 * C0), mi.Float(3.0), mi.Bool(True))
-    energy = sums.energy()
-    assert energy.shape == (2, 3, 5)
-    assert energy[1, 1, 2] == energy.sum() == 3
-
-
 def test_parts_have_the_bits_of_the_whole():
     """Coarse and fine sums, and what is not finite, of some of the pixels."""
     received = histogram(5, (7,))

@@ -8,6 +8,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver import chain as receiver_chain
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
@@ -138,15 +139,12 @@ def test_snr_of_photons_and_of_saturated_samples():
     assert np.isnan(stuck.snr([1e-4], 1.0)[0])
 
 
-@pytest.mark.slow
-def test_seeds():
+def test_seeds_repeat_and_blocks_of_shots_differ(monkeypatch):
+    monkeypatch.setattr(receiver_chain, "_BLOCK", 2**11)
     chain, light = RECEIVERS["apd"], power(scale=1e-7)
-    one, two, three = (chain.apply(light, 1.0, 30, seed) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(one.signal, two.signal)
-    assert not np.array_equal(one.signal, three.signal)
-    # More shots than one block holds: they differ, but for equal codes of the digitiser by chance.
-    many = chain.apply(np.full(4096, 1e-7), 1.0, 600, 5).signal
-    assert len(np.unique(many[:, 100:104], axis=0)) > 590
+    one, two, three = (chain.apply(light, 1.0, 40, seed).signal for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, two)
+    assert len(np.unique(np.concatenate([one[:, 0], three[:, 0]]), axis=0)) == 80
 
 
 def test_fitting_gain_and_attenuation_in_closed_form():
@@ -203,13 +201,3 @@ def test_noise_of_the_avalanche_photodiode():
     assert diode.leakage_current_na + diode.gain * diode.dark_current_na == pytest.approx(15, rel=0.01)
     current = 1e-9 * (diode.leakage_current_na + diode.dark_current_na * diode.gain**2 * diode.excess_noise)
     assert np.sqrt(2 * 1.602176634e-19 * current) == pytest.approx(0.23e-12, rel=0.01)
-
-
-def test_chains_without_limits_need_no_attenuation():
-    for chain in (RECEIVERS["ideal"], RECEIVERS["spad"], ReceiverChain(LinearDetector(1.0), Amplifier(1e3))):
-        assert chain.fitting_attenuation([1.0], 1.0) == chain.fitting_gain([1.0], 1.0) == 1
-    # Noise above the range cannot be attenuated.
-    noisy = ReceiverChain(LinearDetector(1.0), Amplifier(1e9, 1e3, limit_v=1e-3))
-    assert noisy.fitting_attenuation([1e-6], 1.0) == np.inf
-    with pytest.raises(UserError, match="gain = 2 needs an amplifier"):
-        RECEIVERS["spad"].with_gain(2)

@@ -6,7 +6,7 @@ from rows import each_row
 from scipy.stats import norm
 from significance import largest_z
 
-from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout
 
 
 @pytest.mark.parametrize("response", ["single_pole", "gaussian"])
@@ -70,13 +70,6 @@ def test_amplifier_noise_without_a_low_pass_is_that_of_the_bins():
     assert weights == np.ones(1)
     record = np.arange(6.0)
     np.testing.assert_array_equal(amplifier.low_pass(1.0).sampled(record, 1), record)
-
-
-def test_filtered_is_causal_and_ordered():
-    record = np.zeros((2, 8))
-    record[1, 3] = 2.0
-    np.testing.assert_allclose(filtered(record, np.array([0.5, 0.3, 0.2]))[1], [0, 1.0, 0.6, 0.4, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(filtered(record, np.array([2.0])), 2 * record)
 
 
 def test_logarithm():
@@ -144,17 +137,6 @@ def test_logarithm_of_noise(mean):
     assert found.mean[0] == pytest.approx(samples.mean(), abs=2e-5)
     assert found.variance[0] == pytest.approx(samples.var(), rel=1e-4, abs=1e-15)
     assert found.saturation[0] == pytest.approx(saturated.mean(), abs=1e-5)
-
-
-def test_logarithm_saturates_at_its_input():
-    # 0.3 V a decade and the top code at 0.6 V: ten to the 2 times the knee.
-    stage = Readout(None, LogAmplifier(0.3, 1e-3), Digitiser(16, 0.6, 0.0))
-    samples, saturated = stage.read(np.array([0.09, 0.11, -1e-3]))
-    np.testing.assert_array_equal(saturated, [False, True, True])
-    assert samples[1] == pytest.approx(0.6, rel=1e-4)
-    still = stage.expected(np.array([0.09, 0.11, -1e-3]), np.zeros(3))
-    np.testing.assert_allclose(still.mean, samples, atol=1e-5)
-    np.testing.assert_array_equal(still.saturation, [0, 1, 1])
 
 
 def test_samples_fall_on_bins():

@@ -100,14 +100,6 @@ def test_every_function_sees_the_tail(name):
         np.testing.assert_allclose(0.01 * bound.mean_derivatives[0], bright - dark, atol=1e-9)
 
 
-def test_no_part_of_the_record_is_cut_off_before_a_tail():
-    chain = RECEIVERS["pmt"]
-    assert chain.forgets_light
-    assert not replace(chain, detector=TUBE).forgets_light
-    assert not RECEIVERS["spad"].forgets_light
-    assert not replace(chain, amplifier=replace(chain.amplifier, coupling_ns=1e3)).forgets_light
-
-
 def test_afterpulses_of_cells_follow_those_that_fire():
     # 1000 cells, a mean of 3 events in each: 1 - exp(-3) of them fire, and have afterpulses.
     cells = SiliconPhotomultiplier(0.5, 1000, 10.0, tail_fractions=(0.05,), tail_decays_ns=(20.0,))
@@ -115,9 +107,3 @@ def test_afterpulses_of_cells_follow_those_that_fire():
     later = 0.05 * 1000 * (1 - np.exp(-3)) * (np.exp(-0.5 / 20) - np.exp(-1.5 / 20))
     assert events[21] == pytest.approx(later)
     assert events[21:].sum() == pytest.approx(0.05 * 1000 * (1 - np.exp(-3)) * np.exp(-0.5 / 20), rel=1e-4)
-
-
-def test_a_tube_at_another_voltage_keeps_its_tail():
-    changed = TUBE.with_gain(0.5)
-    assert changed.gain == pytest.approx(10.0)
-    assert (changed.tail_fractions, changed.tail_decays_ns) == (FRACTIONS, DECAYS)

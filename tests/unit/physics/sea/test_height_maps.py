@@ -280,8 +280,6 @@ def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
         ),
         ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
         ({"origin": (np.nan, 0)}, "origin_x = nan must be finite"),
-        ({"values": "fathoms"}, "map_values = 'fathoms' must be heights or depths"),
-        ({"holes": "keep"}, "map_holes = 'keep' must be refuse or fill"),
     ],
 )
 def test_invalid_placements_are_rejected(tmp_path, options, message):

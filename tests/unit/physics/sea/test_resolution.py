@@ -50,21 +50,6 @@ def test_waves_and_cells_follow_the_beam_or_the_pixels():
     assert choose(lidar(), shortest_wave=0.48).cell_size == pytest.approx(0.04)
 
 
-def test_the_waves_do_not_depend_on_the_cells():
-    footprints = lidar(field_of_view=0.01, pixel=1e-4)
-    automatic = choose(footprints)
-    for cell in (0.01, 0.3):
-        other = choose(footprints, cell_size=cell)
-        assert (other.shortest_wave, other.beam_wave) == (automatic.shortest_wave, automatic.beam_wave)
-
-
-def test_waves_for_pixels_count_as_those_for_the_beam():
-    """Cells of merging follow the beam: for waves of 8 cm they would be 13 times finer than needed, and as noisy."""
-    assert choose(lidar(field_of_view=0.01, pixel=1e-5)).beam_wave == choose(lidar()).shortest_wave
-    for same in (choose(lidar()), choose(lidar(), shortest_wave=0.3), choose(lidar(5e5, 1e-4)), choose([])):
-        assert same.beam_wave == same.shortest_wave
-
-
 def test_patch_holds_beam_and_view_of_separate_instruments():
     laser, _ = lidar(aim=(0.0, 0.0))
     _, receiver = lidar(aim=(10.0, 4.0))

@@ -44,14 +44,6 @@ def test_absorption_is_pope_and_fry():
     assert water_absorption(532) == pytest.approx(0.04444, abs=1e-8)
 
 
-def test_absorption_has_its_published_minimum():
-    # 0.0044 1/m at 418 nm (abstract)
-    wavelengths = np.linspace(400, 700, 601)
-    values = water_absorption(wavelengths)
-    assert wavelengths[np.argmin(values)] == pytest.approx(418, abs=1)
-    assert values.min() == pytest.approx(0.0044, abs=5e-5)
-
-
 def test_scattering_is_zhang_hu_and_he():
     b = water_scattering(532, [20, 10, 10, 20], [35, 35, 7, 0])
     np.testing.assert_allclose(b, [0.001962, 0.002004, 0.001633, 0.001510], rtol=0, atol=6e-7)
