@@ -41,3 +41,11 @@ def test_sky_fraction_grows_with_the_zenith_angle():
 def test_background_power():
     """10 mW m^-2 sr^-1 nm^-1 on 1 mrad^2 and 0.025 m^2 through 1 nm: 0.25 nW."""
     assert background_power([0.01, 0.02], 0.025e-6, 1.0) == pytest.approx([2.5e-10, 5e-10], rel=1e-12, abs=0)
+
+
+def test_aerosols_scatter_forwards_by_the_published_fraction():
+    """Equations 20 to 26 of Gregg and Carder (1990) by hand: 0.791115 for an asymmetry of 0.65 at 60 degrees."""
+    sky = clear_sky_irradiance(60.0, aerosol_optical_depth=0.2, angstrom_exponent=1.3, ozone_cm=0.0, pressure_hpa=0.0)
+    # A single-scattering albedo of 0.993 leaves the share T^0.007 of the light to be scattered or not.
+    through = sky.direct_normal / 1.90
+    assert sky.diffuse == pytest.approx(0.791115 * 0.95 * (through**0.007 - through), rel=1e-5)

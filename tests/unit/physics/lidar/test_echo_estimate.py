@@ -90,6 +90,22 @@ def test_scattering_shifts_and_delays_by_its_moments():
     significance.assert_equal([[one[1]] for one in samples], [expected[1]], error=0.03, bias=0.01)
 
 
+def test_shifts_on_the_way_up_change_no_time():
+    """Without shifts on the way down, time is that of the beam; half of the mean square of the angles remains."""
+    rng = np.random.default_rng(3 + significance.seed_shift)
+    column = WaterColumn([0.0], [0.3], [0.25], [1e-4])
+    phase = PowerLawTable.from_function(lambda theta: henyey_greenstein(theta, 0.95))
+    system = LidarSystem(200.0, np.radians(60), 1.34, 1.34, energy=1.0, aperture_area=1.0)
+    model = EchoEstimate(system, column, [phase], FLAT, 8.0, 0.1)
+    bottom = model.water_and_bottom(np.zeros((2**14, 2)), 16, rng)[1]
+    x, time = bottom.angle_x.ravel(), bottom.time_ns.ravel()
+    bent = abs(x) > 1e-12
+    # On the slope of the line of sight of the lit point, 2 H sin(theta)/(c cos^2(theta)) a radian, or on none.
+    slope = np.polyfit(x[bent], (time - time.min())[bent], 1)[0]
+    steepest = 2e9 / C0 * 200.0 * np.sin(np.radians(60)) / np.cos(np.radians(60)) ** 2
+    assert 0.3 < slope / steepest < 0.75
+
+
 def test_tilted_light_meets_more_water_and_the_bottom_the_same():
     """Isotropic backscatter: 1/cos for each way; of a function of the angle, that between both directions."""
     water = WaterColumn(np.zeros(1), np.array([0.3]), np.array([0.2]), np.array([0.1]))

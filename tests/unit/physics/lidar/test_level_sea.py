@@ -49,17 +49,6 @@ def test_crossing_closes_over_all_scales():
         assert (theta, y) == (pytest.approx(refracted_path(rho, height, depth, N)[0], abs=1e-12), 0)
 
 
-def test_lengths_are_those_of_the_legs():
-    sine, depth = np.sin(np.radians(40)), np.array([-1.0, 1.0, 4.0, 9.0])
-    sea = LevelSea((1.33, 1.34, 1.36), (2.0, 5.0), (1.35, 1.36, 1.38))
-    optical, horizontal = sea.lengths(depth, sine)
-    legs = {(1.33, 1.35): [0, 1, 2, 2], (1.34, 1.36): [0, 0, 2, 3], (1.36, 1.38): [0, 0, 0, 4]}
-    angles = {one: snell(np.radians(40), one[0]) for one in legs}
-    np.testing.assert_allclose(optical, sum(one[1] * np.array(d) / np.cos(angles[one]) for one, d in legs.items()))
-    expected = sum(np.array(d) * np.tan(angles[one]) for one, d in legs.items())
-    np.testing.assert_allclose(sine * horizontal, expected, rtol=1e-12)
-
-
 def test_crossing_inverts_points_at_a_height():
     """Also straight below, far away, on the sea and in the air."""
     z = np.array([-9.0, -3.0, -1.0, -30.0, 0.0, 5.0, -4.0])

@@ -139,6 +139,14 @@ def test_snr_of_photons_and_of_saturated_samples():
     assert np.isnan(stuck.snr([1e-4], 1.0)[0])
 
 
+def test_every_record_has_its_own_background():
+    chain = replace(RECEIVERS["pmt"], digitiser=Digitiser(10, 1.0, -0.05, sampling_ghz=0.25))
+    mean = chain.expected(np.zeros((2, 3, 30)), 1.0, 1e-7 * np.arange(6).reshape(2, 3)).mean
+    assert mean.shape == (2, 3, 8)
+    np.testing.assert_allclose(np.diff(mean[..., 4].ravel()), mean[0, 1, 4] - mean[0, 0, 4])
+    assert np.all(chain.snr(np.zeros((2, 3, 30)), 1.0, 1e-7 * np.arange(6).reshape(2, 3)) == 0)
+
+
 def test_seeds_repeat_and_blocks_of_shots_differ(monkeypatch):
     monkeypatch.setattr(receiver_chain, "_BLOCK", 2**11)
     chain, light = RECEIVERS["apd"], power(scale=1e-7)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from rows import each_row
 from significance import largest_z
 
@@ -37,7 +36,6 @@ def assert_variance(samples, variance):
     assert abs(samples.var(ddof=1) / variance - 1) < largest_z(shots) * np.sqrt(2 / shots), samples.var() / variance
 
 
-@pytest.mark.slow
 def test_energy_of_an_echo():
     """Counts of the mean N have the variance N + (e N)^2; the background does not change."""
     shots, rms = 20_000, 0.05

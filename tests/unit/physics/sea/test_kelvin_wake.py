@@ -85,6 +85,18 @@ def test_waves_grow_from_amidships_to_the_stern():
     assert np.abs(heights[:, (x < 0) & (x >= -2)]).max() < 0.06 * np.abs(heights).max()
 
 
+def test_coarse_lines_show_no_waves_that_they_cannot_resolve():
+    fine = np.linspace(-30, 10, 161)
+    coarse = np.concatenate([[-160, -130, -100, -70, -50, -40], fine])
+    speed = 3.0  # waves of 5.8 m at most
+    uneven = kelvin_wake(coarse, fine, speed, 0.0, 8.0)
+    even = kelvin_wake(fine, fine, speed, 0.0, 8.0)
+    # The first fine line counts its coarse neighbour.
+    assert uneven[:, 7:] == pytest.approx(even[:, 1:], abs=1e-5 * np.abs(even).max())
+    assert np.all(uneven[:, :7] == 0)
+    assert np.abs(even[:, 0]).max() > 0.1 * np.abs(even).max()
+
+
 def test_short_waves_fade_and_slow_ships_leave_nothing():
     x = np.linspace(-20, -10, 401)
     y = np.linspace(-3, 3, 241)

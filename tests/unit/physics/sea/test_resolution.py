@@ -50,6 +50,35 @@ def test_waves_and_cells_follow_the_beam_or_the_pixels():
     assert choose(lidar(), shortest_wave=0.48).cell_size == pytest.approx(0.04)
 
 
+def test_large_patches_have_fewer_cells_in_a_wave():
+    """42 m from a mast of 15 m at grazing angles: 512 cells a side instead of 1280."""
+    mast = choose(lidar(15.0, 5e-3, 10e-3, off_nadir=math.radians(84.6)))
+    assert mast.refined_size / mast.cell_size == pytest.approx(512)
+    assert 4 * mast.cell_size < mast.shortest_wave == pytest.approx(2.5e-3 * 15 / math.cos(math.radians(84.6)))
+
+
+def test_the_waves_do_not_depend_on_the_cells():
+    footprints = lidar(field_of_view=0.01, pixel=1e-4)
+    automatic = choose(footprints)
+    for cell in (0.01, 0.3):
+        other = choose(footprints, cell_size=cell)
+        assert (other.shortest_wave, other.beam_wave) == (automatic.shortest_wave, automatic.beam_wave)
+
+
+def test_waves_for_pixels_count_as_those_for_the_beam():
+    """Cells of merging follow the beam: for waves of 8 cm they would be 13 times finer than needed, and as noisy."""
+    assert choose(lidar(field_of_view=0.01, pixel=1e-5)).beam_wave == choose(lidar()).shortest_wave
+    for same in (choose(lidar()), choose(lidar(), shortest_wave=0.3), choose(lidar(5e5, 1e-4)), choose([])):
+        assert same.beam_wave == same.shortest_wave
+
+
+def test_narrow_beams_have_a_patch_of_many_fine_cells_and_wide_views_fewer():
+    """0.1 mrad in 200 mrad: the patch gives up the view, not the cells that resolve the beam."""
+    narrow = choose(lidar(divergence=1e-4, field_of_view=0.2))
+    assert narrow.cell_size == pytest.approx(0.5e-4 * 200 / math.cos(TILT))
+    assert narrow.refined_size == pytest.approx(1024 * narrow.cell_size)
+
+
 def test_patch_holds_beam_and_view_of_separate_instruments():
     laser, _ = lidar(aim=(0.0, 0.0))
     _, receiver = lidar(aim=(10.0, 4.0))
