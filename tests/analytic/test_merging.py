@@ -87,12 +87,6 @@ def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_sea
         assert seen < size < 1.6 * seen
 
 
-def test_track_length_is_the_slanted_way_to_the_bottom(wavy_sea):
-    lidar, region = wavy_sea
-    slanted = 8.0 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
-    assert region.track_length(lidar) == pytest.approx(slanted, rel=0.05)
-
-
 @pytest.mark.slow
 def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsewhere(lidar_scene):
     """Waves of 10 m/s reach 1.5 m below the mean sea level somewhere on the sea, a bottom is at 1.25 m."""

@@ -153,14 +153,6 @@ def test_values_in_a_pipe_are_not_waited_for(tmp_path):
     assert len(refused) == 1
 
 
-def test_links_within_a_file_are_its_own(tmp_path):
-    with h5py.File(tmp_path / "a.nc", "w") as file:
-        file["a"] = np.zeros(3)
-        file["soft"] = h5py.SoftLink("/a")
-        file.create_group("b")["up"] = file["/"]
-    check_hdf5(tmp_path / "a.nc")
-
-
 @each_row("name", ["", ".", "..", "a/b", "../a", "/a", "a\\b", "a\nb", "a\0", "\x1b[2J", "x" * 201, 3, None])
 def test_names_of_more_than_a_file(name):
     assert not is_file_name(name)

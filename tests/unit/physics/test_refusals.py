@@ -47,10 +47,7 @@ REFUSED = [
     (lambda: Pulse.sampled([0, 1], [0, 0]), "power must be greater than 0 somewhere"),
     (lambda: Pulse.sampled([0], [1]), r"times_ns of shape \(1,\) must be a list of at least 2"),
     (lambda: waveform(1.0, 1.0, (0, np.ones(1))), "time axis"),
-    (
-        lambda: TimeAxis.covering(1396.2, 1552.0, 1e-5),
-        r"bin_width_ns = 1e-05 divides the time axis .* at least 0\.00016, for",
-    ),
+    (lambda: TimeAxis.covering(1396.2, 1552.0, 1e-5), r"bin_width_ns = 1e-05 .* at least 0\.00016"),
     (lambda: ReceiverChain(DIODE, digitiser=Digitiser(8, 1.0)), "digitiser needs an amplifier"),
     (lambda: ReceiverChain(DIODE, logarithm=LogAmplifier(0.2, 1e-3)), "logarithm needs an amplifier"),
     (lambda: ReceiverChain(photons(), Amplifier(1.0)), "SinglePhotonDetector, which outputs counts"),
@@ -61,17 +58,11 @@ REFUSED = [
     (lambda: photons(afterpulse_probability=0.1), "afterpulse_decay_ns is required"),
     (
         lambda: photons(afterpulse_probability=0.1, afterpulse_decay_ns=9.0, paralyzable=True),
-        "afterpulse_probability = 0.1 must be 0 for a paralyzable detector",
+        "must be 0 for a paralyzable",
     ),
     (lambda: photons(tail_fractions=(0.1,)), r"tail_decays_ns = \[\] must have as many numbers as tail_fractions, 1"),
-    (
-        lambda: photons(tail_fractions=(0.7, 0.6), tail_decays_ns=(9.0, 8.0)),
-        "tail_fractions .* a sum of at most 1",
-    ),
-    (
-        lambda: photons(**TAIL, tail_delays_ns=(1.0, 2.0)),
-        "tail_delays_ns = .* must have as many numbers as tail_fractions",
-    ),
+    (lambda: photons(tail_fractions=(0.7, 0.6), tail_decays_ns=(9.0, 8.0)), "tail_fractions .* a sum of at most 1"),
+    (lambda: photons(**TAIL, tail_delays_ns=(1.0, 2.0)), "tail_delays_ns = .* must have as many"),
     (lambda: Digitiser(8, 1.0, block_after=5), "block_after = 5 needs block_threshold_v"),
     (lambda: Amplifier(1.0, response="boxcar"), "response = 'boxcar'"),
     (lambda: moments(-PULSE, PULSE[None]), "power = -1 must not be negative"),
@@ -81,10 +72,7 @@ REFUSED = [
     (lambda: wake(x=[1.0]), r"x of shape \(1,\) must be a list of at least 2 numbers"),
     (lambda: wake(y=[[0, 1]]), r"y of shape \(1, 2\) must be a list of at least 2 numbers"),
     (lambda: wake(y=[0, 2, 2]), "y must increase strictly, but 2 is followed by 2"),
-    (
-        lambda: wake(x=[0, 0.05], y=[0, 0.05], ship_x=1e6),
-        r"wake_x, wake_y: the wake spreads over 3.54e\+05 m before this sea, too far for waves of 0.1 m",
-    ),
+    (lambda: wake(x=[0, 0.05], y=[0, 0.05], ship_x=1e6), r"wake_x, wake_y: .* over 3.54e\+05 m .* too far"),
     *((lambda cells=cells: wave_numbers(10, cells), f"cells = {cells} must be") for cells in (0, 15)),
     (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
     (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
@@ -93,7 +81,7 @@ REFUSED = [
     (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
     (
         lambda: PowerLawTable.from_function(np.ones_like).with_chi(0.001),
-        "chi_p = 0.001 makes the phase function negative: .* than 0.00",
+        "chi_p = 0.001 makes .* negative: .* than 0.00",
     ),
     (lambda: PowerLawTable.from_values([1.0, 0.0, 1.0]), "greater than 0 at every node"),
     (lambda: PowerLawTable.from_values([1.0, np.nan]), "nan"),

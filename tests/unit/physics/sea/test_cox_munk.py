@@ -72,21 +72,6 @@ def test_series_has_the_moments_of_its_terms():
         assert series.along(across, up) == pytest.approx(wanted, abs=1e-9)
 
 
-def test_waves_and_ripples_together_have_the_series():
-    """The ripples' density, averaged over Gaussian slopes of waves, is the whole series."""
-    total, part = cox_munk(6.0), (0.6 * cox_munk(6.0)[0], 0.7 * cox_munk(6.0)[1])
-    series = GramCharlierSeries.of_clean_sea(6.0)
-    ripples = series.of_part(total, part)
-    x, y, gaussian = normal_grid(reach=7.0, count=281)
-    sigma = np.sqrt(np.array([total, part, np.subtract(total, part)]))
-    for up, across in ((0.0, 0.0), (0.3, 0.1), (-0.25, 0.2)):
-        u, c = ((slope - sigma[2, i] * node) / sigma[1, i] for slope, node, i in ((up, y, 0), (across, x, 1)))
-        density = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[1].prod()) * ripples.ratio(c, u)
-        u, c = up / sigma[0, 0], across / sigma[0, 1]
-        wanted = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[0].prod()) * series.ratio(c, u)
-        assert np.sum(gaussian * density) == pytest.approx(wanted, rel=1e-6)
-
-
 def test_series_of_strong_wind_or_a_small_part_is_refused():
     with pytest.raises(UserError, match="slope_distribution 'gram_charlier' = 15 must lie"):
         GramCharlierSeries.of_clean_sea(15)

@@ -24,12 +24,6 @@ def test_independent_slopes_enhance_nothing(displacement):
     np.testing.assert_allclose(found, 1, atol=2e-3)
 
 
-def test_far_ways_are_independent():
-    structure = gaussian_structure(0.02, 0.1)
-    assert structure.enhancement(0.5, 4.0) == pytest.approx(1, abs=2e-3)
-    assert structure.enhancement(0.5, 0.0) > 1.3
-
-
 def test_structures_of_a_sea_have_its_variances():
     """At large distances twice the variance; without ripples of their own, ripples differ at any distance."""
     upwind, crosswind = cox_munk(6.0)

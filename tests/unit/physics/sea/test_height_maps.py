@@ -247,12 +247,6 @@ def test_holes_have_the_value_of_the_nearest_cell(tmp_path, caplog):
     assert "2 of 12 heights are missing, filled from the nearest cells" in caplog.text
 
 
-def test_holes_of_oblong_cells_are_filled_along_the_short_side(tmp_path):
-    rows = np.array([[1.0, 2, 3], [4, -9999, 6], [7, 8, 9]])
-    path = write_ascii_grid(tmp_path / "map.asc", rows, ncols=3, cellsize=None, dx=1, dy=3)
-    assert read_height_map(path, holes="fill").heights[1, 1] in (4, 6)
-
-
 @each_row(
     ("changes", "message"),
     [
