@@ -48,7 +48,7 @@ def test_solids_without_effect_change_no_light(lidar_scene, passes, integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.long)])
+@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
 def test_panes_that_reflect_nothing_change_no_light(lidar_scene, passes, integrator):
     """Paths cross them one by one, since their index is not quite that of the water."""
     bsdf = {"type": "thindielectric", "int_ior": 1.34001, "ext_ior": 1.34}
