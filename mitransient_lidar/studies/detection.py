@@ -288,7 +288,7 @@ def _in_images(
 ) -> xr.Dataset:
     """Return the result of gates of a camera."""
     pfa, pd, numbers = attributes["pfa"], attributes["pd"], sorted({*_FRAMES, frames})
-    experiments = [one.tuned(frames, pfa, pd) for one in experiments]
+    experiments = [one.tuned(frames, pfa) for one in experiments]
     trial, dims = experiments[0], stack["gate_energy"].dims
     if not trial.products.products.any():
         raise UserError("target: it changes no light in the gates; check its place, and the start of the gates")

@@ -18,13 +18,13 @@ import numpy as np
 
 from mitransient_lidar.analysis.detection.statistics import Statistic
 from mitransient_lidar.analysis.detection.trials import MOST_GROUPS, Variables, crossing, interval, with_limits
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.receiver.camera import Camera, Noise
 from mitransient_lidar.physics.receiver.electronics import Expected
 
 _TOLERANCE, _MOST_STEPS = 1e-4, 200  # of weights in noise that pixels share; what they detect is exact for any weights
 _ROUNDING = 1e-9
-_TUNINGS = 3  # steps in which the shares of the covariances are found
+_SHARES = 0.5, 0.25, 0.1, 0.02, 0.75  # of the covariance with the target that are tried
 
 
 class GateImages(NamedTuple):
@@ -35,6 +35,7 @@ class GateImages(NamedTuple):
     vectors: FloatArray
     filters: FloatArray  #: D^-1 times the vectors.
     noises: list[Noise]  #: Without and with the target, each of shape (*pixels, 1).
+    thirds: FloatArray  #: Third cumulants of the filtered image [1], without and with the target, shape (2,).
     expected: Expected  #: Moments of the mean light without and with the target, shape (*pixels, 2).
 
 
@@ -43,11 +44,13 @@ class FilterProducts:
     """Scalar products of the vectors of renders.
 
     `products` has the shape (3, gate, vector, vector): x D^-1 y, and x D^-1 C D^-1 y with the covariance C without and
-    with the target. Renders are those of different `seas`, whose differences are clutter, or of one.
+    with the target. `thirds`, of shape (2, gate), are the third cumulants without and with the target behind the mean
+    filter of all renders. Renders are those of different `seas`, whose differences are clutter, or of one.
     """
 
     seas: bool
     products: FloatArray
+    thirds: FloatArray
 
     @property
     def renders(self) -> int:
@@ -56,7 +59,13 @@ class FilterProducts:
 
     def of(self, gate: int) -> FilterProducts:
         """Return the products of a gate alone."""
-        return replace(self, products=self.products[:, [gate]])
+        return replace(self, products=self.products[:, [gate]], thirds=self.thirds[:, [gate]])
+
+    def skewness(self) -> FloatArray:
+        """Return the skewness of one filtered frame by the noise alone, without and with the target, shape (2,)."""
+        template = _template(self.renders, range(self.renders))
+        variance = template @ self.products[1:].sum(axis=1) @ template
+        return _ratio(self.thirds.sum(axis=1), variance**1.5)
 
     def coefficients(self, frames: int, renders: Sequence[int]) -> FloatArray:
         """Return the sum of filters that is best behind the clutter of some renders, and scaled to their difference.
@@ -64,10 +73,8 @@ class FilterProducts:
         It is 0 if the target changes nothing.
         """
         product, first = self.products[0].sum(axis=0), 2 * self.renders
-        halves = 2 * np.array(renders)[:, None] + [0, 1]
-        template = np.zeros(2 * first)
-        template[halves] = 0.5 / len(renders)
-        found = template
+        halves = _halves(renders)
+        template = found = _template(self.renders, renders)
         if self.seas:
             clutter = np.zeros((2 * first, len(renders)))
             clutter[first + halves, np.arange(len(renders))[:, None]] = 0.5
@@ -94,15 +101,26 @@ class FilterProducts:
         others = (answers[:, 1].sum(axis=1) - level) / (len(renders) - 1)
         null = level - others if self.seas else np.zeros_like(rise)
         target = null + rise
-        variances = [np.einsum("ni,ij,nj->n", weights, noise, weights).mean() / frames for noise in noises]
-        if self.seas:
-            variances = [
-                own + max(np.cov(one.T)[0, 1], 0.0) for own, one in zip(variances, (null, target), strict=True)
-            ]
-        means = float(null.mean()), float(target.mean())
+        own = np.array([np.einsum("ni,ij,nj->n", weights, noise, weights).mean() / frames for noise in noises])
+        clutter = [max(np.cov(one.T)[0, 1], 0.0) if self.seas else 0.0 for one in (null, target)]
+        variances = own + clutter
+        skewness = self.skewness() / math.sqrt(frames) * (own / variances) ** 1.5
+        moments = zip((null.mean(), target.mean()), np.sqrt(variances), strict=True)
         return Statistic(
-            weights, others.mean(axis=1), means[0], math.sqrt(variances[0]), means[1], math.sqrt(variances[1])
+            weights, others.mean(axis=1), *(float(one) for pair in moments for one in pair), *map(float, skewness)
         )
+
+
+def _halves(renders: Sequence[int]) -> IntArray:
+    """Return the places of the halves of renders among the vectors of the difference, shape (renders, 2)."""
+    return 2 * np.array(renders)[:, None] + [0, 1]
+
+
+def _template(count: int, renders: Sequence[int]) -> FloatArray:
+    """Return the sum of vectors that is the mean difference of some of `count` renders."""
+    found = np.zeros(4 * count)
+    found[_halves(renders)] = 0.5 / len(renders)
+    return found
 
 
 @dataclass(frozen=True)
@@ -134,24 +152,19 @@ class ImageTrial:
     sky: float
     target_share: float = 0.5
 
-    def tuned(self, frames: int, pfa: float, pd: float) -> ImageTrial:
-        """Return the trial whose filters are the best ones for two probabilities, of false alarm and of detection.
+    def tuned(self, frames: int, pfa: float) -> ImageTrial:
+        """Return the trial whose filters are the best ones for a probability of false alarm.
 
         Notes
         -----
-        Of all weighted sums, with noise that differs with the target: each covariance counts by the quantile of its
-        error over the deviation of the sum (T. W. Anderson and R. R. Bahadur, Ann. Math. Stat. 33, 420 (1962),
-        doi:10.1214/aoms/1177704568), which is found in a few steps.
+        With noise that differs with the target, the best weighted sums are those for a sum of both covariances (T. W.
+        Anderson and R. R. Bahadur, Ann. Math. Stat. 33, 420 (1962), doi:10.1214/aoms/1177704568); the shares are the
+        best of a few.
         """
-        from scipy.special import ndtri
-
-        trial = self
-        for _ in range(_TUNINGS):
-            if (found := trial.products.statistic(frames)) is None:
-                break
-            alarm, miss = -ndtri(pfa) / found.null_sd, max(ndtri(pd), 0.0) / found.target_sd
-            trial = replace(trial, target_share=float(miss / (alarm + miss)))
-        return trial
+        trials = [replace(self, target_share=share) for share in _SHARES]
+        found = [one.products.statistic(frames) for one in trials]
+        margins = [-math.inf if one is None else float(one.quantile(pfa)) for one in found]
+        return trials[int(np.argmax(margins))]
 
     def widened(self, count: int, apart: int) -> ImageTrial:
         """Return the trial with gates that are sums of `count` gates, each `apart` steps after the former."""
@@ -172,7 +185,10 @@ class ImageTrial:
             # Where pixels do not share noise, saturation reduces it.
             own = noise.own if noise.shared.any() else expected.variance
             noises = [Noise(noise.shared[..., [which]], own[..., [which]]) for which in (0, 1)]
-            yield GateImages(vectors, self._filters(vectors, noises), noises, expected)
+            filters = self._filters(vectors, noises)
+            weights = filters @ _template(self.light.shape[1], range(self.light.shape[1]))
+            thirds = self.camera.third_cumulant(np.stack([weights, weights], axis=-1), mean, *given)
+            yield GateImages(vectors, filters, noises, thirds, expected)
 
     def _filters(self, vectors: FloatArray, noises: Sequence[Noise]) -> FloatArray:
         """Return D^-1 times vectors, D being the covariance of both noises by their shares, by conjugate gradients."""
@@ -205,12 +221,13 @@ class ImageTrial:
     @cached_property
     def products(self) -> FilterProducts:
         """Scalar products of each gate."""
-        found = []
+        found, thirds = [], []
         for one in self.images():
             size = one.vectors.shape[-1]
+            thirds.append(one.thirds)
             right = [one.vectors, *(self._correlated(noise, one.filters) for noise in one.noises)]
             found.append([values.reshape(-1, size).T @ one.filters.reshape(-1, size) for values in right])
-        return FilterProducts(self.seas, np.moveaxis(np.array(found), 0, 1))
+        return FilterProducts(self.seas, np.moveaxis(np.array(found), 0, 1), np.transpose(thirds))
 
     def maps(self, frames: int) -> dict[str, FloatArray]:
         """Return what the camera sees in each pixel and gate, shape (*pixels, gate), of one frame.

@@ -13,6 +13,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
+_SYMMETRIC = 1e-6  # least skewness that counts
+
 
 class ShotMoments(NamedTuple):
     """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of the samples of a shot."""
@@ -84,7 +86,9 @@ class Statistic(NamedTuple):
     """A weighted sum of samples, and its distribution without and with the target.
 
     Weights of the samples, shape (cases, samples), offsets that are subtracted from their sums, shape (cases,), and
-    means and standard deviations over shots and cases; the weighted sum is assumed normally distributed.
+    means, standard deviations and skewnesses over shots and cases. The weighted sum has a Pearson distribution of type
+    III with these moments, the normal one without skewness, by the cube root of E. B. Wilson and M. M. Hilferty, Proc.
+    Natl. Acad. Sci. 17, 684 (1931), doi:10.1073/pnas.17.12.684.
     """
 
     weights: FloatArray
@@ -93,6 +97,8 @@ class Statistic(NamedTuple):
     null_sd: float
     target_mean: float
     target_sd: float
+    null_skewness: float = 0.0
+    target_skewness: float = 0.0
 
     @property
     def deflection(self) -> float:
@@ -103,11 +109,11 @@ class Statistic(NamedTuple):
         """Return the threshold for a probability of false alarm, above 0 and below 1."""
         from scipy.special import ndtri
 
-        return np.asarray(self.null_mean - self.null_sd * ndtri(false_alarm))
+        return np.asarray(self.null_mean + self.null_sd * _skewed(-ndtri(false_alarm), self.null_skewness))
 
     def quantile(self, false_alarm: npt.ArrayLike) -> FloatArray:
-        """Return the mean with a target above the threshold, in standard deviations with it."""
-        return np.asarray((self.target_mean - self.threshold(false_alarm)) / self.target_sd)
+        """Return the quantile of the normal distribution that has the probability of detection."""
+        return -_normal((self.threshold(false_alarm) - self.target_mean) / self.target_sd, self.target_skewness)
 
     def detection(self, false_alarm: npt.ArrayLike) -> FloatArray:
         """Return the probability of detection at a probability of false alarm, above 0 and below 1."""
@@ -120,6 +126,22 @@ class Statistic(NamedTuple):
         from scipy.special import ndtr
 
         return float(ndtr((self.target_mean - self.null_mean) / np.hypot(self.null_sd, self.target_sd)))
+
+
+def _skewed(quantile: npt.ArrayLike, skewness: float) -> FloatArray:
+    """Return the value, of mean 0 and deviation 1, of a skewed distribution at a quantile of the normal one."""
+    if abs(skewness) < _SYMMETRIC:
+        return np.asarray(quantile, np.float64)
+    share = skewness / 6
+    return np.asarray(((share * (np.asarray(quantile) - share) + 1) ** 3 - 1) / (3 * share))
+
+
+def _normal(value: npt.ArrayLike, skewness: float) -> FloatArray:
+    """Return the quantile of the normal distribution at a value of a skewed one; the inverse of `_skewed`."""
+    if abs(skewness) < _SYMMETRIC:
+        return np.asarray(value, np.float64)
+    share = skewness / 6
+    return np.asarray((np.cbrt(3 * share * np.asarray(value) + 1) - 1) / share + share)
 
 
 @dataclass(frozen=True)

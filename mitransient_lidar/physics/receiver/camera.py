@@ -219,6 +219,24 @@ class Camera(Plan):
         scale = self.electrons_per_dn**2
         return Noise(shared / scale, variance / scale + (0 if self.kind == "counting" else 1 / 12))
 
+    def third_cumulant(
+        self, weights: FloatArray, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1
+    ) -> FloatArray:
+        """Return the third cumulant of the sum of the pixels times weights [1/DN] in each gate, without saturation.
+
+        The weights have the shape of `energy`; the other parameters are those of `events`.
+        """
+        events = self.events(energy, open_ns, background, pulses)
+        scaled, pixels = weights / self.electrons_per_dn, tuple(range(events.ndim - 1))
+        if self.intensifier_mtf == 1:
+            return np.asarray(np.sum(self._charge(events, pulses, _ALIKE)[2] * scaled**3, axis=pixels))
+        # The electrons of an event, whose number is gamma-distributed, meet the weights of the pixels at random.
+        once, twice, thrice = (self.spread(scaled**power) for power in (1, 2, 3))
+        noise = self.excess_noise - 1 / self.gain
+        triples = self.gain**3 * noise * (2 * noise - 1) * once**3 + 3 * self.gain**2 * noise * once * twice
+        found = events * (triples + self.gain * thrice) + self._dark(_ALIKE) * scaled**3
+        return np.asarray(np.sum(found, axis=pixels))
+
     def spread(self, values: Values, power: int = 1) -> FloatArray:
         """Return values, shape (row, column, ...), behind the intensifier: a symmetric matrix B of this power."""
         return _blurred(np.asarray(values, np.float64), self.intensifier_mtf, power)

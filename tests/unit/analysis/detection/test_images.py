@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
-from scipy.stats import norm
+from scipy.stats import norm, skew
 from significance import largest_z
 
 from mitransient_lidar.analysis.detection.images import ImageTrial, detected, single_gates
@@ -105,23 +105,31 @@ def test_deflection_in_closed_form_grows_with_the_root_of_the_frames():
     assert found["detection"][1][0] == pytest.approx(float(ndtr(quantile(own, 1))))
 
 
-def test_filters_for_two_probabilities_detect_most():
-    """A target of which some parts are far brighter than the water: no other share of the two covariances is better."""
-    own = trial(replace(CAMERAS["direct"][0], read_noise=1.0, offset_dn=9.0), 2.0)
+def uneven(camera, level):
+    """Return images of rare events and a target of which some parts are far brighter than the water."""
+    own = trial(camera, level)
     own.light[0] = own.light[1] * np.geomspace(1, 300, SIZE)[:, None, None]
-    pfa, pd = 1e-3, 0.9
+    return own
 
-    def root_of_frames(trial):
-        """Return the root of the number of frames that a filter needs."""
-        one = trial.products.statistic(1)
-        return (norm.isf(pfa) * one.null_sd + norm.ppf(pd) * one.target_sd) / (one.target_mean - one.null_mean)
 
-    shares = np.linspace(0, 1, 21)
-    needed = [root_of_frames(replace(own, target_share=share)) for share in shares]
-    best = own.tuned(1, pfa, pd)
-    assert root_of_frames(best) == pytest.approx(min(needed), rel=2e-3)
-    assert abs(best.target_share - shares[np.argmin(needed)]) < 0.06
-    assert min(needed) < 0.98 * needed[10]
+def test_filters_of_the_best_share_detect_most():
+    own = uneven(CAMERAS["counting"][0], 0.003)
+    best = quantile(own.tuned(1, 1e-3), 1, 1e-3)
+    others = [quantile(replace(own, target_share=share), 1, 1e-3) for share in np.linspace(0.02, 1, 15)]
+    assert best > max(others) - 0.05
+    assert best > min(others) + 0.1
+
+
+@pytest.mark.parametrize("kind", ["intensified", "counting"])
+def test_rare_events_skew_the_sum_of_the_pixels(kind):
+    """The skewness of a sample has an error of sqrt(6/n) where it is small, and a larger one elsewhere."""
+    own, count = uneven(CAMERAS[kind][0], 5e-4), 800
+    expected, weights = own.products.statistic(1), own.maps(1)["filter_weight"]
+    limit = 1.5 * largest_z(count) * np.sqrt(6 / count)
+    assert max(expected.null_skewness, expected.target_skewness) > limit
+    for light, stated in ((own.light[1], expected.null_skewness), (own.light[0], expected.target_skewness)):
+        drawn = own.camera.sample(light[0, 0], 5.0, count, 3, 0.0, PULSES).signal
+        assert abs(skew(np.tensordot(drawn, weights, 3)) - stated) < limit
 
 
 def test_a_shadow_alone_is_detected():
