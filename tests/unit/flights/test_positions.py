@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from rows import each_row
 from scipy.spatial.transform import Rotation
-from significance import largest_z
+from significance import largest_chi2, largest_z
 from synthetic_shots import DEPTH, THETA, N, result
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
@@ -231,6 +231,38 @@ def mixed():
     return made
 
 
+def test_waveforms_without_an_echo_keep_a_point_where_they_look():
+    given = poses(1)
+    sea = SurfaceModel(level=0.4, height_deviation=0.2)
+    points = located(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
+    assert points["kind"].values.tolist() == [41, 43, 40, 40, 41, 45]
+    assert points["pixel"].values.tolist() == [0, 0, 0, 1, 2, 3]
+    assert points["return_number"].values.tolist() == [1, 2, 3, 1, 1, 1]
+    assert points["number_of_returns"].values.tolist() == [3, 3, 3, 1, 1, 1]
+    np.testing.assert_array_equal(points["intensity"].values, [3, 5, 6, 6, 3, np.nan])
+    np.testing.assert_array_equal(points["depth"].values, [0, 5, 8, 8, 0, np.nan])
+    assert points["intensity"].attrs["units"] == "W"
+    ray = sights(given)[0, 3]
+    silent = found(points, PointClass.NO_ECHO)[0]
+    np.testing.assert_allclose(silent, given["origin"][0] + (0.4 - given["origin"][0, 2]) / ray[2] * ray, atol=1e-9)
+    # Known but for the waves: a height that is off by its deviation moves the point along the line of sight.
+    last = points.isel(point=-1)
+    horizontal = 0.2 * math.hypot(ray[0], ray[1]) / -ray[2]
+    np.testing.assert_allclose(
+        [last["vertical_uncertainty"], last["horizontal_uncertainty"]], [0.2, horizontal], rtol=1e-12
+    )
+
+
+def test_one_echo_of_many_pixels_in_rows_and_columns_is_where_it_is_as_one_of_pixels():
+    given, values = poses(3), np.full((3, 4), 6.0)
+    made = echoes(given["origin"][:, 2:] / -sights(given)[..., 2], values)
+    expected = located(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
+    grid = made.assign_coords(row=("pixel", [0, 0, 1, 1]), column=("pixel", [0, 1, 0, 1]))
+    grid = grid.set_index(pixel=("row", "column")).unstack("pixel")
+    image = located(grid, **given, angle_x=ANGLE_X.reshape(2, 2), angle_y=ANGLE_Y.reshape(2, 2), **INDICES)
+    xr.testing.assert_identical(image, expected)
+
+
 def test_points_of_measured_waveforms_are_the_true_ones_within_their_errors():
     made = extract(result().assign_attrs(surface_slope_variance=0.0))
     given = {
@@ -247,6 +279,19 @@ def test_points_of_measured_waveforms_are_the_true_ones_within_their_errors():
         error = np.abs(own["z"].values - height)
         assert np.all(error < 4 * own["vertical_uncertainty"].values), error
         assert np.all(own["vertical_uncertainty"].values < 0.2)
+
+
+def test_the_level_of_the_sea_is_known_within_its_error():
+    errors, levels = np.random.default_rng(7).uniform(0.02, 0.2, 400), []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        z = 0.35 + 0.1 * rng.normal(size=400) + errors * rng.normal(size=400)
+        spots = np.column_stack([rng.uniform(0, 100, (400, 2)), z])
+        levels.append(SurfaceModel.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
+    z_values = np.array([(one.level - 0.35) / one.level_error for one in levels])
+    assert abs(z_values.mean()) < largest_z(10**6) / math.sqrt(60)
+    assert (z_values**2).sum() < largest_chi2(60)
+    assert np.mean([one.height_deviation for one in levels]) == pytest.approx(0.1, rel=0.05)
 
 
 def linear_waves(seed, spacing, error):
@@ -305,6 +350,15 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
     assert wrong[1] < 0.6 * wrong[0], wrong
 
 
+def test_planes_forget_waves_of_another_time():
+    spots, _, slope = linear_waves(8, 1.0, 0.01)
+    sea = SurfaceModel.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
+    later = sea.at(spots[:50, :2], np.full(50, 10.0))
+    np.testing.assert_allclose(later.height, sea.level)
+    np.testing.assert_allclose(later.slope, 0)
+    np.testing.assert_allclose(later.slope_error, slope.std())
+
+
 def test_the_sea_is_fitted_to_surface_points():
     given, waves = poses(200), 0.1 * np.random.default_rng(9).normal(size=(200, 1))
     ray = sights(given)
@@ -341,3 +395,20 @@ def test_wrong_input_is_refused(changes, message):
     options = {**poses(1), "angle_x": ANGLE_X, "angle_y": ANGLE_Y, **INDICES}
     with pytest.raises(UserError, match=message):
         located(mixed(), **{**options, **changes})
+
+
+@each_row(
+    ("change", "message"),
+    [
+        (lambda made: made.drop_vars("surface_time_ns_method_error"), "lack surface_time_ns_method_error"),
+        (lambda made: made.expand_dims(estimator=["peak", "gaussian"]), "several estimators"),
+        (lambda made: made.isel(shot=0), "they need shot and pixel"),
+        (
+            lambda made: made.assign(depth_m=made["depth_m"].assign_attrs(long_name="depth below the mean sea level")),
+            "from the mean sea level",
+        ),
+    ],
+)
+def test_other_echoes_are_refused(change, message):
+    with pytest.raises(UserError, match=message):
+        located(change(mixed()), **poses(1), angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)

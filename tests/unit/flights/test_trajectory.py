@@ -11,6 +11,9 @@ from mitransient_lidar.flights.poses.trajectory import Trajectory
 LINES = {"kind": "lines", "start": [10, 20], "heading_deg": 30, "speed": 50, "height": 200, "length": 500}
 
 
+MAST = {"kind": "mast", "position": [1, 2, 15], "heading_deg": 120, "duration_s": 30}
+
+
 def _trajectory(times, yaw=None, **others):
     zeros = np.zeros(len(times))
     return Trajectory(times, np.zeros((len(times), 3)), zeros, zeros, zeros if yaw is None else yaw, **others)
@@ -61,10 +64,27 @@ def test_splines_follow_a_smooth_motion(interval, of_position, of_angles):
     assert errors["linear"][0] > 0.9 * (60 * interval) ** 2 / (8 * 500)
 
 
+def test_splines_end_where_records_are_far_apart():
+    """Waypoints, and a gap between two flight lines: straight lines, which the records beside do not feel."""
+    time = np.array([0, 10, 20, 20.5, 21, 21.5, 22, 40, 40.5, 41, 41.5])
+    x = np.array([0, 100, 0, 10, 20, 30, 40, 900, 890, 880, 870])
+    zeros = np.zeros(time.size)
+    records = time, np.column_stack([x, zeros, zeros]), zeros, zeros, zeros
+    times = np.array([3, 15, 20.25, 21.9, 30, 40.1, 41.2])
+    linear, cubic = (Trajectory(*records, interpolation=kind).at(times) for kind in ("linear", "cubic"))
+    np.testing.assert_allclose(cubic.position, linear.position, atol=1e-9)
+    np.testing.assert_allclose(cubic.position[:, 0], [30, 50, 5, 38, 40 + 860 * 8 / 18, 898, 876], atol=1e-9)
+
+
 def test_headings_pass_north_the_short_way():
     yaw = _trajectory([0, 1, 2, 3], [350, 10, -10, 710]).at([0, 0.25, 0.5, 0.75, 1.75, 2.5]).yaw_deg
     # 350 to 10 is 20 degrees to the right; 10 to -10 is 20 to the left; -10 and 710 are the same.
     np.testing.assert_allclose((yaw + 180) % 360 - 180, [-10, -5, 0, 5, -5, -10], atol=1e-12)
+
+
+def test_rolls_pass_the_back_the_short_way():
+    trajectory = Trajectory([0, 1], np.zeros((2, 3)), [170, -170], [0, 0], [0, 0])
+    np.testing.assert_allclose(trajectory.at([0, 0.25, 0.75, 1]).roll_deg, [170, 175, -175, -170])
 
 
 def test_parallel_lines_alternate():
@@ -86,6 +106,16 @@ def test_parallel_lines_alternate():
 
 def _without(given, name, **others):
     return {key: value for key, value in given.items() if key != name} | others
+
+
+def test_pulses_begin_with_each_line():
+    trajectory = platform_of({**LINES, "count": 2, "spacing": 40, "turn_s": 0.35}).trajectory()
+    times = trajectory.pulse_times(10)
+    # 10 s at 10 Hz, both ends included: 0.1 s does not divide the turn.
+    assert times.size == 202
+    np.testing.assert_allclose(times[:101], np.arange(101) / 10)
+    np.testing.assert_allclose(times[101:], 10.35 + np.arange(101) / 10)
+    assert (trajectory.at(times).line == np.repeat([0, 1], 101)).all()
 
 
 def test_noise_of_attitudes_is_stationary_with_its_correlation():
@@ -129,6 +159,13 @@ def test_invalid_records(times, yaw, message):
         _trajectory(times, yaw)
 
 
+@each_row("time", [-0.1, 1.5, 4.1])
+def test_times_on_no_line_are_refused(time):
+    trajectory = _trajectory(np.arange(5), lines=[(0, 1), (2, 4)])
+    with pytest.raises(UserError, match=rf"time = {time:g} s \(number 2\) is on no flight line: .* 0 to 1 s, 2 to 4 s"):
+        trajectory.at([0.5, time])
+
+
 @each_row(
     ("given", "message"),
     [
@@ -144,3 +181,8 @@ def test_invalid_records(times, yaw, message):
 def test_invalid_platforms(given, message):
     with pytest.raises(UserError, match=message):
         platform_of(given).trajectory()
+
+
+def test_too_many_pulses_are_refused():
+    with pytest.raises(UserError, match="pulse_rate_hz = 1e\\+09 gives 1e\\+10 pulses: at most 1e\\+08"):
+        platform_of(LINES).trajectory().pulse_times(1e9)

@@ -54,6 +54,10 @@ def test_one_number_changes(name, text):
     assert value_of(changed, name) == 8.1
 
 
+def test_values_keep_all_digits():
+    assert value_of(with_value(PARAMETERS, "bottom_depth", 0.1 + 0.2), "bottom_depth") == 0.1 + 0.2
+
+
 @each_row(
     ("name", "message"),
     [
@@ -97,6 +101,19 @@ def test_parameters_of_plugins_are_those_of_the_scene(tmp_path):
     # The height for which the sea chooses its cells follows the lidar, unless it is given by the id of the sea.
     assert values["sea"]["altitude"] is None
     assert (values["bottom"]["depth"], values["lower"]["depth"]) == (7, 9)
+
+
+def test_results_state_the_parameters_of_plugins(tmp_path):
+    path = tmp_path / "own.xml"
+    path.write_text(OWN)
+    loaded = open_scene(path, {"sea.altitude": 90, "jerlov": "1C"})
+    found = {name.partition(".")[2]: value for name, value in loaded.attributes().items() if name.startswith("scene.")}
+    given = {"deep": "6", "wind_speed": "2", "jerlov": "1C", "altitude": "200", "sea.altitude": "90"}
+    assert {name: found[name] for name in given} == given
+    assert not {"attenuation", "kd", "sea_wind_speed", "seabed_depth"} & found.keys()
+    assert value_of(loaded.parameters, "seabed.depth") == 6
+    assert value_of(loaded.parameters, "bottom_depth") == value_of(loaded.parameters, "depth") == 6
+    assert open_scene(loaded.source).parameters == loaded.parameters
 
 
 @each_row(

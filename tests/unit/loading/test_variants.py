@@ -28,6 +28,13 @@ def test_llvm_releases_that_abort_are_refused_by_name(tmp_path, name):
         variants.check_llvm_path(str(tmp_path / name))
 
 
+def test_a_link_to_an_old_llvm_is_refused_too(tmp_path):
+    (tmp_path / "libLLVM-15.so.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
+    with pytest.raises(UserError, match="LLVM 15"):
+        variants.check_llvm_path(str(tmp_path / "libLLVM.so"))
+
+
 def test_cuda_without_a_gpu_is_refused():
     if dr.has_backend(dr.JitBackend.CUDA):
         assert variants.set_variant("cuda_ad_mono") == "cuda_ad_mono"
@@ -52,6 +59,15 @@ def test_shots_leave_the_gpu_and_come_back(monkeypatch, caplog):
         mitransient_lidar.render_shots("table1", {"nonsense": 1}, positions=[(0, 0), (1, 1)])
     assert [active[number] for number in (1, 2, -1)] == ["cuda_ad_mono", "llvm_ad_mono", "cuda_ad_mono"]
     assert caplog.text.count("shots are rendered by llvm_ad_mono: a kernel of cuda_ad_mono") == 1
+
+
+def test_old_llvm_in_the_process_says_to_import_first(monkeypatch):
+    monkeypatch.setattr(variants, "loaded_llvm", lambda: (15, 0, 6))
+    with pytest.raises(UserError, match=r"LLVM 15 does not work with Dr\.Jit"):
+        variants.check_llvm()
+    monkeypatch.setattr(variants, "find_llvm", lambda: None)
+    with pytest.raises(UserError, match="install LLVM 17 or newer"):
+        variants.check_llvm()
 
 
 @pytest.mark.slow

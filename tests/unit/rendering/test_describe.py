@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
@@ -131,6 +132,26 @@ def test_index_layers_bend_the_axis(lidar_scene):
     sines = np.sin(np.radians(20)) / np.array([1.334, 1.6])
     expected = float(np.array([3.0, 5.0]) @ np.tan(np.arcsin(sines)))
     np.testing.assert_allclose(attributes["bottom_point"], [expected, 0, -8], atol=1e-3)
+
+
+def test_targets_are_seen_and_shadowed_along_refracted_rays(lidar_scene):
+    """A level plate: its corners cross the sea and end on the bottom as single rays do."""
+    low, high = np.array([1.0, -0.5]), np.array([2.0, 0.5])
+    plate = mi.ScalarTransform4f().translate([1.5, 0, -6]).scale(0.5)
+    laser = {"aim_x": 1.0}
+    extra = {"plate": {"type": "rectangle", "to_world": plate}}
+    (target,) = json.loads(described(lidar_scene(tx=laser, extra=extra))["target_outlines"])
+    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    for name, aim in (("seen", 0.0), ("shadow", 1.0)):
+        offset = corners - [aim - 200 * np.tan(np.radians(20)), 0]
+        distance = np.linalg.norm(offset, axis=1)
+        theta, phi = refracted_path(distance, 200.0, 6.0, 1.34)
+        reach = 200 * np.tan(theta) + (0 if name == "seen" else 8) * np.tan(phi)
+        expected = [aim - 200 * np.tan(np.radians(20)), 0] + offset * (reach / distance)[:, None]
+        line = np.reshape(target[name], (-1, 2))
+        for corner in expected:
+            assert np.hypot(*(line - corner).T).min() < 1e-3
+    assert target["id"] == "plate"
 
 
 def test_targets_belong_to_the_view_at_their_depth(lidar_scene):

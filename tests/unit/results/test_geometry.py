@@ -8,9 +8,16 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, share_in_view
+from mitransient_lidar.results.geometry import (
+    LinesOfSight,
+    lidar_geometry,
+    lidar_system,
+    optional_number,
+    share_in_view,
+)
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -37,6 +44,14 @@ def test_times_depths_and_paths():
     assert geometry.depth_per_ns == pytest.approx(C0 / (2 * GROUP) * COS_WATER)
 
 
+def test_system_of_the_lidar_equation():
+    system = lidar_system(ATTRIBUTES)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.9**2 * 0.8), 0.025)
+    obscured = {**ATTRIBUTES, "obscuration": 0.3}
+    system = lidar_system(obscured, efficiency=0.5)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.5), pytest.approx(0.7 * 0.025))
+
+
 def test_share_of_the_beam_in_view():
     """The sum of the shares that are stored; without them, that of a circle or square of 3 standard deviations."""
     stored = xr.Dataset(coords={"beam_share": ("pixel", [0.25, 0.5])}, attrs=ATTRIBUTES)
@@ -48,6 +63,19 @@ def test_share_of_the_beam_in_view():
         assert share_in_view(dataset) == pytest.approx(1 - math.exp(-4.5))
     square = xr.Dataset(attrs={**ATTRIBUTES, "field_of_view_shape": "square"})
     assert share_in_view(square) == pytest.approx(math.erf(3 / math.sqrt(2)) ** 2)
+
+
+def test_numbers_that_are_missing_or_invalid():
+    missing = {name: value for name, value in ATTRIBUTES.items() if name != "refractive_index"}
+    with pytest.raises(UserError, match="the dataset has no attribute refractive_index"):
+        lidar_geometry(missing)
+    with pytest.raises(UserError, match="altitude = -1 is under water: this needs a lidar above the sea"):
+        lidar_geometry({**ATTRIBUTES, "altitude": -1.0})
+    for value in ("high", float("nan")):
+        with pytest.raises(UserError, match=r"the attribute altitude = .* must be a number of at least 0"):
+            lidar_geometry({**ATTRIBUTES, "altitude": value})
+    assert optional_number({"a": "x", "b": 3}, "a") is None
+    assert optional_number({"a": "x", "b": -3}, "b") == -3.0
 
 
 def image(sights=True):
@@ -100,3 +128,14 @@ def test_lines_of_sight_without_coordinates_are_those_of_the_centres():
     # Times and depths are inverse, in any shape.
     depths = np.linspace(0, 9, 12).reshape(6, 2)
     np.testing.assert_allclose(lines.depth_of_time(lines.time_of_depth(depths)), depths, atol=1e-9)
+
+
+def test_sum_of_pixels_looks_where_most_light_is():
+    _, lines = image()
+    total = lines.combined()
+    weight = np.arange(6.0) / 15
+    assert total.surface_time[0] == pytest.approx(1419 + weight @ np.arange(6.0))
+    # A mixture has the mean variance plus the variance of the means.
+    mean = weight @ np.arange(6.0)
+    variance = weight @ (0.1 * np.arange(6.0)) ** 2 + weight @ (np.arange(6.0) - mean) ** 2
+    assert total.surface_spread[0] == pytest.approx(math.sqrt(variance))

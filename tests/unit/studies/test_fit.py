@@ -124,6 +124,13 @@ def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
     assert ("set bin_width_ns to 0.12 or less" in caplog.text) == (given is not None)
 
 
+def test_values_of_layers_are_set_in_their_list():
+    model = model_of("fig15_2x2", ["attenuation[1]"], wind_speed=3)
+    assert model.starts({}) == {"attenuation[1]": 0.5}
+    assert model.with_values({"attenuation[1]": 0.4}) == {"wind_speed": 3, "attenuation": "0.9, 0.4"}
+    assert model.with_values({"attenuation[0]": 1.0, "attenuation[1]": 0.4})["attenuation"] == "1.0, 0.4"
+
+
 @each_row(
     ("free", "options", "message"),
     [
@@ -142,6 +149,14 @@ def test_invalid_parameters_are_refused(free, options, message, renders):
     data = noisy(0.01, np.random.default_rng(4), pixels=("red",))
     with pytest.raises(UserError, match=message):
         mitransient_lidar.fit(data, "table1", free, **options)
+
+
+def test_scenes_that_are_unknown_are_refused():
+    data = noisy(0.01, np.random.default_rng(5))
+    with pytest.raises(UserError, match="the result does not hold its scene"):
+        mitransient_lidar.fit(data, None, NAMES)
+    with pytest.raises(UserError, match="start of bottom_reflectance is missing"):
+        mitransient_lidar.fit(data, closed_form, NAMES, start={"attenuation": 0.2})
 
 
 def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):

@@ -84,6 +84,12 @@ def test_weights_subtract_what_is_correlated():
     assert 1 / (weights @ covariance @ weights) == pytest.approx(1 / (1 - 0.36))
 
 
+def test_samples_without_noise_take_no_part():
+    np.testing.assert_allclose(
+        matched_weights(np.array([1.0, 5.0, 2.0]), np.diag([1.0, 0.0, 1e-30])), [2.5e-31, 0, 0.5]
+    )
+
+
 def one_case(rise, covariance, factor=1.0):
     null = np.zeros((1, len(rise)))
     return Cases(null, covariance[None], null + rise, factor * covariance[None])
@@ -95,6 +101,11 @@ def test_probability_of_detection_in_closed_form():
     assert statistic.deflection == pytest.approx(4.3718)
     assert float(statistic.detection(1e-3)) == pytest.approx(0.9, abs=1e-5)
     assert statistic.area() == pytest.approx(norm.cdf(4.3718 / np.sqrt(2)))
+
+
+def test_noise_with_the_target_counts():
+    statistic = one_case(np.array([3.0]), np.eye(1), factor=4.0).statistic()
+    assert float(statistic.detection(1e-3)) == pytest.approx(norm.cdf((3 - norm.isf(1e-3)) / 2))
 
 
 def test_no_other_weights_do_better():

@@ -12,6 +12,7 @@ from significance import FALSE_ALARM, largest_z
 
 from mitransient_lidar.analysis.information.fits import WaveformFit
 from mitransient_lidar.analysis.information.measured import measured
+from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.fit import describe_fit, parameter_frame
 
@@ -82,6 +83,25 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
 
 
 @pytest.mark.slow
+def test_errors_of_records_of_a_receiver_are_those_of_its_closed_form():
+    """Records of 40 shots behind an avalanche photodiode, whose bandwidth correlates neighbouring samples."""
+    light = closed_form(TRUTH, pixels=("a", "b"), power=3e-7)
+    recorded = detect_waveforms(light, "apd", shots=20 * 40, seed=4)
+    distances, probabilities = [], []
+    for number in range(20):
+        found = recorded.isel(shot=slice(40 * number, 40 * number + 40)).assign_attrs(shots=40)
+
+        def model(values):
+            return closed_form(values, pixels=("a", "b"), power=3e-7)
+
+        fitted = fit(found, model=model)
+        distances.append(distance(fitted))
+        probabilities.append(fitted.attrs["probability"])
+    assert_chi_squared(distances, len(TRUTH))
+    assert kstest(probabilities, "uniform").pvalue > FALSE_ALARM
+
+
+@pytest.mark.slow
 def test_noise_of_the_model_widens_the_covariance():
     """A model with the error of the data: the same for all values, as by common random numbers."""
     random = np.random.default_rng(5)
@@ -133,6 +153,17 @@ def test_errors_of_all_bins_that_agree_are_in_the_covariance():
         distances.append(
             distance(fit(noisy(0.002, random), TRUTH, model=lambda values, own=own: rendered(values, *own)))
         )
+    assert_mean(distances)
+
+
+@pytest.mark.slow
+def test_standard_errors_from_few_passes_widen_the_covariance():
+    """Data of 8 passes, whose own standard errors as weights gave mean squared distances of 5.9 to 9.1."""
+    random = np.random.default_rng(10)
+    distances = []
+    for _ in range(100):
+        data = rendered(TRUTH, *of_passes(random, 8, 0.01))
+        distances.append(distance(fit(data.drop_vars("waveform_derivative"), TRUTH)))
     assert_mean(distances)
 
 
@@ -194,6 +225,25 @@ def test_errors_are_taken_from_residuals_where_they_are_unknown():
     assert any("errors of the waveforms are unknown" in text for text in unknown.attrs["messages"])
 
 
+def test_degenerate_and_idle_parameters_are_named():
+    """A second scattering of the same effect, and a parameter without any."""
+
+    def model(values):
+        exact = closed_form({**TRUTH, "scattering": values["scattering"] + values["twin"]})
+        slope = exact["waveform_derivative"].sel(parameter="scattering")
+        slopes = np.stack([slope, slope, 0 * slope])
+        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
+        return xr.Dataset(data, {"parameter": ["scattering", "twin", "idle"]}, exact.attrs)
+
+    starts = {"scattering": 0.05, "twin": 0.05, "idle": 1.0}
+    fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
+    assert float(fitted["value"][:2].sum()) == pytest.approx(0.15, rel=1e-5)
+    messages = " ".join(fitted.attrs["messages"])
+    assert "scattering and twin cannot be told apart" in messages
+    assert "idle has no influence" in messages
+    assert np.isnan(fitted["stderr"].values[2])
+
+
 def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     """A scene whose scattering must not exceed its attenuation, as of renders; a full first step does."""
     refused = []
@@ -241,6 +291,19 @@ def test_an_interrupted_fit_has_its_last_step(complete):
         np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=0.1)
 
 
+def test_some_pixels_are_fitted_by_their_names():
+    data = noisy(0.002, np.random.default_rng(7), pixels=("a", "b", "c")).isel(pixel=[2, 0])
+
+    def model(values):
+        return closed_form(values, pixels=("a", "b", "c"))
+
+    fitted = fit(data, model=model)
+    assert fitted["fitted"]["pixel"].values.tolist() == ["c", "a"]
+    assert abs(fitted["residual"]).max() < 6
+    with pytest.raises(UserError, match="the scene has no pixel c: its pixels are a, b"):
+        fit(data, model=lambda values: closed_form(values, pixels=("a", "b")))
+
+
 @each_row(
     ("options", "message"),
     [
@@ -267,3 +330,15 @@ def test_an_interrupted_fit_has_its_last_step(complete):
 def test_invalid_input_is_refused(options, message):
     with pytest.raises(UserError, match=message):
         fit(noisy(0.002, np.random.default_rng(8)), **options)
+
+
+def test_samples_without_value_or_error_are_left_out(tmp_path):
+    lines = [
+        f"{time},{light:.9g},0.002" for time, light in zip(TIME, closed_form(TRUTH)["waveform"][0].values, strict=True)
+    ]
+    lines[50], lines[60] = "50,,0.002", "60,7,"
+    (tmp_path / "gaps.csv").write_text("\n".join(["time_ns,single,single_stderr", *lines]))
+    fitted = fit(tmp_path / "gaps.csv", free_scale=False, free_time=False)
+    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-5)
+    assert np.flatnonzero(fitted["used"][0] == 0).tolist() == [50, 60]
+    assert fitted.attrs["expected"] == pytest.approx(TIME.size - 2 - len(TRUTH))

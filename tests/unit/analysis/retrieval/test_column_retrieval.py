@@ -42,6 +42,11 @@ def test_bounds_of_attenuation_include_waters_by_name(name):
     assert found.attenuation_low < water.attenuation < found.attenuation_high
 
 
+def test_columns_that_no_water_makes_are_nan():
+    found = water_of_column([0.05, np.nan, -0.1, 0.1, 0.1], [1e-3, 1e-3, 1e-3, np.nan, -1e-3], 0.06, 1.0)
+    assert np.isnan(found.kd).all()
+
+
 def test_reflectance_is_the_ratio_of_bottom_and_column():
     """Both from the lidar equation, single scattering: what lies above cancels, at any depth."""
     water = WaterColumn([0], [0.3], [0.15], [0.006])

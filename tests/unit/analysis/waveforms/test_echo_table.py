@@ -6,13 +6,32 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from lake_waveforms import BINS, DECAY, PER_NS, SHIFTS, SURFACE, TIME, column, echo, lit, recorded, result, waveform
+from lake_waveforms import (
+    BINS,
+    DECAY,
+    DT,
+    EDGES,
+    PER_NS,
+    SHIFTS,
+    SURFACE,
+    TIME,
+    column,
+    echo,
+    lit,
+    recorded,
+    result,
+    waveform,
+)
 from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pulse import Pulse
+
+#: Delays of targets behind the surface [ns], of four waveforms.
+PLACES = [[], [40], [40, 28], [44, 34, 54]]
 
 
 @each_row("estimator", echo_table.ESTIMATORS)
@@ -60,6 +79,16 @@ def test_depths_from_the_mean_surface():
         np.testing.assert_allclose(table["depth_m"].sel(echo=name) / PER_NS, SHIFTS + delay, atol=0.05)
 
 
+def test_several_estimators_have_a_dimension_of_their_own():
+    table = echo_table.extract(result(), ["peak", "gaussian"])
+    assert table["time_ns"].dims == ("pixel", "estimator", "echo")
+    one = echo_table.extract(result(), "gaussian")
+    xr.testing.assert_equal(table["time_ns"].sel(estimator="gaussian", drop=True), one["time_ns"])
+    # On the column, the peak is late.
+    late = table["time_ns"].sel(echo="surface", estimator="peak") - one["time_ns"].sel(echo="surface")
+    assert (late > 0.5).all()
+
+
 def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
     """Scattered light that rises 9 ns late: as a surface echo, it would make the bottom a metre shallower."""
     late = column(SURFACE + 9, SURFACE + 70, 2e-6) + echo(SURFACE + 70, 3e-14)
@@ -78,6 +107,22 @@ def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
     # Without shares of the beam, every first echo is the surface.
     unknown = echo_table.extract(result(dataset["waveform"].values))
     assert not (unknown["flags"] & EchoFlag.NO_SURFACE_LIGHT).any()
+
+
+def test_all_targets_of_a_waveform_are_listed():
+    """None, one, two and three targets: the table has as many as the waveform with most, the strongest first."""
+    shots = [waveform() + sum(echo(SURFACE + at, 5e-13 / (1 + k)) for k, at in enumerate(places)) for places in PLACES]
+    table = echo_table.extract(result(np.stack(shots)))
+    names = ["target", "target_2", "target_3"]
+    assert table["echo"].values.tolist() == ["surface", "column", *names, "bottom"]
+    for pixel, places in enumerate(PLACES):
+        own = table.isel(pixel=pixel)
+        delay = own["time_ns"].sel(echo=names[: len(places)]).values - SURFACE
+        np.testing.assert_allclose(delay, places, atol=0.3)
+        assert (own["flags"].sel(echo=names[: len(places)]) == 0).all()
+        assert (own["flags"].sel(echo=names[len(places) :]) == EchoFlag.NO_ECHO).all()
+        assert float(own["time_ns"].sel(echo="bottom")) - SURFACE == pytest.approx(70, abs=0.1)
+    assert echo_table.extract(result(np.stack(shots)), targets=1)["echo"].values.tolist() == list(echo_table.ECHOES)
 
 
 @pytest.mark.parametrize("rise", [1.5, 3.0])
@@ -118,6 +163,14 @@ def test_rows_say_why_a_depth_is_unknown():
     assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
 
 
+def test_imager_and_blocks_give_the_same_as_pixels():
+    flat = echo_table.extract(result())
+    image = echo_table.extract(result(grid=(2, 2)), block=3)
+    assert image["time_ns"].dims == ("row", "column", "echo")
+    np.testing.assert_array_equal(image["time_ns"].values.reshape(4, 4), flat["time_ns"].values)
+    assert "angle_x" in image.coords
+
+
 def test_layers_of_the_water_are_found():
     """Half the backscatter from 3 m down."""
     step = 3.0 / PER_NS
@@ -128,6 +181,15 @@ def test_layers_of_the_water_are_found():
     assert float(table["layer_p_value"][1, 0]) < 1e-6
     assert float(table["layer_depth_m"][1, 0]) == pytest.approx(3.0, abs=0.1)
     assert float(table["layer_step"][1, 0]) == pytest.approx(np.log(0.5), abs=0.07)
+
+
+def test_the_pulse_may_be_given():
+    """A ramp of 6 ns: centroid 2 ns before its end. Taken for a Gaussian, times would be that much early."""
+    pulse = Pulse.sampled([0, 6, 6.01], [0, 1, 0])
+    shares = np.diff(pulse.cumulative(EDGES - SURFACE - 0.2))
+    values = (3e-13 / (DT * 1e-9) * shares)[np.newaxis]
+    table = echo_table.extract(result(values), "centroid", pulse=pulse)
+    assert float(table["time_ns"].sel(echo="surface")[0]) == pytest.approx(SURFACE + 0.2, abs=0.05)
 
 
 @pytest.mark.slow
