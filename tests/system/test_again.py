@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 from few_paths import few_paths
-from rows import each_row
 from same_bits import assert_same_bits
 
 import mitransient_lidar
@@ -215,23 +214,6 @@ def test_what_cannot_be_rendered_again_is_refused(own, folder):
     for params, message in ((5, "params = 5 must be a dict"), ({"a": 1}, "need an XML scene")):
         with pytest.raises(UserError, match=message):
             mitransient_lidar.render(own, params=params)
-
-
-@pytest.mark.slow
-@each_row(
-    ("attributes", "message"),
-    [
-        ({"seed": None}, "no attribute seed"),
-        ({"plugin_parameters": "{"}, "plugin_parameters of the result is damaged"),
-        ({"scene_files": 3}, "scene_files of the result is damaged"),
-        ({"variant": "scalar_rgb"}, "variant = 'scalar_rgb' is not supported"),
-    ],
-)
-def test_damaged_results_are_refused(attributes, message, own):
-    first = own.copy()
-    first.attrs = {name: value for name, value in {**first.attrs, **attributes}.items() if value is not None}
-    with pytest.raises(UserError, match=message):
-        mitransient_lidar.render(first)
 
 
 @pytest.mark.slow

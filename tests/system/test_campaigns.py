@@ -236,7 +236,6 @@ def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatc
 #: No new process imports this script, so that it needs no condition. Ctrl-C comes when three runs are done.
 SCRIPT = """
 import contextlib
-import functools
 import json, os, signal, sys
 import mitransient_lidar
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,20 +1,11 @@
 """Slopes, bottoms and waters estimated from rendered shots, against what was rendered."""
 
-import math
-
 import numpy as np
 import pytest
 import xarray as xr
-from oracles.lidar_equation import column_power
-from rows import each_row
 
 import mitransient_lidar
-from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
-from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.rendering.shots import series as shot_series
 
 #: Slopes along and across.
@@ -62,45 +53,3 @@ def test_correction_halves_what_slope_does_to_the_bottom(planes):
 def sea(request):
     params = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": request.param}
     return shot_series.render_shots("fig09_2x2", params, count=24, passes=2)
-
-
-WATERS = {
-    "jerlov IB": (0.0532, 0.124, 0.00196),
-    "petzold coastal": (0.179, 0.219, 0.00293),
-    "jerlov 1C": (0.0951, 0.432, 0.00944),
-}
-
-
-@each_row("name", WATERS)
-def test_waters_in_closed_form(name):
-    """Columns of the lidar equation, and Kd of an independent Monte Carlo study; nothing is rendered.
-
-    In quasi-single scattering (Gordon 1982, doi:10.1364/AO.21.002996) the column in a wide view has the level of single
-    scattering by bb and decays with a + bb; light scattered more often adds to it. For the sun at the zenith,
-    Kirk (1984), doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold: 3 to
-    12 % above the relation of Lee, Du and Arnone (2005) that the retrieval uses. Limits are of size.
-    """
-    absorption, scattering, backscattering = WATERS[name]
-    angle, index, group = math.radians(20), 1.34, 1.364
-    system = LidarSystem(200.0, angle, index, group, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
-    time = TimeAxis(1390.0, 0.5, 160)
-    geometry = LidarGeometry(200.0, angle, index, group)
-    depth = geometry.depth_of_time(time.centres_ns)
-    water = WaterColumn([0.0], [absorption + scattering], [scattering], [backscattering])
-    backward_phase = backscattering / (2 * math.pi * scattering)
-    power = column_power(system, water, backward_phase, np.maximum(depth, 0), angle, "a+bb")
-    # A surface echo of 0.2 pJ, all in one bin before the pulse.
-    instant = np.where(depth > 0, power, 0)
-    instant[np.argmax(depth > 0)] += 2e-13 / 0.5e-9
-    pulsed = waveform(instant[np.newaxis] * 0.5e-9, 0.5, Pulse.gaussian(4.0).kernel(0.5))
-    attributes = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": index, "group_index": group}
-    attributes |= {"pulse_fwhm_ns": 4.0, "pulse_energy_mj": 5.0, "aperture_area": 0.025, "divergence_mrad": 0.1}
-    attributes |= {"field_of_view_mrad": 60.0}
-    arrays = [pulsed * 0.5e-9, 0 * pulsed, pulsed, 1e-4 * pulsed + 1e-12]
-    options = {"time": time, "pixel_names": ["all"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": attributes}
-    found = retrieve.water(results.build(*arrays, **options), efficiency=0.81 * 0.9)
-    assert float(found["column_attenuation"]) == pytest.approx(absorption + backscattering, rel=1e-3)
-    assert absorption < float(found["absorption"]) < absorption + backscattering
-    assert 0.75 * backscattering < float(found["backscattering"]) < 0.97 * backscattering
-    kirk = math.sqrt(absorption**2 + 0.235 * absorption * scattering)
-    assert 0.87 * kirk < float(found["kd"]) < 0.98 * kirk

@@ -71,17 +71,6 @@ def test_latin_hypercube_has_one_run_in_each_part_of_a_range():
     assert sorted(parts) == list(range(36))
 
 
-def test_sobol_fills_the_plane_more_evenly_than_random_numbers():
-    cells = {}
-    for kind in ("sobol", "random"):
-        table = Campaign.of_file(changed(design={"kind": kind, "count": 256, "seed": 3})).table()
-        depth = (table["bottom_depth"] - 2) / 18
-        share = np.log(table["attenuation"] / 0.15) / np.log(10)
-        cells[kind] = np.histogram2d(depth, share, bins=16, range=[[0, 1], [0, 1]])[0]
-    assert cells["sobol"].max() == cells["sobol"].min() == 1
-    assert cells["random"].max() > 2
-
-
 def test_grid_has_all_combinations():
     given = changed(
         parameters={

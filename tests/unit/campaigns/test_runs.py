@@ -2,7 +2,6 @@ import itertools
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer, source_of
@@ -86,23 +85,6 @@ def test_what_is_asked_of_a_run(asked):
     assert (first["target_error"], first["components"], first["move_target"]) == (0.05, False, False)
     assert first["axis"] == TimeAxis(1300, 1, 300)
     assert first["max_time"] is None
-
-
-def test_time_of_a_run_without_all_shots_is_refused(monkeypatch):
-    """Its arrays do not fit those of the store."""
-    given = {"scene": "table1", "fixed": FLAT, "parameters": {"bottom_depth": [3.0]}, "max_time": 2}
-    campaign = Campaign.of_file({**given, "design": {"kind": "random", "count": 1, "shots": 4}})
-    asked = []
-
-    def render_shots(scene, params, **options):
-        asked.append(options["max_time"])
-        return xr.Dataset(coords={"shot": np.arange(3)})
-
-    monkeypatch.setattr("mitransient_lidar.campaigns.runs.render_shots", render_shots)
-    runs = RunRenderer(campaign, source_of(campaign), TimeAxis(1300, 1, 300))
-    with pytest.raises(UserError, match=r"^max_time = 2 s ended after 3 of 4 shots of the run: it must be longer$"):
-        runs.arrays(0, {"bottom_depth": 3.0})
-    assert asked == [2.0]
 
 
 @pytest.mark.slow

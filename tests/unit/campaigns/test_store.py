@@ -100,30 +100,17 @@ def test_new_store_is_empty_and_complete(store, path):
     assert (data.attrs["time_start_ns"], data.attrs["bin_width_ns"]) == (1000, 0.5)
 
 
-def is_of(store, campaign, columns, scene=RECORD):
-    try:
-        store.require(campaign, columns, lambda: scene)
-    except UserError as error:
-        return "holds another campaign, or its scene has changed" not in str(error)
-    return True
-
-
-def test_renderer_of_a_store_is_that_of_its_campaign(store):
+def test_a_store_is_completed_by_its_own_campaign_only(store):
     renderer = store.renderer()
-    assert (renderer.plan.text, renderer.axis) == (CAMPAIGN.text, AXIS)
-    assert renderer.scene.parameters == {"time": "0"}
-    assert is_of(store, CAMPAIGN, CAMPAIGN.table())
-    other = Campaign.of_file(
-        {"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}}
-    )
-    assert not is_of(store, other, other.table())
-    edited = CAMPAIGN.table()
+    assert (renderer.plan.text, renderer.axis, renderer.scene.parameters) == (CAMPAIGN.text, AXIS, {"time": "0"})
+    store.require(CAMPAIGN, CAMPAIGN.table(), lambda: RECORD)
+    given = {"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}}
+    other, edited = Campaign.of_file(given), CAMPAIGN.table()
     edited["time"] = edited["time"] + 1e-9
-    assert not is_of(store, CAMPAIGN, edited)
-    # The file of the scene has changed since.
-    assert not is_of(store, CAMPAIGN, CAMPAIGN.table(), replace(RECORD, text="<scene></scene>"))
-    with pytest.raises(UserError, match=r"shard_size = 8 must be that of .*, 4"):
-        store.require(CAMPAIGN, None, lambda: RECORD, 8)
+    changed = replace(RECORD, text="<scene></scene>")
+    for rows in ((other, other.table(), RECORD), (CAMPAIGN, edited, RECORD), (CAMPAIGN, CAMPAIGN.table(), changed)):
+        with pytest.raises(UserError, match="holds another campaign, or its scene has changed"):
+            store.require(*rows[:2], lambda scene=rows[2]: scene)
 
 
 def test_shards_are_written_and_read(store, path):
@@ -210,13 +197,11 @@ def test_a_store_with_a_lost_chunk_is_read_without_its_runs(full, path):
 def test_damaged_values_are_not_read(full, path):
     flip(path / "waveform/c/0/0/0/0")
     data = open_campaign(path)
-    with pytest.raises(ValueError, match="checksum"):
+    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"), reporting_damage(path):
         data["waveform"].load()
-    with (
-        pytest.raises(UserError, match=r"campaign\.zarr is damaged"),
-        reporting_damage(path),
-    ):
-        data["waveform"].load()
+    (path / "waveform" / "zarr.json").write_text("{")
+    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
+        Store(path)
 
 
 @each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
@@ -258,12 +243,6 @@ def test_edited_attributes_are_refused(full, path, change, message, sealed):
         Store(path)
         return
     with pytest.raises(UserError, match=message if sealed else "is no store|its attributes have changed"):
-        Store(path)
-
-
-def test_an_array_whose_metadata_are_damaged(full, path):
-    (path / "waveform" / "zarr.json").write_text("{")
-    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
         Store(path)
 
 
@@ -321,20 +300,9 @@ def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
     monkeypatch.setattr(sweep, "on_this_machine", lambda few, *_: contextlib.nullcontext(few))
     monkeypatch.setattr(sweep, "_render", lambda store, shards, pool, tally: rendered.append(pool))
     sweep.complete(lambda: store, 2, None, False, None)
-    message = (
-        r"shards of 4 runs, 3 at a time, take 2\.78e-06 GB of memory, and at most 2e-06 GB may be: take fewer workers"
-    )
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=r"4 runs, 3 at a time, take .* at most 2e-06 GB may be: take fewer workers"):
         sweep.complete(lambda: store, 4, None, False, None)
     assert rendered == [2]
-
-
-def test_other_folders_are_refused(tmp_path):
-    zarr.create_group(str(tmp_path / "group.zarr"), zarr_format=3)
-    for name in ("group.zarr", "none.zarr"):
-        with pytest.raises(UserError, match=rf"{name} is no store of a campaign"):
-            open_campaign(tmp_path / name)
-    assert not (tmp_path / "none.zarr").exists()
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "waveform", "waveform/zarr.json", "status/c/0"])

@@ -40,19 +40,6 @@ def test_bad_flights_are_one_sentence(change, message):
         FlightPlan.of_file({**FLIGHT, **change})
 
 
-@each_row(
-    ("change", "message"),
-    [
-        ({"platform": {**LINE, "height": 0.5}}, "from a height of 0.5 m"),
-        ({"scanner": {"kind": "fixed", "nadir_angle_deg": 89.0}}, "looks 89 degrees from nadir"),
-        ({"platform": {**LINE, "start": [0.0, 20_000.0]}}, r"reaches 200[\d.]+ m from the origin"),
-    ],
-)
-def test_poses_that_cannot_be_rendered(change, message):
-    with pytest.raises(UserError, match=message):
-        input_columns(FlightPlan.of_file({**FLIGHT, **change}).poses())
-
-
 def test_pulses_of_one_group_have_similar_poses():
     scanner = {"kind": "oscillating", "half_angle_deg": 15.0, "rate_hz": 5.3}
     plan = FlightPlan.of_file({**FLIGHT, "scanner": scanner})

@@ -350,15 +350,6 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
     assert wrong[1] < 0.6 * wrong[0], wrong
 
 
-def test_planes_forget_waves_of_another_time():
-    spots, _, slope = linear_waves(8, 1.0, 0.01)
-    sea = SurfaceModel.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
-    later = sea.at(spots[:50, :2], np.full(50, 10.0))
-    np.testing.assert_allclose(later.height, sea.level)
-    np.testing.assert_allclose(later.slope, 0)
-    np.testing.assert_allclose(later.slope_error, slope.std())
-
-
 def test_the_sea_is_fitted_to_surface_points():
     given, waves = poses(200), 0.1 * np.random.default_rng(9).normal(size=(200, 1))
     ray = sights(given)
@@ -395,20 +386,3 @@ def test_wrong_input_is_refused(changes, message):
     options = {**poses(1), "angle_x": ANGLE_X, "angle_y": ANGLE_Y, **INDICES}
     with pytest.raises(UserError, match=message):
         located(mixed(), **{**options, **changes})
-
-
-@each_row(
-    ("change", "message"),
-    [
-        (lambda made: made.drop_vars("surface_time_ns_method_error"), "lack surface_time_ns_method_error"),
-        (lambda made: made.expand_dims(estimator=["peak", "gaussian"]), "several estimators"),
-        (lambda made: made.isel(shot=0), "they need shot and pixel"),
-        (
-            lambda made: made.assign(depth_m=made["depth_m"].assign_attrs(long_name="depth below the mean sea level")),
-            "from the mean sea level",
-        ),
-    ],
-)
-def test_other_echoes_are_refused(change, message):
-    with pytest.raises(UserError, match=message):
-        located(change(mixed()), **poses(1), angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)

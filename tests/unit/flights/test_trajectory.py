@@ -11,9 +11,6 @@ from mitransient_lidar.flights.poses.trajectory import Trajectory
 LINES = {"kind": "lines", "start": [10, 20], "heading_deg": 30, "speed": 50, "height": 200, "length": 500}
 
 
-MAST = {"kind": "mast", "position": [1, 2, 15], "heading_deg": 120, "duration_s": 30}
-
-
 def _trajectory(times, yaw=None, **others):
     zeros = np.zeros(len(times))
     return Trajectory(times, np.zeros((len(times), 3)), zeros, zeros, zeros if yaw is None else yaw, **others)
@@ -181,8 +178,3 @@ def test_times_on_no_line_are_refused(time):
 def test_invalid_platforms(given, message):
     with pytest.raises(UserError, match=message):
         platform_of(given).trajectory()
-
-
-def test_too_many_pulses_are_refused():
-    with pytest.raises(UserError, match="pulse_rate_hz = 1e\\+09 gives 1e\\+10 pulses: at most 1e\\+08"):
-        platform_of(LINES).trajectory().pulse_times(1e9)

@@ -54,10 +54,6 @@ def test_one_number_changes(name, text):
     assert value_of(changed, name) == 8.1
 
 
-def test_values_keep_all_digits():
-    assert value_of(with_value(PARAMETERS, "bottom_depth", 0.1 + 0.2), "bottom_depth") == 0.1 + 0.2
-
-
 @each_row(
     ("name", "message"),
     [

@@ -61,15 +61,6 @@ def test_shots_leave_the_gpu_and_come_back(monkeypatch, caplog):
     assert caplog.text.count("shots are rendered by llvm_ad_mono: a kernel of cuda_ad_mono") == 1
 
 
-def test_old_llvm_in_the_process_says_to_import_first(monkeypatch):
-    monkeypatch.setattr(variants, "loaded_llvm", lambda: (15, 0, 6))
-    with pytest.raises(UserError, match=r"LLVM 15 does not work with Dr\.Jit"):
-        variants.check_llvm()
-    monkeypatch.setattr(variants, "find_llvm", lambda: None)
-    with pytest.raises(UserError, match="install LLVM 17 or newer"):
-        variants.check_llvm()
-
-
 @pytest.mark.slow
 def test_importing_without_a_usable_llvm_is_a_readable_error(tmp_path):
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "missing.so")}

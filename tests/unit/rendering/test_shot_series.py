@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import run
-from few_paths import few_paths
 from rows import each_row
-from same_bits import assert_same_bits
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.shots import batches as shot_batches
 from mitransient_lidar.rendering.shots import series as shot_series
 from mitransient_lidar.rendering.shots import truth as shot_truth
@@ -191,29 +188,11 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
 
 
 @pytest.mark.slow
-def test_time_bins_that_leave_out_light_are_refused(rendered):
-    own = shot_series.render_shots("fig09_2x2", {**FLAT, "bottom_depth": 4}, positions=[(0, 0)])
-    with pytest.raises(UserError, match=r"the record of 13\d\d to 1\d\d\d ns leaves out light: it must hold 13\d\d to"):
-        shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0)], axis=results.time_axis(own))
-
-
-@pytest.mark.slow
 def test_places_beside_the_bottom_are_told(rendered, caplog):
     """The bottom of the scene is a square of 1 km."""
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
     np.testing.assert_array_equal(series["true_bottom_depth"], [8.0, np.nan])
     assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
-
-
-@pytest.mark.slow
-def test_random_places_are_those_of_the_seed(rendered):
-    waves = {"surface_size": 60, "surface_cell_size": 1}
-    series = [shot_series.render_shots("fig09_2x2", waves, count=2, seed=seed) for seed in (1, 1, 2)]
-    assert (
-        series[0]["aim_x"].values.tolist() == series[1]["aim_x"].values.tolist() != series[2]["aim_x"].values.tolist()
-    )
-    assert series[0].attrs["places_seed"] == 1
-    assert min(series[0].attrs["slope_deviation"]) > 0
 
 
 @pytest.mark.slow
@@ -247,42 +226,6 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES)
     assert series.sizes["shot"] == series["aim_x"].size == 2
     assert series.attrs["interrupted"] == 1
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """Replace the time [s], which goes on by itself where `step` is not 0."""
-
-    class Clock:
-        now, step = 0.0, 0.0
-
-        def read(self):
-            self.now += self.step
-            return self.now
-
-    made = Clock()
-    monkeypatch.setattr("time.perf_counter", made.read)
-    return made
-
-
-@pytest.mark.slow
-@each_row("options", [{"target_error": 1e-4, "pass_share": 1.0}, {"passes": 200}])
-def test_time_ends_the_passes_of_a_batch(clock, caplog, tmp_path, options):
-    """A launch takes 1 s and holds 4 passes of an error; the limit of 4 s begins 1 s before the batch."""
-    clock.step = 1.0
-    scene = few_paths("fig09_2x2", tmp_path)
-    params = {**FLAT, "bin_width_ns": 4, "bin_count": 40}
-    first = shot_series.render_shots(scene, params, positions=PLACES[:2], max_time=4.0, **options)
-    assert len(set(first["shot_passes"].values)) == 1
-    assert first["shot_passes"][0] == first.attrs["passes"] < first.attrs["most_passes"]
-    assert first.attrs["most_passes"] == options.get("passes", shot_batches.MOST_PASSES_FOR_ERROR)
-    if "target_error" in options:
-        assert first.attrs["passes"] == 12
-        assert "2 of 2 shots ended before target_error = 0.0001" in caplog.text
-    clock.step = 0.0
-    results.save(first, tmp_path / "a.nc")
-    assert_same_bits(first, render_again(tmp_path / "a.nc"))
-    assert render_again(first, passes=2).attrs["passes"] == 2
 
 
 @pytest.mark.slow

@@ -171,14 +171,14 @@ def test_round_trip(tmp_path, case, suffix):
 
 
 @each_row("suffix", [".exr", ".nc"])
-def test_round_trip_keeps_non_finite_values(tmp_path, suffix):
+def test_files_of_any_name_keep_values_that_are_not_finite(tmp_path, suffix):
     dataset = make()
-    dataset["waveform"][0, 0] = np.nan
-    dataset["waveform"][1, 1] = -np.inf
+    dataset["waveform"][0, 0], dataset["waveform"][1, 1] = np.nan, -np.inf
     results.save(dataset, tmp_path / f"a{suffix}")
-    back = results.open(tmp_path / f"a{suffix}")["waveform"].values
-    assert np.isnan(back[0, 0])
-    assert back[1, 1] == -np.inf
+    os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
+    back = results.open(tmp_path / "a.dat")
+    np.testing.assert_allclose(back["waveform"], dataset["waveform"], rtol=1e-6)
+    assert back.attrs["scene"] == "fig09"
 
 
 def test_other_programs_read_netcdf(tmp_path):
@@ -202,13 +202,6 @@ def test_a_file_has_at_most_forty_attributes_and_gives_all_back(tmp_path):
     with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as other:
         assert len(other.attrs) <= 40
         assert {"title", "history", "scene", "seed", "error_median", "scene_xml"} < set(other.attrs)
-
-
-@each_row("suffix", [".exr", ".nc"])
-def test_format_follows_the_content_not_the_suffix(tmp_path, suffix):
-    results.save(make(), tmp_path / f"a{suffix}")
-    os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
-    assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
 
 
 def test_images_of_many_bins_have_several_parts(tmp_path):

@@ -8,14 +8,12 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.geometry import (
     LinesOfSight,
     lidar_geometry,
     lidar_system,
-    optional_number,
     share_in_view,
 )
 
@@ -63,19 +61,6 @@ def test_share_of_the_beam_in_view():
         assert share_in_view(dataset) == pytest.approx(1 - math.exp(-4.5))
     square = xr.Dataset(attrs={**ATTRIBUTES, "field_of_view_shape": "square"})
     assert share_in_view(square) == pytest.approx(math.erf(3 / math.sqrt(2)) ** 2)
-
-
-def test_numbers_that_are_missing_or_invalid():
-    missing = {name: value for name, value in ATTRIBUTES.items() if name != "refractive_index"}
-    with pytest.raises(UserError, match="the dataset has no attribute refractive_index"):
-        lidar_geometry(missing)
-    with pytest.raises(UserError, match="altitude = -1 is under water: this needs a lidar above the sea"):
-        lidar_geometry({**ATTRIBUTES, "altitude": -1.0})
-    for value in ("high", float("nan")):
-        with pytest.raises(UserError, match=r"the attribute altitude = .* must be a number of at least 0"):
-            lidar_geometry({**ATTRIBUTES, "altitude": value})
-    assert optional_number({"a": "x", "b": 3}, "a") is None
-    assert optional_number({"a": "x", "b": -3}, "b") == -3.0
 
 
 def image(sights=True):

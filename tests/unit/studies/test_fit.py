@@ -151,14 +151,6 @@ def test_invalid_parameters_are_refused(free, options, message, renders):
         mitransient_lidar.fit(data, "table1", free, **options)
 
 
-def test_scenes_that_are_unknown_are_refused():
-    data = noisy(0.01, np.random.default_rng(5))
-    with pytest.raises(UserError, match="the result does not hold its scene"):
-        mitransient_lidar.fit(data, None, NAMES)
-    with pytest.raises(UserError, match="start of bottom_reflectance is missing"):
-        mitransient_lidar.fit(data, closed_form, NAMES, start={"attenuation": 0.2})
-
-
 def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):
     """Renders take a second each: no step is tried from 1.5 s on, and the last values are the result."""
     now = [0.0]

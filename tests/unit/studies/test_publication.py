@@ -6,16 +6,14 @@ import math
 import matplotlib.image
 import numpy as np
 import pytest
-import xarray as xr
 from command_line import run
 from rows import each_row
 from scipy.special import erf
 
 import mitransient_lidar
 from mitransient_lidar.plots.publication import figures as publication
-from mitransient_lidar.studies.publication import measures, renders
+from mitransient_lidar.studies.publication import measures
 from mitransient_lidar.studies.publication.measures import Series, Waveform
-from mitransient_lidar.studies.publication.renders import Renders, joined
 from mitransient_lidar.studies.publication.statements import COLUMNS, Statement, write_statements
 
 TIME = np.arange(0.125, 120, 0.25)
@@ -86,30 +84,6 @@ def test_error_of_a_ratio_is_that_of_repeated_experiments():
     # The spread of 400 values is known to 1 / sqrt(800), the mean of their errors far better.
     z = (np.sqrt(np.mean(found[:, 1] ** 2)) / found[:, 0].std() - 1) * math.sqrt(800)
     assert abs(z) < 4
-
-
-def test_series_of_other_bins_are_joined_on_common_ones():
-    early = Series(np.arange(0.5, 10), np.arange(10.0).reshape(1, 1, 10))
-    late = Series(np.arange(2.5, 12), np.arange(2, 12.0).reshape(1, 1, 10))
-    both = joined([early, late])
-    np.testing.assert_array_equal(both.time, np.arange(2.5, 10))
-    np.testing.assert_array_equal(both.power[0], both.power[1])
-
-
-def test_renders_are_kept_by_places_and_values_of_options(monkeypatch):
-    made = []
-
-    def render_shots(scene, params, **options):
-        made.append(options)
-        return xr.Dataset(attrs={"interrupted": 0})
-
-    monkeypatch.setattr(renders, "render_shots", render_shots)
-    own = Renders()
-    first = own._rendered("table1", {}, [(0, 0)], {"passes": 4})
-    assert own._rendered("table1", {}, [[0.0, 0.0]], {"passes": 4}) is first
-    for places, goal in (([(0, 0)], {"passes": 8}), ([(1, 0)], {"passes": 4}), ([(0, 0)], {"passes": 4, "seed": 1})):
-        assert own._rendered("table1", {}, places, goal) is not first
-    assert len(made) == 4
 
 
 @each_row(

@@ -153,14 +153,6 @@ def test_stack_is_labelled():
     assert stack.attrs["history"].startswith(dataset.attrs["history"])
 
 
-def test_gates_of_a_result_with_gates_of_its_own_are_cut_anew():
-    own = gating.cut_gates(record(), GateTrain(1418.0, 6.0, 3.0, 20))
-    dataset = record().assign(gate_energy=own["gate_energy"])
-    stack = gating.cut_gates(dataset, GateTrain(1420.0, 5.0, 5.0, 4))
-    assert stack.sizes["gate"] == 4
-    np.testing.assert_array_equal(stack["gate_start"], [1420, 1425, 1430, 1435])
-
-
 def test_nan_stays_in_its_gates():
     dataset = record()
     dataset["waveform"][1, 40] = np.nan  # 1420 to 1420.5 ns

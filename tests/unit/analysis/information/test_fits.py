@@ -12,7 +12,6 @@ from significance import FALSE_ALARM, largest_z
 
 from mitransient_lidar.analysis.information.fits import WaveformFit
 from mitransient_lidar.analysis.information.measured import measured
-from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.fit import describe_fit, parameter_frame
 
@@ -80,25 +79,6 @@ def test_unknown_scale_and_offset_are_recovered(tmp_path):
     assert_chi_squared(distances, len(truth))
     assert fitted["used"].values.sum() > 0.8 * times.size
     assert fitted["measured"].sizes == {"pixel": 1, "time": times.size}
-
-
-@pytest.mark.slow
-def test_errors_of_records_of_a_receiver_are_those_of_its_closed_form():
-    """Records of 40 shots behind an avalanche photodiode, whose bandwidth correlates neighbouring samples."""
-    light = closed_form(TRUTH, pixels=("a", "b"), power=3e-7)
-    recorded = detect_waveforms(light, "apd", shots=20 * 40, seed=4)
-    distances, probabilities = [], []
-    for number in range(20):
-        found = recorded.isel(shot=slice(40 * number, 40 * number + 40)).assign_attrs(shots=40)
-
-        def model(values):
-            return closed_form(values, pixels=("a", "b"), power=3e-7)
-
-        fitted = fit(found, model=model)
-        distances.append(distance(fitted))
-        probabilities.append(fitted.attrs["probability"])
-    assert_chi_squared(distances, len(TRUTH))
-    assert kstest(probabilities, "uniform").pvalue > FALSE_ALARM
 
 
 @pytest.mark.slow
@@ -223,25 +203,6 @@ def test_errors_are_taken_from_residuals_where_they_are_unknown():
     np.testing.assert_allclose(fit(data, scale_errors=True)["stderr"], unknown["stderr"], rtol=3e-3)
     assert np.isnan(unknown.attrs["probability"])
     assert any("errors of the waveforms are unknown" in text for text in unknown.attrs["messages"])
-
-
-def test_degenerate_and_idle_parameters_are_named():
-    """A second scattering of the same effect, and a parameter without any."""
-
-    def model(values):
-        exact = closed_form({**TRUTH, "scattering": values["scattering"] + values["twin"]})
-        slope = exact["waveform_derivative"].sel(parameter="scattering")
-        slopes = np.stack([slope, slope, 0 * slope])
-        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
-        return xr.Dataset(data, {"parameter": ["scattering", "twin", "idle"]}, exact.attrs)
-
-    starts = {"scattering": 0.05, "twin": 0.05, "idle": 1.0}
-    fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
-    assert float(fitted["value"][:2].sum()) == pytest.approx(0.15, rel=1e-5)
-    messages = " ".join(fitted.attrs["messages"])
-    assert "scattering and twin cannot be told apart" in messages
-    assert "idle has no influence" in messages
-    assert np.isnan(fitted["stderr"].values[2])
 
 
 def test_impossible_steps_are_shortened_and_the_fit_goes_on():

@@ -39,25 +39,18 @@ from mitransient_lidar.rendering.shots import series as shot_series
 pytestmark = pytest.mark.usefixtures("scattered_once")
 
 
-@pytest.mark.slow
-def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
+def test_a_slope_that_the_sea_cannot_have_is_refused():
     """A plane of 40 degrees along, in a sea whose slopes have a standard deviation of 0.1 in each direction."""
     shot = result(np.stack([waveform(delay) for delay in plane_delays(0.84, 0.05)]), surface_slope_variance=0.02)
     found = retrieve.surface_slopes(shot)
-    assert math.isnan(found["slope_along"])
-    assert math.isnan(found["slope_along_stderr"])
+    assert np.isnan([found["slope_along"], found["slope_along_stderr"]]).all()
     assert float(found["slope_refused"]) == 1
     assert float(found["slope_across"]) == pytest.approx(0.05, abs=0.03)
-    assert found.attrs["steepest_slope"] == pytest.approx(0.5)
-    results.save(shot, tmp_path / "shot.nc")
-    done = run("retrieve", tmp_path / "shot.nc")
-    assert "slope along: refused, an estimate is steeper than 0.50, beyond what the sea has" in done.output
-    # With a prior, only the prior is left.
+    # With a prior, only the prior is left; of an unknown sea, it is kept.
     along = retrieve.surface_slopes(shot, slope_deviation=(0.1, 0.1))
     assert (float(along["slope_along"]), float(along["slope_along_stderr"])) == (0.0, pytest.approx(0.1))
     kept = retrieve.surface_slopes(result(shot["waveform"].values))
     assert float(kept["slope_along"]) == pytest.approx(0.84, rel=0.1)
-    assert float(kept["slope_refused"]) == 0
 
 
 def test_a_receiver_of_one_pixel_gives_bottom_and_water():
@@ -228,29 +221,15 @@ def short(bins=0, depth=DEPTH):
     return shot.isel(time=slice(0, bins or None))
 
 
-@pytest.mark.slow
-def test_estimates_without_a_column(tmp_path, caplog):
+def test_estimates_without_a_column(caplog):
     """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
     for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):
-        caplog.clear()
         found = retrieve.retrieve(shot)
         assert float(found["slope_along"]) == pytest.approx(0.1, abs=0.02)
         assert float(found["depth_m"].sel(correction="slope")) == pytest.approx(depth, abs=0.1, nan_ok=True)
-        assert np.isnan(found["reflectance"]).all()
-        assert np.isnan(found["class_probability"]).all()
-        assert np.isnan(found["kd"])
-        assert caplog.messages == [
-            "no waveform has a column long enough for a fit: the reflectance of the bottom is unknown"
-        ]
-        results.save(shot, tmp_path / "short.nc")
-        done = run("retrieve", tmp_path / "short.nc")
-        assert done.exit_code == 0, done.output
-        unseen = (
-            "bottom: not observable, no echo" if math.isnan(depth) else "bottom reflectance: not observable, no column"
-        )
-        for text in ("slope along: +0.1", unseen, "water: not observable, no column that can be fitted"):
-            assert text in done.output
-        assert "nan" not in done.output
+        for name in ("reflectance", "class_probability", "kd"):
+            assert np.isnan(found[name]).all()
+        assert "no waveform has a column long enough for a fit" in caplog.text
 
 
 def test_no_estimate():

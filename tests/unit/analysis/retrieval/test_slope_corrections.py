@@ -80,13 +80,6 @@ def test_depth_of_a_traced_ray(along, height):
     assert np.sign(np.round(level - 8.0, 9)) == np.sign(along)
 
 
-def test_rays_that_miss_the_facet_are_unknown():
-    # A ray cannot meet this face, which is visible from below only.
-    assert np.isnan(SlopeRefraction.of(-3.0, 0, THETA, N).cos_vertical)
-    assert np.isnan(SlopeRefraction.of(np.nan, 0, THETA, N).cos_vertical)
-    assert np.isnan(bottom_gain(RANGE, 8.0, N, SlopeRefraction.of(np.nan, 0, THETA, N)))
-
-
 def test_variances_by_slope_and_range_without_and_with_the_correction():
     """3 along - 2 across + range/10 of a level sea at 210 m: variances by hand, 0.0181 before."""
 

@@ -73,7 +73,6 @@ def test_time_without_noise_has_no_bias(tau):
     assert (echoes.width_ns < 0.5 * template.fwhm_ns).all()
 
 
-@pytest.mark.slow
 def test_errors_of_time_and_energy_are_those_of_the_noise_within_a_fifth():
     count, noise = 600, 0.02
     rng = np.random.default_rng(5)

