@@ -235,22 +235,21 @@ def test_waveforms_without_an_echo_keep_a_point_where_they_look():
     given = poses(1)
     sea = SurfaceModel(level=0.4, height_deviation=0.2)
     points = located(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
-    assert points["kind"].values.tolist() == [41, 43, 40, 40, 41, 45]
-    assert points["pixel"].values.tolist() == [0, 0, 0, 1, 2, 3]
-    assert points["return_number"].values.tolist() == [1, 2, 3, 1, 1, 1]
-    assert points["number_of_returns"].values.tolist() == [3, 3, 3, 1, 1, 1]
-    np.testing.assert_array_equal(points["intensity"].values, [3, 5, 6, 6, 3, np.nan])
-    np.testing.assert_array_equal(points["depth"].values, [0, 5, 8, 8, 0, np.nan])
-    assert points["intensity"].attrs["units"] == "W"
+    for name, expected in {
+        "kind": [41, 43, 40, 40, 41, 45],
+        "pixel": [0, 0, 0, 1, 2, 3],
+        "return_number": [1, 2, 3, 1, 1, 1],
+        "number_of_returns": [3, 3, 3, 1, 1, 1],
+        "intensity": [3, 5, 6, 6, 3, np.nan],
+        "depth": [0, 5, 8, 8, 0, np.nan],
+    }.items():
+        np.testing.assert_array_equal(points[name].values, expected, err_msg=name)
     ray = sights(given)[0, 3]
     silent = found(points, PointClass.NO_ECHO)[0]
     np.testing.assert_allclose(silent, given["origin"][0] + (0.4 - given["origin"][0, 2]) / ray[2] * ray, atol=1e-9)
     # Known but for the waves: a height that is off by its deviation moves the point along the line of sight.
-    last = points.isel(point=-1)
-    horizontal = 0.2 * math.hypot(ray[0], ray[1]) / -ray[2]
-    np.testing.assert_allclose(
-        [last["vertical_uncertainty"], last["horizontal_uncertainty"]], [0.2, horizontal], rtol=1e-12
-    )
+    for name, error in (("vertical", 0.2), ("horizontal", 0.2 * math.hypot(ray[0], ray[1]) / -ray[2])):
+        assert float(points[f"{name}_uncertainty"][-1]) == pytest.approx(error, rel=1e-12)
 
 
 def test_one_echo_of_many_pixels_in_rows_and_columns_is_where_it_is_as_one_of_pixels():

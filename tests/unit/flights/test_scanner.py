@@ -103,18 +103,6 @@ def test_every_line_of_a_flight_begins_with_a_whole_point():
         assert len(np.unique(poses.axis[poses.line == line][:1000].round(9), axis=0)) == 1000
 
 
-def test_pixels_that_stay_with_the_platform():
-    """At small angles far stays forward, while the pixels of the scan turn with it."""
-    times = np.arange(8) / 400
-    small = PALMER | {"nadir_angle_deg": 1e-6}
-    scan, platform = (
-        Scanner.of_table({**small, "pixels": pixels}).directions(times) for pixels in ("scan", "platform")
-    )
-    np.testing.assert_allclose(platform.far, np.tile([0, 1, 0], (8, 1)), atol=1e-7)
-    np.testing.assert_allclose(platform.left, np.tile([-1, 0, 0], (8, 1)), atol=1e-7)
-    np.testing.assert_allclose(_azimuth_deg(scan.far) % 360, np.arange(8) * 45, atol=1e-6)
-
-
 @each_row(
     ("given", "message"),
     [

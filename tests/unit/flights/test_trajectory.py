@@ -79,11 +79,6 @@ def test_headings_pass_north_the_short_way():
     np.testing.assert_allclose((yaw + 180) % 360 - 180, [-10, -5, 0, 5, -5, -10], atol=1e-12)
 
 
-def test_rolls_pass_the_back_the_short_way():
-    trajectory = Trajectory([0, 1], np.zeros((2, 3)), [170, -170], [0, 0], [0, 0])
-    np.testing.assert_allclose(trajectory.at([0, 0.25, 0.75, 1]).roll_deg, [170, 175, -175, -170])
-
-
 def test_parallel_lines_alternate():
     trajectory = platform_of({**LINES, "count": 3, "spacing": 40, "turn_s": 20, "crab_deg": 3}).trajectory()
     np.testing.assert_allclose(trajectory.lines, [(0, 10), (30, 40), (60, 70)])

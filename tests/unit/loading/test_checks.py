@@ -208,16 +208,12 @@ def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
     assert str(caught.value).isprintable()
 
 
-def test_names_of_files_are_texts():
+def test_names_of_files_are_texts_and_types_are_checked_with_parameters_in_place(tmp_path):
     with pytest.raises(UserError, match=r"profile_file = 1.0 must be a text, the name of a file"):
         open_scene({"type": "scene", "laser": {"type": "lidar_transmitter", "profile_file": 1.0}}, None)
-
-
-def test_types_are_checked_with_parameters_in_place(tmp_path):
     text = '<default name="kind" value="lidar_merging"/><integrator type="$kind"/>'
-    written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', text)
     with pytest.raises(UserError, match=NOT_A_NAME):
-        open_scene(written, {"kind": PATH})
+        open_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', text), {"kind": PATH})
 
 
 def test_integrators_of_a_command_are_names():

@@ -115,10 +115,8 @@ def test_text_with_includes_in_place(scene):
 def test_mitsuba_reads_the_same(scene):
     config = mi.parser.ParserConfig(mi.variant())
     for given in ({}, {"radius": "5", "grey": "0.2"}):
-        states = (
-            mi.parser.parse_file(config, str(scene), **given),
-            mi.parser.parse_string(config, read_document(scene).text, **given),
-        )
+        own = mi.parser.parse_string(config, read_document(scene).text, **given)
+        states = (mi.parser.parse_file(config, str(scene), **given), own)
         first, second = ([(node.type, str(node.props)) for node in state.nodes] for state in states)
         assert first == second
         assert f'"radius" -> {given.get("radius", "2")}' in first[1][1]
@@ -191,12 +189,10 @@ def test_includes_that_double_are_refused_at_once(tmp_path):
 def test_parameters_that_double_are_refused_at_once(tmp_path):
     """40 parameters that name the next one twice are a text of a terabyte."""
     parameters = [f'<default name="p{n:02}" value="$p{n + 1:02},$p{n + 1:02}"/>' for n in range(40)]
-    parameters += ['<default name="p40" value="1"/>']
-    shape = '<shape type="sphere"><float name="radius" value="$p00"/></shape>'
-    path = tmp_path / "bomb.xml"
-    path.write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
+    shape = '<default name="p40" value="1"/><shape type="sphere"><float name="radius" value="$p00"/></shape>'
+    (tmp_path / "bomb.xml").write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
     with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
-        scenes.open_scene(path)
+        scenes.open_scene(tmp_path / "bomb.xml")
 
 
 @pytest.mark.parametrize("folder", ["maps", "$x"])

@@ -124,12 +124,11 @@ def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
 
 
 def test_the_printed_xml_is_included_by_a_scene(tmp_path):
-    name = "teledyne_czmil"
-    (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))
+    (tmp_path / "instrument.xml").write_text(instruments.instrument_text("teledyne_czmil"))
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
     ours, plain = scenes.open_scene(path).scene, mi.load_file(str(path), optimize=False)
-    mounted = scenes.open_scene("table1", FLAT, name).scene
+    mounted = scenes.open_scene("table1", FLAT, "teledyne_czmil").scene
     for loaded in (ours, plain):
         for part, expected in zip(parts(loaded), parts(mounted), strict=True):
             assert part.pose.origin == pytest.approx(expected.pose.origin)

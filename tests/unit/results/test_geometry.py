@@ -116,11 +116,9 @@ def test_lines_of_sight_without_coordinates_are_those_of_the_centres():
 
 
 def test_sum_of_pixels_looks_where_most_light_is():
+    """A mixture has the mean variance plus the variance of the means."""
     _, lines = image()
-    total = lines.combined()
-    weight = np.arange(6.0) / 15
-    assert total.surface_time[0] == pytest.approx(1419 + weight @ np.arange(6.0))
-    # A mixture has the mean variance plus the variance of the means.
-    mean = weight @ np.arange(6.0)
-    variance = weight @ (0.1 * np.arange(6.0)) ** 2 + weight @ (np.arange(6.0) - mean) ** 2
+    total, weight, number = lines.combined(), np.arange(6.0) / 15, np.arange(6.0)
+    assert total.surface_time[0] == pytest.approx(1419 + weight @ number)
+    variance = weight @ (0.1 * number) ** 2 + weight @ (number - weight @ number) ** 2
     assert total.surface_spread[0] == pytest.approx(math.sqrt(variance))

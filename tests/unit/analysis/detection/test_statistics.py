@@ -97,11 +97,6 @@ def test_probability_of_detection_in_closed_form():
     assert statistic.area() == pytest.approx(norm.cdf(4.3718 / np.sqrt(2)))
 
 
-def test_noise_with_the_target_counts():
-    statistic = one_case(np.array([3.0]), np.eye(1), factor=4.0).statistic()
-    assert float(statistic.detection(1e-3)) == pytest.approx(norm.cdf((3 - norm.isf(1e-3)) / 2))
-
-
 def test_no_other_weights_do_better():
     random = np.random.default_rng(1)
     root = random.normal(size=(5, 5))

@@ -49,11 +49,8 @@ def test_columns_that_no_water_makes_are_nan():
 
 def test_kd_is_near_that_of_an_independent_study():
     """Kirk (1984), doi:10.4319/lo.1984.29.2.0350, for the sun at the zenith and a phase function of Petzold."""
-    for absorption, scattering, backscattering in (
-        (0.0532, 0.124, 0.00196),
-        (0.179, 0.219, 0.00293),
-        (0.0951, 0.432, 0.00944),
-    ):
+    waters = (0.0532, 0.124, 0.00196), (0.179, 0.219, 0.00293), (0.0951, 0.432, 0.00944)
+    for absorption, scattering, backscattering in waters:
         found = water_of_column(absorption, backscattering / (2 * math.pi), 0.0, 1.0)
         assert 0.87 < float(found.kd) / math.sqrt(absorption**2 + 0.235 * absorption * scattering) < 0.98
 

@@ -130,12 +130,3 @@ def test_a_single_record_behind_a_logarithm_is_expanded():
     del shots.attrs["receiver.logarithm.volts_per_decade"]
     with pytest.raises(UserError, match=r"no attribute receiver.logarithm.volts_per_decade"):
         echo_table.extract(shots)
-
-
-def test_waveforms_in_the_noise_are_flagged():
-    dataset = recorded(np.stack([waveform(), 0 * TIME]), 20, 0.05)
-    table = echo_table.extract(dataset, ["gaussian", "peak", "deconvolution"])
-    dark = table.isel(pixel=1)
-    assert np.isnan(dark["time_ns"]).all()
-    assert (dark["flags"] == EchoFlag.NO_ECHO).all()
-    assert np.isfinite(table["time_ns"].isel(pixel=0).sel(echo="bottom")).all()

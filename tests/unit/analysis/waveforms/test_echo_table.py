@@ -150,14 +150,6 @@ def test_rows_say_why_a_depth_is_unknown():
     assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
 
 
-def test_imager_and_blocks_give_the_same_as_pixels():
-    flat = echo_table.extract(result())
-    image = echo_table.extract(result(grid=(2, 2)), block=3)
-    assert image["time_ns"].dims == ("row", "column", "echo")
-    np.testing.assert_array_equal(image["time_ns"].values.reshape(4, 4), flat["time_ns"].values)
-    assert "angle_x" in image.coords
-
-
 def test_layers_of_the_water_are_found():
     """Half the backscatter from 3 m down."""
     step = 3.0 / PER_NS

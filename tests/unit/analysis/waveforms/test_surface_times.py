@@ -61,15 +61,6 @@ def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
     assert 0.8 < z.std() < np.sqrt(largest_chi2(shots) / shots)
 
 
-def test_a_late_echo_in_a_lit_pixel_is_replaced():
-    level = lines(1).surface_time
-    late = level + np.array([0, 0, 12.0, 0, np.nan])
-    found = infer(late)
-    assert found.own.tolist() == [[True, True, False, True, False]]
-    np.testing.assert_allclose(found.time_ns, level)
-    assert found.stderr_ns[0, 2] > 0.3
-
-
 def test_an_echo_outside_the_heights_of_the_sea_is_not_the_surface():
     """A bottom 8 m deep, 75 ns late in all pixels, refers to the mean sea level, whose heights are its error."""
     found = infer(lines(1).surface_time + 75)
