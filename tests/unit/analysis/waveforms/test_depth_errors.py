@@ -96,7 +96,7 @@ def test_scattered_light_counts_with_the_beam_inside_the_view():
     assert 0.001 < wide / 8 < 0.02
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_published_biases_of_depth_appear_in_rendered_results():
     """Turbid water: 8 m too deep at nadir, too shallow far off it, by undercutting (Guenther and Thomas 1984)."""
     params = {
