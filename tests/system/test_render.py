@@ -30,7 +30,7 @@ def small(scene="table1", **options):
 def test_intervals_cover_the_long_run_mean(lidar_scene):
     """Intervals of four passes (Student's t, 95 %) hold the mean of many seeds in 95 % of the bins and gates.
 
-    Errors that are those of a pass, not of the mean, would make it 100 %. Judged are bins with errors below 10 %. With
+    Errors that are those of a pass, not of the mean, would make it 99 %. Judged are bins with errors below 10 %. With
     larger ones, light of few paths makes the distribution of a pass skew: 94 % of the bins with errors of 10 to 20 %,
     91 to 93 % with 20 to 40 %, 50 to 70 % beyond.
     """
