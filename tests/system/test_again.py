@@ -82,6 +82,14 @@ def test_a_result_and_its_files_give_the_same_bits(suffix, table, tmp_path):
 
 
 @pytest.mark.slow
+def test_given_options_win(own):
+    other = mitransient_lidar.render(own, seed=1, passes=3, integrator={**FEW, "paths_per_pass": 2048})
+    assert (other.attrs["seed"], other.attrs["passes"]) == (1, 3)
+    assert json.loads(other.attrs["plugin_parameters"])["integrator"]["paths_per_pass"] == 2048
+    assert_same_bits(mitransient_lidar.render(other, seed=0, passes=2, integrator=FEW), own)
+
+
+@pytest.mark.slow
 def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder):
     first, path = own, folder / "profile.csv"
     (file,) = json.loads(first.attrs["scene_files"])

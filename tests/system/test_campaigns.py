@@ -18,10 +18,35 @@ from command_line import assert_refused, run
 from quick_campaign import QUICK, files_of, planned_copy, write_toml
 
 from mitransient_lidar.campaigns import shard as shards
+from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
 from mitransient_lidar.campaigns.versions import FILES, check_versions
 from mitransient_lidar.core.errors import UserError
+
+
+@pytest.mark.slow
+def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path):
+    """Ctrl-C comes when three runs are done; processes write what they have."""
+    path, pressed = tmp_path / "other.zarr", []
+
+    def press(state):
+        if state.done >= 3 and not pressed:
+            pressed.append(state.done)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with pytest.raises(KeyboardInterrupt, match=r"interrupted after \d+ of 12 runs, which are kept; the same command"):
+        run_campaign(campaign, path, workers=2, shard_size=5, progress=press)
+    signal.signal(signal.SIGINT, former)
+    assert np.count_nonzero(Store(path).status() == DONE) >= 3
+    first, other = open_campaign(quick), resume(path, workers=1)
+    for name in first.variables:
+        np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))
+    before = files_of(path)
+    run_campaign(campaign, path, workers=1, shard_size=5)
+    assert files_of(path) == before
 
 
 @pytest.mark.long
@@ -181,6 +206,15 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
     shard_code(monkeypatch, "arrays(self, number, values)", start)
     outcome = shards.render_in_process(str(path), 1)
     assert outcome == ((6, 0, "") if deaths == 2 else (0, 0, "shard 1: the process ended by signal 9"))
+
+
+@pytest.mark.slow
+def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
+    """The command says which ones to look at."""
+    path = planned_copy(quick, tmp_path / "left.zarr")
+    monkeypatch.setattr(workers, "render_in_process", lambda path, shard, *_: shards.Outcome(0, 0, "shard 0: lost"))
+    with pytest.raises(UserError, match=r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log"):
+        resume(path, workers=1)
 
 
 @pytest.mark.long

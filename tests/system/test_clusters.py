@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
+from command_line import assert_refused, run
 from quick_campaign import files_of, planned_copy
 
 from mitransient_lidar._version import __version__
@@ -21,6 +23,7 @@ from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
+from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError
 
 SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
@@ -230,6 +233,34 @@ def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind)
         finally:
             worker.kill()
     assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.slow
+def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
+    """Workers may join later, and files may change while a worker runs."""
+    path = planned_copy(quick, tmp_path / "other.zarr")
+    processes = shards.Processes({**own_versions(), "drjit": "1.4.9"}, "the worker at tcp://a:1")
+    with pytest.raises(UserError, match=r"the worker at tcp://a:1 has drjit 1\.5\.0 instead of 1\.4\.9: all that"):
+        shards.render_in_process(str(path), 0, processes=processes)
+    assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.slow
+def test_other_servers_than_schedulers(quick):
+    """An HTTP server once gave a traceback, and 40 s."""
+
+    def serve():
+        while True:
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(1000)
+                connection.sendall(b"HTTP/1.0 200 OK\r\n\r\nok")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        text = f"--scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT"
+        assert_refused(run("campaign", quick, "-q", "--scheduler", address), text)
 
 
 def test_a_scheduler_that_stops_while_it_starts(monkeypatch, tmp_path):

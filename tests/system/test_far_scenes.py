@@ -6,6 +6,7 @@ import mitsuba as mi
 import mitsuba_plugins
 import numpy as np
 import pytest
+from rows import each_row
 from same_bits import assert_same_bits
 
 import mitransient_lidar
@@ -13,6 +14,7 @@ from mitransient_lidar.loading import catalogue, frame
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.studies.find_shots import find_shots
+from mitransient_lidar.transport.scene_parts import find_receiver, lidar_sensor
 
 #: As in map coordinates, a whole number of periods of the sea [m]; the other place is between its cells.
 FAR, BETWEEN = (5e5, -9e5), (123456.789, -9876543.21)
@@ -175,3 +177,15 @@ def test_texture_of_a_far_seabed_stays_in_place():
         colours.append(np.array(bottom.bsdf().eval_diffuse_reflectance(si)))
     assert colours[0].std() > 0.09
     np.testing.assert_array_equal(*colours)
+
+
+@each_row("stays", ["near", "loaded", "unknown"])
+def test_near_scenes_and_those_of_unknown_places_stay(stays):
+    x, y = (240.0, -60.0) if stays == "near" else FAR
+    sphere = ball(x, y)
+    one = {"centers": [[x, y, -4]], "scales": [[1, 1, 1]], "quaternions": [[0, 0, 0, 1]]}
+    one = {name: mi.TensorXf(np.array(values, np.float32)) for name, values in one.items()}
+    parts = {"near": sphere, "loaded": mi.load_dict(sphere), "unknown": {"type": "ellipsoids", **one}}
+    scene = open_scene(scene_at(x, y, part=parts[stays])).scene
+    assert not frame.frame_origin(scene).any()
+    assert find_receiver(lidar_sensor(scene)).pose.ground_point()[0] == pytest.approx(x)

@@ -8,7 +8,10 @@ from command_line import assert_refused, run
 from oracles import las_reader
 from significance import largest_z
 
-from mitransient_lidar.campaigns.store import DONE, Store
+from mitransient_lidar.campaigns import workers
+from mitransient_lidar.campaigns.shard import Outcome, render_shard
+from mitransient_lidar.campaigns.store import DONE, FAILED, Store
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.fly import STORE, fly
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.products import Flown, describe_points
@@ -192,6 +195,33 @@ def assert_files(folder, points, flown):
 def test_flights_that_cannot_be_rendered(change, message):
     with pytest.raises(Exception, match=message):
         FlightRenderer.of(FlightPlan.of_file({**FLIGHT, **change}))
+
+
+@pytest.mark.long
+def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
+    """The other pulses have their points."""
+    path, folder, stacked = tmp_path / "short.toml", tmp_path / "failed", FlightRenderer.stacked
+    text = TOML.replace("rate_hz = 320.0, most = 32", "rate_hz = 40.0, most = 4")
+    path.write_text(text.replace("still_sea = true", "still_sea = false"))
+
+    def fails(renderer, numbers, inputs):
+        if 0 in numbers:
+            raise UserError("the sea is too rough")
+        return stacked(renderer, numbers, inputs)
+
+    def render_here(path, shard, retry, report, processes):
+        found = []
+        render_shard(path, shard, retry, {}, set(), lambda **event: found.append(event), lambda: False)
+        return Outcome(found[-1]["done"], found[-1]["failed"])
+
+    monkeypatch.setattr(FlightRenderer, "stacked", fails)
+    monkeypatch.setattr(workers, "render_in_process", render_here)
+    out = run("fly", path, "-o", folder, "--workers", 1, "-q")
+    failed = np.count_nonzero(Store(folder / STORE).status() == FAILED)
+    assert 0 < failed < 4
+    assert out.exit_code == 1
+    assert out.stderr.splitlines()[-1] == f"{failed} of 4 shots failed, the first, shot 0, so: the sea is too rough"
+    assert len(laspy.read(folder / "points.laz")) > 0
 
 
 def test_command_refuses_bad_flights(tmp_path):

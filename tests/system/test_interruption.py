@@ -112,3 +112,15 @@ def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
     stdout, stderr = process.communicate(timeout=240)
     assert (process.returncode, stderr) == (code, "")
     assert "table1" in stdout
+
+
+@pytest.mark.slow
+def test_a_render_with_closed_streams_writes_its_files_and_nothing_into_them(tmp_path):
+    """It once wrote nothing, with exit code 2; files took the number of stderr, which libraries write to."""
+    coarse = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
+    command = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-m", "mitransient_lidar", *RENDER, *coarse]
+    done = subprocess.run([*command, "--passes", "2", "-o", str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert names(tmp_path) == FILES
+    for suffix in ("nc", "exr"):
+        assert mitransient_lidar.open(tmp_path / f"table1.{suffix}").attrs["passes"] == 2

@@ -125,6 +125,26 @@ def test_water_without_a_visible_bottom():
 
 
 @pytest.mark.slow
+def test_the_record_holds_its_gates():
+    gates = {"gate_count": 4, "gate_width_ns": 30.0}
+    for start in (1300.0, 1900.0):
+        axis = prepared(beside((0, 0, 0), {**gates, "gate_start_ns": start})).axis
+        assert axis.start_ns < min(start, 1410) - 10
+        assert axis.end_ns > max(start + 120, 1500) + 10
+
+
+def test_a_scene_without_water():
+    """A plate in the air, 20 m above the lowest point, and no light of a sea."""
+    transform = mi.ScalarTransform4f()
+    plate = {"type": "rectangle", "to_world": transform.translate([0, 0, 20]).scale(50), "bsdf": {"type": "diffuse"}}
+    scene = {name: part for name, part in beside((0, 0, 0)).items() if name not in ("sea", "bottom")}
+    axis = prepared({**scene, "plate": plate}).axis
+    near, far = (2 * 180 / 0.299792458 / np.cos(np.radians(20) + side * 15e-3) for side in (-1, 1))
+    assert near - 20 < axis.start_ns < near - 15
+    assert far + 15 < axis.end_ns < far + 20
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("params", "sentence"),
     [

@@ -68,6 +68,15 @@ def test_the_error_of_the_energy_has_the_correlation_of_bins():
     assert together.energy_ratio_stderr > 5 * alone
 
 
+def test_bins_outside_the_window_or_badly_known_do_not_count():
+    window = {"window_start_ns": 20.0, "window_end_ns": 60.0}
+    outcome = comparison.compare(result(1, **window), result(2, **window))
+    assert outcome.bin_count == 80  # bins 20 to 59 with their centres within, of two pixels
+    noisy = result(2)
+    noisy["impulse_response_stderr"][0] = noisy["impulse_response"][0] * 0.4
+    assert comparison.compare(result(1), noisy).bin_count == 100
+
+
 def test_sidak_limit_has_the_significance():
     """Among 200 numbers; Bonferroni's is 0.2 % of z higher, no correction 1.3 lower."""
     limit = comparison.sidak_limit(200)

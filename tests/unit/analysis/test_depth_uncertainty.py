@@ -10,6 +10,7 @@ from mitransient_lidar.analysis.depth_uncertainty import (
     TrajectoryErrors,
     non_negative_line,
     sounding_uncertainty,
+    write_fits,
 )
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 
@@ -120,3 +121,15 @@ def test_lost_bottoms_have_no_uncertainty():
         found = sounding_uncertainty(made).isel(wind_speed=4, water=5, off_nadir_deg=0)
         np.testing.assert_allclose(found["vertical_a"], constant)
         np.testing.assert_allclose(found["vertical_b"], 0 * np.asarray(constant))
+
+
+def test_file_of_fits_has_the_rows_that_uncertainty_tools_take_by_their_number(tmp_path):
+    """Row 6 w + k belongs to the wind w of five and the water k of six."""
+    found = sounding_uncertainty(table()).isel(off_nadir_deg=0)
+    write_fits(found.sel(correction="none"), "vertical", tmp_path / "fits.csv")
+    lines = (tmp_path / "fits.csv").read_text().splitlines()
+    assert lines[0] == "Wind,JerlovType,a,b"
+    assert len(lines) == 31
+    assert lines[1 + 6 * 2 + 3] == "5,5C,0.05,0.008"
+    assert lines[1] == "1,III,0.01,0.002"
+    assert lines[30].startswith("9,9C,0.09,")

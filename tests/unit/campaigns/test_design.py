@@ -21,6 +21,9 @@ CAMPAIGN = {
 }
 
 
+TWO = {"scene": "table1", "design": {"kind": "random", "count": 2}}
+
+
 TOML = """
 scene = "table1"
 target_error = 0.1
@@ -85,6 +88,15 @@ def test_grid_has_all_combinations():
     np.testing.assert_allclose(np.unique(table["attenuation"]), [0.1, 10**-0.5, 1])
 
 
+def test_table_of_a_file(tmp_path):
+    (tmp_path / "runs.csv").write_text("bottom_depth, petzold\n5, clear\n7.5, coastal\n")
+    given = {"scene": "table1", "parameters": {"altitude": "20 * bottom_depth"}, "design": {"file": "runs.csv"}}
+    table = Campaign.of_file(given, tmp_path).table()
+    assert table["bottom_depth"].tolist() == [5, 7.5]
+    assert table["petzold"].tolist() == ["clear", "coastal"]
+    assert table["altitude"].tolist() == [100, 150]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -110,6 +122,13 @@ def test_read(tmp_path):
     assert len(campaign.table()["bottom_depth"]) == 3
     again = Campaign.from_json(campaign.text)
     np.testing.assert_array_equal(again.table()["bottom_depth"], campaign.table()["bottom_depth"])
+
+
+def test_scene_beside_the_file(tmp_path):
+    (tmp_path / "mine.xml").write_text("<scene version='3.0.0'/>")
+    assert Campaign.of_file({**TWO, "scene": "mine.xml"}, tmp_path).scene == str(tmp_path / "mine.xml")
+    (tmp_path / "table1").write_text("another file")
+    assert Campaign.of_file(TWO, tmp_path).scene == "table1"
 
 
 @pytest.mark.parametrize("text", ["scene = ", "\x00"])

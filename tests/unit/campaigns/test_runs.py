@@ -48,6 +48,16 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
     assert [path for path, _ in record.files.values()] == [str(tmp_path / "map.npy")]
 
 
+@pytest.mark.slow
+def test_random_seas_are_of_the_run():
+    runs = renderer({"bottom_depth": [3.0, 4.0]})
+    seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]
+    assert len(set(seas)) == 100
+    assert runs.inputs(7, {"bottom_depth": 5.0}) == {"bottom_depth": 5.0, "surface_seed": seas[7]}
+    given = renderer({"surface_seed": [3, 4]})
+    assert given.inputs(0, {"surface_seed": 3}) == {"surface_seed": 3}
+
+
 @pytest.fixture
 def asked(monkeypatch):
     """Replace `render_shots`; return the parameters and options of its calls."""

@@ -1,8 +1,10 @@
+import contextlib
 import errno
 import os
 import re
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,12 @@ import xarray as xr
 import zarr
 from rows import each_row
 
+from mitransient_lidar.campaigns import sweep
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
-from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign, seal
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign, reporting_damage, seal
 from mitransient_lidar.campaigns.sweep import describe_campaign
+from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
@@ -96,6 +100,19 @@ def test_new_store_is_empty_and_complete(store, path):
     assert (data.attrs["time_start_ns"], data.attrs["bin_width_ns"]) == (1000, 0.5)
 
 
+def test_a_store_is_completed_by_its_own_campaign_only(store):
+    renderer = store.renderer()
+    assert (renderer.plan.text, renderer.axis, renderer.scene.parameters) == (CAMPAIGN.text, AXIS, {"time": "0"})
+    store.require(CAMPAIGN, CAMPAIGN.table(), lambda: RECORD)
+    given = {"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}}
+    other, edited = Campaign.of_file(given), CAMPAIGN.table()
+    edited["time"] = edited["time"] + 1e-9
+    changed = replace(RECORD, text="<scene></scene>")
+    for rows in ((other, other.table(), RECORD), (CAMPAIGN, edited, RECORD), (CAMPAIGN, CAMPAIGN.table(), changed)):
+        with pytest.raises(UserError, match="holds another campaign, or its scene has changed"):
+            store.require(*rows[:2], lambda scene=rows[2]: scene)
+
+
 def test_shards_are_written_and_read(store, path):
     status, errors, arrays = filled(store, 1, 7)
     status[:], errors[:] = DONE, ""
@@ -111,6 +128,14 @@ def test_shards_are_written_and_read(store, path):
         "10 runs: 3 done, 1 failed, 6 planned",
         f"failed 1, the first run 6: {errors[2]}",
     ]
+
+
+def test_a_finished_shard_is_not_written_again(store, path):
+    status, errors, arrays = filled(store, 0, 7)
+    store.write(0, np.full_like(status, DONE), errors, arrays)
+    store.write(0, status, errors, {name: array + 1 for name, array in arrays.items()})
+    assert (open_campaign(path)["waveform"].isel(run=slice(0, 4)) == 7).all()
+    assert store.status().tolist() == [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]
 
 
 def test_status_is_written_last(store, path, monkeypatch):
@@ -169,6 +194,16 @@ def test_a_store_with_a_lost_chunk_is_read_without_its_runs(full, path):
     assert describe_campaign(path) == ["10 runs: 6 done, 0 failed, 4 planned"]
 
 
+def test_damaged_values_are_not_read(full, path):
+    flip(path / "waveform/c/0/0/0/0")
+    data = open_campaign(path)
+    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"), reporting_damage(path):
+        data["waveform"].load()
+    (path / "waveform" / "zarr.json").write_text("{")
+    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
+        Store(path)
+
+
 @each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
 @each_row("damage", [flip, Path.unlink])
 def test_damaged_coordinates_are_refused(full, path, name, damage):
@@ -211,6 +246,24 @@ def test_edited_attributes_are_refused(full, path, change, message, sealed):
         Store(path)
 
 
+def test_a_store_that_another_process_has_just_made(full, path):
+    """The second one of two sweeps that begin together goes on with the store of the first one."""
+    renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
+    made = Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
+    assert (made.status() == DONE).all()
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_failed_creation_leaves_nothing(path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(zarr.Group, "create_array", full)
+    with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
+        Store.create(path, RunRenderer(CAMPAIGN, RECORD, AXIS), CAMPAIGN.table(), ARRAYS, COORDINATES)
+    assert not list(path.parent.iterdir())
+
+
 def test_lines_of_the_documentation_make_a_batch(tmp_path, monkeypatch):
     text = (Path(__file__).parents[3] / "docs" / "guide" / "campaigns.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -238,6 +291,18 @@ def test_size_of_shards(tmp_path, count, size):
     columns = {"altitude": np.arange(count)}
     made = Store.create(tmp_path / "a.zarr", RunRenderer(CAMPAIGN, RECORD, AXIS), columns, ARRAYS, COORDINATES)
     assert made.shard_size == size
+
+
+def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
+    """One shard was: each worker has one."""
+    monkeypatch.setattr(validation, "usable_memory", lambda: 2000.0)
+    rendered = []
+    monkeypatch.setattr(sweep, "on_this_machine", lambda few, *_: contextlib.nullcontext(few))
+    monkeypatch.setattr(sweep, "_render", lambda store, shards, pool, tally: rendered.append(pool))
+    sweep.complete(lambda: store, 2, None, False, None)
+    with pytest.raises(UserError, match=r"4 runs, 3 at a time, take .* at most 2e-06 GB may be: take fewer workers"):
+        sweep.complete(lambda: store, 4, None, False, None)
+    assert rendered == [2]
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "waveform", "waveform/zarr.json", "status/c/0"])

@@ -15,6 +15,7 @@ import pytest
 import rich.console
 import xarray as xr
 from command_line import assert_refused, run, stub
+from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import messages
@@ -99,6 +100,21 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
         assert part in result.stderr
 
 
+@each_row("quiet", [True, False])
+def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
+    """They once were shown after its report, and earlier, those of the program that called it were silent, too."""
+    logger = logging.getLogger("mitransient_lidar")
+    before = logger.propagate, logger.level, [*logger.handlers]
+    monkeypatch.setattr("mitransient_lidar.results.dataset_of", lambda *_: logger.warning("early") or xr.Dataset())
+    stub(monkeypatch, "record", lambda *_, **__: ())
+    monkeypatch.setattr("mitransient_lidar.analysis.receiver.describe_recording", lambda *_, **__: ())
+    monkeypatch.setattr("mitransient_lidar.cli.analysis.write_netcdf", lambda *_: logger.warning("late"))
+    done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
+    assert done.exit_code == 0, done.output
+    assert ("early" in done.stderr, caplog.messages) == ((False, []) if quiet else (True, ["early", "late"]))
+    assert (logger.propagate, logger.level, logger.handlers) == before
+
+
 @pytest.mark.slow
 def test_interrupted_render_is_kept(scene, calls, tmp_path):
     calls.extra["interrupted"] = 1
@@ -133,6 +149,14 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept.\n")
 
 
+def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
+    calls.extra["error"] = KeyboardInterrupt()
+    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
+    assert result.exit_code == 130
+    assert result.stderr == "interrupted.\n"
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene, calls, tmp_path, monkeypatch):
     """Its sentence once passed for one of pixels that do not see the sea, with exit code 0 and a stale picture."""
 
@@ -164,6 +188,15 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
     assert result.exit_code == 130
     assert results.open(tmp_path / "out" / "fig09.nc").attrs["passes"] == 4
     assert (tmp_path / "out" / "fig09.exr").exists()
+
+
+def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
+    (tmp_path / "file").write_text("regular")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert_refused(run("render", scene, "-o", folder), f"cannot write to folder {folder}: Not a directory.")
+    (tmp_path / "fig09.nc").mkdir()
+    assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder.")
+    assert not calls.seen
 
 
 def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):

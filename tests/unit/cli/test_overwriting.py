@@ -236,6 +236,22 @@ def test_line_names_what_differs():
     assert done.exit_code == 0
 
 
+def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
+    """It has no mark, and the SHA-256 at its end."""
+    held = {"scene": "table1", "pass_share": 1.0, "elapsed_s": 3.0, "scene.wind_speed": "5"}
+    saved = results.open("shot.nc").assign_attrs(held)
+    results.save(saved, "d/table1.nc")
+    former = overwriting._mark_of_result(folder / "d/table1.nc")
+    assert (former["command"], former["subject"]["scene"]) == ("render", "table1")
+    assert "is kept" not in command("render").stderr
+    results.save(saved.assign_attrs(elapsed_s=61.0), "d/table1.nc")
+    assert_refused(command("render"), "since it took 61 s to make")
+    results.save(saved.assign_attrs(scene="fig09_2x2"), "d/table1.nc")
+    assert_refused(command("render"), "since its scene is fig09_2x2")
+    saved.to_netcdf("d/table1.nc", engine="h5netcdf")
+    assert_refused(command("render"), "since no command has written it as it is")
+
+
 @pytest.mark.usefixtures("small_figures")
 @pytest.mark.slow
 def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):

@@ -142,6 +142,17 @@ def test_times_their_type_and_the_notes_agree(
         np.testing.assert_array_equal(read_column(file, "gps_time"), points["gps_time"] - less)
 
 
+def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset) -> None:
+    points["intensity"].values[:3] = [-0.1, 7.0, np.nan]
+    write_points(tmp_path / "points.las", points)
+    file = las_reader.read(tmp_path / "points.las")
+    notes = file.records["LASF_Spec", 3].rstrip(b"\0").decode("ascii")
+    step = float(re.search(r"Intensity: 1 is (\S+) V\.", notes)[1])
+    read = read_column(file, "intensity")
+    assert read[:3].tolist() == [0, 65535, 0]
+    assert np.max(np.abs(step * read[3:] - points["intensity"][3:])) <= 0.5001 * step
+
+
 def test_points_without_an_echo_are_synthetic_and_doubtful_ones_withheld(tmp_path: Path, points: xr.Dataset) -> None:
     write_points(tmp_path / "points.las", points)
     file = las_reader.read(tmp_path / "points.las")
@@ -179,6 +190,13 @@ def test_compressed_points_are_those_without_compression(tmp_path: Path, points:
     assert compressed.points.array.tobytes() == plain.points.array.tobytes()
     np.testing.assert_allclose(compressed.x, points["x"], rtol=0, atol=0.51e-3)
     np.testing.assert_array_equal(compressed["shot"], points["shot"])
+
+
+@each_row("crs", ["EPSG:32633", "EPSG:32633+5773"])
+def test_coordinate_system_by_code(tmp_path: Path, points: xr.Dataset, crs: str) -> None:
+    write_points(tmp_path / "points.las", points, crs)
+    record = las_reader.read(tmp_path / "points.las").records["LASF_Projection", 2112]
+    assert pyproj.CRS.from_wkt(record.rstrip(b"\0").decode()).equals(pyproj.CRS(crs), ignore_axis_order=True)
 
 
 # Coordinate systems
@@ -344,6 +362,18 @@ def test_wrong_waveforms(tmp_path: Path, points: xr.Dataset, changes: dict[str, 
     with pytest.raises(UserError, match=re.escape(message)):
         write_waveforms(tmp_path / "waveforms.las", points, values)
     assert not any(tmp_path.iterdir())
+
+
+def test_later_waveforms_that_differ(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
+    parts, packets = chunks(points, waveforms, 20)
+    for second, message in (
+        (waveform_dataset(np.zeros((20, SAMPLES + 1))), "51 samples is longer than the first ones, 50"),
+        (waveform_dataset(np.zeros((20, SAMPLES)), gain=1e-3), "gain = 0.001 must be that of the first waveforms"),
+    ):
+        packets[1] = second
+        with pytest.raises(UserError, match=re.escape(message)):
+            write_waveforms(tmp_path / "waveforms.las", parts, packets)
+        assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["points.las", "points.laz", "waveforms.las"])

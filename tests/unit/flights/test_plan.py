@@ -1,5 +1,7 @@
 """Plans of flights: what a file may hold, and the groups and batches of pulses."""
 
+import json
+
 import numpy as np
 import pytest
 from rows import each_row
@@ -7,6 +9,7 @@ from rows import each_row
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.plan import FlightPlan, flights
 from mitransient_lidar.flights.preparation import input_columns
+from mitransient_lidar.flights.renderer import FlightRenderer
 
 LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
 PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0}
@@ -48,3 +51,24 @@ def test_pulses_of_one_group_have_similar_poses():
     assert 8 <= len(np.unique(columns["group"])) <= 9
     for group in np.unique(columns["group"]):
         assert np.all(np.diff(columns["pulse"][columns["group"] == group]) > 0)
+
+
+@each_row(("still", "longest"), [(False, 0.05), (True, 0.64)])
+def test_batches_are_of_one_group_and_one_sea(still, longest):
+    plan = FlightPlan.of_file({**FLIGHT, "still_sea": still})
+    columns = input_columns(plan.poses())
+    batches = list(FlightRenderer(plan, None, None).batches(columns))
+    assert [row for batch in batches for row in batch] == list(range(len(columns["pulse"])))
+    for batch in batches:
+        assert len(np.unique(columns["group"][batch])) == 1
+        assert np.ptp(columns["time_s"][batch]) < longest
+    assert max(len(batch) for batch in batches) == (64 if still else 5)
+
+
+def test_paths_are_those_of_the_folder(tmp_path):
+    given = {**FLIGHT, "receiver": {"chain": "own.toml"}, "corrections": "table.nc"}
+    plan = FlightPlan.of_file(given, tmp_path)
+    assert plan.receiver.chain == str(tmp_path / "own.toml")
+    assert plan.corrections == str(tmp_path / "table.nc")
+    # Workers read the stored text elsewhere.
+    assert json.loads(plan.text)["receiver"]["chain"] == str(tmp_path / "own.toml")

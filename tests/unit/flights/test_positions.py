@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from rows import each_row
 from scipy.spatial.transform import Rotation
-from significance import largest_z
+from significance import largest_chi2, largest_z
 from synthetic_shots import DEPTH, THETA, N, result
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
@@ -231,6 +231,37 @@ def mixed():
     return made
 
 
+def test_waveforms_without_an_echo_keep_a_point_where_they_look():
+    given = poses(1)
+    sea = SurfaceModel(level=0.4, height_deviation=0.2)
+    points = located(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
+    for name, expected in {
+        "kind": [41, 43, 40, 40, 41, 45],
+        "pixel": [0, 0, 0, 1, 2, 3],
+        "return_number": [1, 2, 3, 1, 1, 1],
+        "number_of_returns": [3, 3, 3, 1, 1, 1],
+        "intensity": [3, 5, 6, 6, 3, np.nan],
+        "depth": [0, 5, 8, 8, 0, np.nan],
+    }.items():
+        np.testing.assert_array_equal(points[name].values, expected, err_msg=name)
+    ray = sights(given)[0, 3]
+    silent = found(points, PointClass.NO_ECHO)[0]
+    np.testing.assert_allclose(silent, given["origin"][0] + (0.4 - given["origin"][0, 2]) / ray[2] * ray, atol=1e-9)
+    # Known but for the waves: a height that is off by its deviation moves the point along the line of sight.
+    for name, error in (("vertical", 0.2), ("horizontal", 0.2 * math.hypot(ray[0], ray[1]) / -ray[2])):
+        assert float(points[f"{name}_uncertainty"][-1]) == pytest.approx(error, rel=1e-12)
+
+
+def test_one_echo_of_many_pixels_in_rows_and_columns_is_where_it_is_as_one_of_pixels():
+    given, values = poses(3), np.full((3, 4), 6.0)
+    made = echoes(given["origin"][:, 2:] / -sights(given)[..., 2], values)
+    expected = located(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
+    grid = made.assign_coords(row=("pixel", [0, 0, 1, 1]), column=("pixel", [0, 1, 0, 1]))
+    grid = grid.set_index(pixel=("row", "column")).unstack("pixel")
+    image = located(grid, **given, angle_x=ANGLE_X.reshape(2, 2), angle_y=ANGLE_Y.reshape(2, 2), **INDICES)
+    xr.testing.assert_identical(image, expected)
+
+
 def test_points_of_measured_waveforms_are_the_true_ones_within_their_errors():
     made = extract(result().assign_attrs(surface_slope_variance=0.0))
     given = {
@@ -247,6 +278,19 @@ def test_points_of_measured_waveforms_are_the_true_ones_within_their_errors():
         error = np.abs(own["z"].values - height)
         assert np.all(error < 4 * own["vertical_uncertainty"].values), error
         assert np.all(own["vertical_uncertainty"].values < 0.2)
+
+
+def test_the_level_of_the_sea_is_known_within_its_error():
+    errors, levels = np.random.default_rng(7).uniform(0.02, 0.2, 400), []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        z = 0.35 + 0.1 * rng.normal(size=400) + errors * rng.normal(size=400)
+        spots = np.column_stack([rng.uniform(0, 100, (400, 2)), z])
+        levels.append(SurfaceModel.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
+    z_values = np.array([(one.level - 0.35) / one.level_error for one in levels])
+    assert abs(z_values.mean()) < largest_z(10**6) / math.sqrt(60)
+    assert (z_values**2).sum() < largest_chi2(60)
+    assert np.mean([one.height_deviation for one in levels]) == pytest.approx(0.1, rel=0.05)
 
 
 def linear_waves(seed, spacing, error):

@@ -3,6 +3,8 @@
 import numpy as np
 import significance
 import xarray as xr
+from scipy.stats import t
+from significance import largest_count
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
@@ -59,6 +61,17 @@ def test_pulses_that_saturate_are_counted():
         assert saturated_pulses(probes, plan, settings) == count
 
 
+def test_each_channel_has_its_own_gain():
+    """The deep pixel has a third of the light, and about three times the gain."""
+    plan, pixels = FlightPlan.of_file(FLIGHT), ["shallow_0", "deep"]
+    series = rendered("teledyne_czmil", pixels, 1e-2)
+    settings = chosen_settings([series], plan)
+    assert settings.keys() == {f"receiver_{name}_{number}" for name in ("gain", "density") for number in (0, 1)}
+    inputs = {"pulse": np.array([0]), **{name: np.array([value]) for name, value in settings.items()}}
+    assert record(series, plan, inputs).attrs["gain"] == detect_waveforms(series).attrs["gain"]
+    assert settings["receiver_gain_1"] > 1.5 * settings["receiver_gain_0"]
+
+
 def test_pooled_errors_are_those_of_counted_paths():
     """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights."""
     rng = np.random.default_rng(5 + significance.seed_shift)
@@ -74,3 +87,22 @@ def test_pooled_errors_are_those_of_counted_paths():
     ratio = np.sqrt(np.mean(((waveform.values - paths / paths.max()) / found) ** 2, axis=(0, 1)))
     assert np.all((ratio[20:100] > 0.75) & (ratio[20:100] < 1.02))
     assert found[..., 60].mean() < 1.25 * true[60]
+
+
+def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
+    """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
+    rng = np.random.default_rng(4 + significance.seed_shift)
+    column = np.exp(-0.05 * np.arange(120))
+    passes = column * (1 + 0.3 * rng.standard_normal((6, 500, 2, 120)))
+    waveform, stderr = (
+        xr.DataArray(values, dims=("shot", "pixel", "time"))
+        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(6))
+    )
+    found = pooled_errors(waveform, stderr)
+    assert np.all(found >= stderr)
+    off = np.abs(waveform - column)
+    bins = off.size
+    assert np.count_nonzero(off > 5 * stderr) > 0.5 * bins * 2 * t.sf(5, 5)
+    assert np.count_nonzero(off > 5 * found) <= largest_count(bins, 2 * t.sf(5, 20))
+    # They are true ones on average, but for what the larger of two errors adds.
+    assert 1.0 < float(np.sqrt(np.mean((found / column) ** 2))) / (0.3 / np.sqrt(6)) < 1.25

@@ -61,6 +61,18 @@ def test_splines_follow_a_smooth_motion(interval, of_position, of_angles):
     assert errors["linear"][0] > 0.9 * (60 * interval) ** 2 / (8 * 500)
 
 
+def test_splines_end_where_records_are_far_apart():
+    """Waypoints, and a gap between two flight lines: straight lines, which the records beside do not feel."""
+    time = np.array([0, 10, 20, 20.5, 21, 21.5, 22, 40, 40.5, 41, 41.5])
+    x = np.array([0, 100, 0, 10, 20, 30, 40, 900, 890, 880, 870])
+    zeros = np.zeros(time.size)
+    records = time, np.column_stack([x, zeros, zeros]), zeros, zeros, zeros
+    times = np.array([3, 15, 20.25, 21.9, 30, 40.1, 41.2])
+    linear, cubic = (Trajectory(*records, interpolation=kind).at(times) for kind in ("linear", "cubic"))
+    np.testing.assert_allclose(cubic.position, linear.position, atol=1e-9)
+    np.testing.assert_allclose(cubic.position[:, 0], [30, 50, 5, 38, 40 + 860 * 8 / 18, 898, 876], atol=1e-9)
+
+
 def test_headings_pass_north_the_short_way():
     yaw = _trajectory([0, 1, 2, 3], [350, 10, -10, 710]).at([0, 0.25, 0.5, 0.75, 1.75, 2.5]).yaw_deg
     # 350 to 10 is 20 degrees to the right; 10 to -10 is 20 to the left; -10 and 710 are the same.
@@ -86,6 +98,16 @@ def test_parallel_lines_alternate():
 
 def _without(given, name, **others):
     return {key: value for key, value in given.items() if key != name} | others
+
+
+def test_pulses_begin_with_each_line():
+    trajectory = platform_of({**LINES, "count": 2, "spacing": 40, "turn_s": 0.35}).trajectory()
+    times = trajectory.pulse_times(10)
+    # 10 s at 10 Hz, both ends included: 0.1 s does not divide the turn.
+    assert times.size == 202
+    np.testing.assert_allclose(times[:101], np.arange(101) / 10)
+    np.testing.assert_allclose(times[101:], 10.35 + np.arange(101) / 10)
+    assert (trajectory.at(times).line == np.repeat([0, 1], 101)).all()
 
 
 def test_noise_of_attitudes_is_stationary_with_its_correlation():
@@ -127,6 +149,13 @@ def test_noise_of_attitudes_is_stationary_with_its_correlation():
 def test_invalid_records(times, yaw, message):
     with pytest.raises(UserError, match=message):
         _trajectory(times, yaw)
+
+
+@each_row("time", [-0.1, 1.5, 4.1])
+def test_times_on_no_line_are_refused(time):
+    trajectory = _trajectory(np.arange(5), lines=[(0, 1), (2, 4)])
+    with pytest.raises(UserError, match=rf"time = {time:g} s \(number 2\) is on no flight line: .* 0 to 1 s, 2 to 4 s"):
+        trajectory.at([0.5, time])
 
 
 @each_row(

@@ -49,6 +49,15 @@ def test_units_and_decimal_commas_of_text(tmp_path):
     np.testing.assert_allclose(found, ROWS, rtol=0, atol=1e-9)
 
 
+def test_files_of_a_plan_have_an_origin_and_lines(tmp_path):
+    _write(tmp_path / "flight.trj", [], NAMES)
+    given = {"kind": "csv", "file": "flight.trj", "origin": [10, 20, 100], "lines_s": [[0, 0.5], [1, 1.25]]}
+    trajectory = platform_of(given).trajectory(tmp_path)
+    np.testing.assert_array_equal(trajectory.position, ROWS[:, 4:] - (10, 20, 100))
+    assert trajectory.rotation_spec == "ARINC 705"
+    np.testing.assert_array_equal(trajectory.at([0.25, 1.25]).line, [0, 1])
+
+
 @each_row(
     ("text", "message"),
     [
@@ -138,6 +147,14 @@ def test_meridian_convergence_of_utm(tmp_path):
     yaw = read_sbet_records(tmp_path / "flight.sbet", 32633).yaw_deg
     convergence = np.arctan(np.tan(np.radians(longitude - 15)) * np.sin(np.radians(latitude)))
     np.testing.assert_allclose(np.radians(90 - yaw), convergence, atol=3e-7)
+
+
+def test_truncated_sbet(tmp_path):
+    _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
+    data = (tmp_path / "flight.sbet").read_bytes()
+    (tmp_path / "flight.sbet").write_bytes(data[:-8])
+    with pytest.raises(UserError, match="has 400 bytes, but an SBET file must have a multiple of 136"):
+        read_sbet_records(tmp_path / "flight.sbet", 32633)
 
 
 @pytest.mark.parametrize(

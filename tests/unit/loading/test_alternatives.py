@@ -39,6 +39,16 @@ def test_waters_by_name_are_those_of_the_command(scene, kind, value):
         assert parameters[name] == ""
 
 
+def test_layers_of_named_waters():
+    column = load(jerlov="1C, 5C", layer_tops="0, 3")[0].column
+    np.testing.assert_array_equal(column.layer_tops, [0, 3])
+    assert column.attenuation == pytest.approx([water_of("jerlov", name).attenuation for name in ("1C", "5C")])
+    # A scene of layers with one water for all of them is that water.
+    assert load("thin_layer", jerlov="1C")[0].column.attenuation == pytest.approx(
+        [water_of("jerlov", "1C").attenuation]
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "width"), [("mrad", 1.0), ("fwhm_mrad", np.sqrt(8 * np.log(2)) / 2), ("1e2_mrad", 2.0)]
 )

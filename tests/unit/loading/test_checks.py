@@ -34,6 +34,14 @@ def test_types_that_are_paths_are_refused(tmp_path, value):
         open_scene({"sea": {"type": "ocean_surface", "interior": {"type": value}}})
 
 
+def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
+    """Mitsuba looks for files, and for libraries of plugins, in all folders that it knows."""
+    before = [str(path) for path in mi.file_resolver()]
+    part = f'<path value="{tmp_path}"/><integrator type="lidar_merging"/>'
+    open_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', part))
+    assert [str(path) for path in mi.file_resolver()] == before
+
+
 @each_row(
     ("attributes", "message"),
     [
@@ -92,6 +100,14 @@ def test_a_part_that_is_an_include_is_refused(tmp_path):
 def test_the_type_of_the_root_is_checked(tmp_path, root):
     with pytest.raises(UserError, match=r"has a root element .*: it must be <scene>"):
         open_scene(stranger(tmp_path, "a.xml", root))
+
+
+def test_a_path_within_another_path_is_refused(tmp_path):
+    """Mitsuba looks for a folder in those before, too: libraries of a/b would have been loaded."""
+    stranger(tmp_path / "a" / "b", "x", "")
+    text = '<scene version="3.0.0"><path value="a"/><path value="b"/><shape type="evil"/></scene>'
+    with pytest.raises(UserError, match="path = 'b' is no folder in"):
+        open_scene(stranger(tmp_path, "a.xml", text))
 
 
 def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
@@ -190,6 +206,14 @@ def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
     with pytest.raises(UserError, match="its name must have no control characters") as caught:
         open_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
     assert str(caught.value).isprintable()
+
+
+def test_names_of_files_are_texts_and_types_are_checked_with_parameters_in_place(tmp_path):
+    with pytest.raises(UserError, match=r"profile_file = 1.0 must be a text, the name of a file"):
+        open_scene({"type": "scene", "laser": {"type": "lidar_transmitter", "profile_file": 1.0}}, None)
+    text = '<default name="kind" value="lidar_merging"/><integrator type="$kind"/>'
+    with pytest.raises(UserError, match=NOT_A_NAME):
+        open_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', text), {"kind": PATH})
 
 
 def test_integrators_of_a_command_are_names():

@@ -112,6 +112,16 @@ def test_text_with_includes_in_place(scene):
     assert catalogue.scene_parameters(scene) == {"radius": "2", "depth": "3", "grey": "0.5", "power": "7", "gain": "1"}
 
 
+def test_mitsuba_reads_the_same(scene):
+    config = mi.parser.ParserConfig(mi.variant())
+    for given in ({}, {"radius": "5", "grey": "0.2"}):
+        own = mi.parser.parse_string(config, read_document(scene).text, **given)
+        states = (mi.parser.parse_file(config, str(scene), **given), own)
+        first, second = ([(node.type, str(node.props)) for node in state.nodes] for state in states)
+        assert first == second
+        assert f'"radius" -> {given.get("radius", "2")}' in first[1][1]
+
+
 def test_value_that_refers_to_a_parameter_follows_it(scene):
     text = """<scene version="3.0.0">
     <default name="a" value="1"/>
@@ -128,6 +138,12 @@ def test_value_that_refers_to_a_parameter_follows_it(scene):
     )
     config = mi.parser.ParserConfig(mi.variant())
     assert mi.parser.parse_string(config, read_document(scene).text, a="9").nodes[1].props["radius"] == 9
+
+
+def test_part_beside_the_including_file_is_found(scene):
+    """Mitsuba looks in the folder of the part first, then in those of the files that include it."""
+    (scene.parent / "parts" / "point.xml").rename(scene.with_name("point.xml"))
+    assert read_document(scene).text == FLAT
 
 
 @pytest.mark.parametrize(
@@ -157,6 +173,26 @@ def test_wrong_includes(scene, part, text, sentence):
     for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.open_scene):
         with pytest.raises(UserError, match=sentence):
             use(scene)
+
+
+def test_includes_that_double_are_refused_at_once(tmp_path):
+    """27 files that include the next one twice are 134 million parts."""
+    for number in range(27):
+        part = f'<include filename="{number + 1}.xml"/>'
+        (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
+    (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
+    for use in (read_document, catalogue.scene_parameters, scenes.open_scene):
+        with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
+            use(tmp_path / "0.xml")
+
+
+def test_parameters_that_double_are_refused_at_once(tmp_path):
+    """40 parameters that name the next one twice are a text of a terabyte."""
+    parameters = [f'<default name="p{n:02}" value="$p{n + 1:02},$p{n + 1:02}"/>' for n in range(40)]
+    shape = '<default name="p40" value="1"/><shape type="sphere"><float name="radius" value="$p00"/></shape>'
+    (tmp_path / "bomb.xml").write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
+    with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
+        scenes.open_scene(tmp_path / "bomb.xml")
 
 
 @pytest.mark.parametrize("folder", ["maps", "$x"])

@@ -123,6 +123,18 @@ def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
     assert surface.interior_medium().parameters["wavelength_nm"] == 515
 
 
+def test_the_printed_xml_is_included_by_a_scene(tmp_path):
+    (tmp_path / "instrument.xml").write_text(instruments.instrument_text("teledyne_czmil"))
+    path = tmp_path / "sea.xml"
+    path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
+    ours, plain = scenes.open_scene(path).scene, mi.load_file(str(path), optimize=False)
+    mounted = scenes.open_scene("table1", FLAT, "teledyne_czmil").scene
+    for loaded in (ours, plain):
+        for part, expected in zip(parts(loaded), parts(mounted), strict=True):
+            assert part.pose.origin == pytest.approx(expected.pose.origin)
+        assert str(loaded.sensors()[0]) == str(mounted.sensors()[0])
+
+
 def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     (tmp_path / "own").mkdir()
     sphere = mi.load_dict({"type": "cube"})
@@ -156,6 +168,13 @@ def test_parameters_that_the_instrument_replaces_are_refused():
     sentence = "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"
     with pytest.raises(UserError, match=sentence):
         scenes.open_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
+
+
+def test_scenes_of_python_take_no_instrument():
+    with pytest.raises(UserError, match="instrument = 'riegl_vq840g' needs an XML scene, not a dict"):
+        scenes.open_scene({"type": "scene"}, None, "riegl_vq840g")
+    with pytest.raises(UserError, match="not a loaded scene"):
+        scenes.open_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
 
 
 def table():

@@ -99,6 +99,19 @@ def test_parameters_of_plugins_are_those_of_the_scene(tmp_path):
     assert (values["bottom"]["depth"], values["lower"]["depth"]) == (7, 9)
 
 
+def test_results_state_the_parameters_of_plugins(tmp_path):
+    path = tmp_path / "own.xml"
+    path.write_text(OWN)
+    loaded = open_scene(path, {"sea.altitude": 90, "jerlov": "1C"})
+    found = {name.partition(".")[2]: value for name, value in loaded.attributes().items() if name.startswith("scene.")}
+    given = {"deep": "6", "wind_speed": "2", "jerlov": "1C", "altitude": "200", "sea.altitude": "90"}
+    assert {name: found[name] for name in given} == given
+    assert not {"attenuation", "kd", "sea_wind_speed", "seabed_depth"} & found.keys()
+    assert value_of(loaded.parameters, "seabed.depth") == 6
+    assert value_of(loaded.parameters, "bottom_depth") == value_of(loaded.parameters, "depth") == 6
+    assert open_scene(loaded.source).parameters == loaded.parameters
+
+
 @each_row(
     ("params", "message"),
     [

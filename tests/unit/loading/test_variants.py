@@ -28,6 +28,13 @@ def test_llvm_releases_that_abort_are_refused_by_name(tmp_path, name):
         variants.check_llvm_path(str(tmp_path / name))
 
 
+def test_a_link_to_an_old_llvm_is_refused_too(tmp_path):
+    (tmp_path / "libLLVM-15.so.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
+    with pytest.raises(UserError, match="LLVM 15"):
+        variants.check_llvm_path(str(tmp_path / "libLLVM.so"))
+
+
 def test_cuda_without_a_gpu_is_refused():
     if dr.has_backend(dr.JitBackend.CUDA):
         assert variants.set_variant("cuda_ad_mono") == "cuda_ad_mono"

@@ -1,5 +1,6 @@
 """Views of results: files of the command, and frames of notebooks."""
 
+import os
 import webbrowser
 from pathlib import Path
 
@@ -58,3 +59,24 @@ def test_the_command_refuses_what_it_cannot_show(result, opened, tmp_path):
     assert_refused(run("view", tmp_path / "empty.nc"), "empty.nc")
     assert opened == []
     assert {path.name for path in tmp_path.iterdir()} == {"shot.nc", "empty.nc"}
+
+
+def test_temporary_pages_of_former_calls_are_removed(result, opened, tmp_path):
+    """They once stayed for ever; those of the last hour may have a browser that has not read them."""
+    paths = [Path(run("view", file).stdout.strip()) for file in [saved(result, tmp_path)] * 2]
+    assert all(path.is_file() for path in paths)
+    old = paths[0].stat().st_mtime - 3700
+    os.utime(paths[0].parent, (old, old))
+    (tmp_path / "mine").mkdir()
+    link = tmp_path / "mitransient-lidar-view-link"
+    link.symlink_to(tmp_path / "mine")
+    os.utime(link, (old, old), follow_symlinks=False)
+    paths.append(Path(run("view", tmp_path / "shot.nc").stdout.strip()))
+    assert [path.parent.exists() for path in paths] == [False, True, True]
+    assert (tmp_path / "mine").is_dir()
+
+
+def saved(result, folder):
+    """Write a result, and return its path."""
+    results.save(result, folder / "shot.nc")
+    return folder / "shot.nc"

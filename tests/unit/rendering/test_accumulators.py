@@ -62,6 +62,15 @@ def test_errors_of_sums_over_any_bins_are_those_of_the_passes(bins):
     assert max(by_curve) > 1.3 or min(by_curve) < 0.7
 
 
+def test_dark_blocks_do_not_count():
+    def draw(rng):
+        values = rng.normal(10, 1, (1, 8))
+        values[:, 4:] = 1e-9 * rng.normal(10, 1)
+        return values
+
+    assert inflation_of(draw)[1][1:] == pytest.approx([1, 1, 1], rel=largest_z(400, 3) / np.sqrt(2 * 400))
+
+
 def test_statistics_of_part_of_the_pixels():
     statistics = PassStatistics()
     for values in np.random.default_rng(2).normal(size=(6, 9, 4)):

@@ -56,6 +56,14 @@ def test_unknown_names_are_refused(renderer, names, message):
         path_parameters(renderer, names)
 
 
+@each_row("water", [{"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9}])
+def test_backscattering_without_influence_is_refused(lidar_scene, water):
+    scene = lidar_scene(integrator=FEW, water=water)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    with pytest.raises(UserError, match="backscattering: the light does not depend on it"):
+        path_parameters(renderer, ["backscattering"])
+
+
 @pytest.mark.parametrize("phase_g", [0.0, 0.02, -0.3])
 def test_derivative_by_a_mean_cosine_near_zero(lidar_scene, phase_g):
     """That of ln (1 - g^2) - 1.5 ln(1 + g^2 - 2 g cos), 3 cos at g = 0, where a step relative to g would be 0."""

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
@@ -131,6 +132,22 @@ def test_index_layers_bend_the_axis(lidar_scene):
     sines = np.sin(np.radians(20)) / np.array([1.334, 1.6])
     expected = float(np.array([3.0, 5.0]) @ np.tan(np.arcsin(sines)))
     np.testing.assert_allclose(attributes["bottom_point"], [expected, 0, -8], atol=1e-3)
+
+
+def test_targets_are_seen_and_shadowed_along_refracted_rays(lidar_scene):
+    """A level plate: its corners cross the sea and end on the bottom as single rays do."""
+    plate = mi.ScalarTransform4f().translate([1.5, 0, -6]).scale(0.5)
+    extra = {"plate": {"type": "rectangle", "to_world": plate}}
+    (target,) = json.loads(described(lidar_scene(tx={"aim_x": 1.0}, extra=extra))["target_outlines"])
+    corners = np.array([[x, y] for x in (1.0, 2.0) for y in (-0.5, 0.5)])
+    for name, aim, depth in (("seen", 0.0, 0), ("shadow", 1.0, 8)):
+        lidar = np.array([aim - 200 * np.tan(np.radians(20)), 0])
+        distance = np.linalg.norm(corners - lidar, axis=1)
+        theta, phi = refracted_path(distance, 200.0, 6.0, 1.34)
+        reach = 200 * np.tan(theta) + depth * np.tan(phi)
+        line = np.reshape(target[name], (-1, 2))
+        for corner in lidar + (corners - lidar) * (reach / distance)[:, None]:
+            assert np.hypot(*(line - corner).T).min() < 1e-3
 
 
 def test_targets_belong_to_the_view_at_their_depth(lidar_scene):

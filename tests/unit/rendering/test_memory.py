@@ -1,5 +1,6 @@
 """Sizes of large arrays are known before they are taken."""
 
+import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,10 +13,13 @@ import xarray as xr
 import mitransient_lidar
 from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.catalogue import scene_text
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.shots.batches import check_size
+from mitransient_lidar.transport.merging.renderer import MergingRenderer
 from mitransient_lidar.transport.rng import Shots
 
 #: A task after a small one, within a limit of the memory; prints the bytes that were estimated, and its peak above that
@@ -63,6 +67,12 @@ def test_arrays_that_exceed_the_memory_are_refused(monkeypatch):
     validation.require_memory("histograms", 2e9, "take fewer")
     with pytest.raises(UserError, match=r"histograms take 2\.1 GB of memory, and at most 2 GB may be: take fewer"):
         validation.require_memory("histograms", 2.1e9, "take fewer")
+
+
+def test_the_memory_of_a_limited_process_is_half_of_its_limit(monkeypatch):
+    whole = validation.usable_memory()
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (10**9, 10**9))
+    assert validation.usable_memory() == 5e8 < whole
 
 
 def test_records_that_exceed_the_memory_are_refused():
@@ -135,6 +145,30 @@ def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch
         check_size(1000, 4, 4000)
     with pytest.raises(UserError, match=r"1000 frames of 65536 pixels take 3\.94 GB"):
         render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
+
+
+def test_too_many_solids_for_components_are_refused_before_a_renderer_is_prepared(tmp_path, monkeypatch):
+    sphere = '<shape type="sphere" id="s{}"><float name="radius" value="0.01"/><bsdf type="diffuse"/></shape>'
+    text = scene_text("table1").replace("</scene>", "".join(map(sphere.format, range(400))) + "</scene>")
+    (tmp_path / "many.xml").write_text(text, "utf-8")
+    monkeypatch.setattr(MergingRenderer, "__init__", lambda *_: pytest.fail("a renderer is prepared"))
+    for render, more in ((mitransient_lidar.render, {}), (mitransient_lidar.render_shots, {"count": 2})):
+        with pytest.raises(UserError, match="components: the scene has 401 solids; allowed are at most 30"):
+            render(tmp_path / "many.xml", components=True, passes=2, **more)
+
+
+def test_an_automatic_time_axis_has_a_longest_length():
+    assert TimeAxis.covering(0, 1e7, 1e3).end_ns >= 1e7
+    with pytest.raises(UserError, match=r"the time axis from 0 to 1\.1e\+07 ns is longer than 1e\+07 ns, the most"):
+        TimeAxis.covering(0, 1.1e7, 1e3)
+    assert TimeAxis.covering(0, 1.1e7, 1e3, None, 11_000).bin_count == 11_000
+
+
+def test_a_long_record_needs_no_more_segments_at_first():
+    """Light in a record of 1 ms would be scattered 16 000 times: its segments took 12.6 GB."""
+    session = open_scene("table1", {"bin_width_ns": 1e6, "aim_x": -1e6})
+    renderer = session.scene.integrator().prepare(session.scene, session.sensor)
+    assert renderer.layout.light_segments == renderer.layout.sensor_segments == 64
 
 
 RENDER = 'ml.render("table1", params={{**small, {}}}, passes=2, {})'

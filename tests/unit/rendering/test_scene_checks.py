@@ -153,6 +153,11 @@ def test_sphere_inside_out_is_refused_or_told(lidar_scene, caplog, mirror, flips
     assert ["faces of shape 'ball' point inwards" in one for one in check(scene, caplog)] == [True] * outcome
 
 
+def test_mirrored_mesh_with_its_own_normals_is_not_told(lidar_scene, caplog):
+    place = TO_WORLD.translate([on_axis(-5.0), 0, -5]).scale([-0.5, 0.5, 0.5])
+    assert check(lidar_scene(extra={"box": {"type": "cube", "to_world": place}}), caplog) == []
+
+
 @pytest.mark.parametrize(("water", "laser", "fits"), [(532, 515, False), (515, 515, True), (532, 532.1, True)])
 def test_water_by_name_has_the_wavelength_of_the_laser(lidar_scene, water, laser, fits):
     of_water = {"chlorophyll": 0.5, "wavelength_nm": water}

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import run
 from rows import each_row
 
 from mitransient_lidar import results
@@ -187,6 +188,14 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
 
 
 @pytest.mark.slow
+def test_places_beside_the_bottom_are_told(rendered, caplog):
+    """The bottom of the scene is a square of 1 km."""
+    series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
+    np.testing.assert_array_equal(series["true_bottom_depth"], [8.0, np.nan])
+    assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
+
+
+@pytest.mark.slow
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
     series = ShotScene("fig13_2x2", params, np.array(PLACES), target=(0.3, 0.0))
@@ -217,6 +226,25 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES)
     assert series.sizes["shot"] == series["aim_x"].size == 2
     assert series.attrs["interrupted"] == 1
+
+
+@pytest.mark.slow
+def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
+    whole = shot_batches.ShotBatches.render
+
+    def interrupted(batches, poses, seeds):
+        if seeds[0] == 1:
+            raise KeyboardInterrupt
+        return whole(batches, poses, seeds)
+
+    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
+    (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
+    arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
+    done = run("shots", "fig09_2x2", *arguments)
+    assert done.exit_code == 130
+    assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
+    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept."
+    assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 
 @pytest.mark.parametrize(

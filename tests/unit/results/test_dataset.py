@@ -1,6 +1,7 @@
 """Datasets: labels, attributes, and round trips through both file formats."""
 
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -167,6 +168,17 @@ def test_round_trip(tmp_path, case, suffix):
         assert back[name].dtype.kind == dataset[name].dtype.kind
         assert_same_kinds(dataset[name].attrs, back[name].attrs)
     assert list(tmp_path.iterdir()) == [path]
+
+
+@each_row("suffix", [".exr", ".nc"])
+def test_files_of_any_name_keep_values_that_are_not_finite(tmp_path, suffix):
+    dataset = make()
+    dataset["waveform"][0, 0], dataset["waveform"][1, 1] = np.nan, -np.inf
+    results.save(dataset, tmp_path / f"a{suffix}")
+    os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
+    back = results.open(tmp_path / "a.dat")
+    np.testing.assert_allclose(back["waveform"], dataset["waveform"], rtol=1e-6)
+    assert back.attrs["scene"] == "fig09"
 
 
 def test_other_programs_read_netcdf(tmp_path):

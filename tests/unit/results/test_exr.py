@@ -71,6 +71,19 @@ def test_channels_beyond_the_memory_leave_the_other_files(tmp_path, monkeypatch)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["small.nc"]
 
 
+def test_plain_attributes_are_readable_and_never_wrong(tmp_path):
+    attributes = {"seed": 2**40, "small": -3, "width": 0.1, "huge": 1e300, "nothing": [], "inf": float("inf")}
+    dataset = light(np.zeros((1, 1, 1)), **attributes, **{"x" * 300: 1, "mixed": [1, 2**40]})
+    results.save(dataset, tmp_path / "a.exr")
+    header, _ = header_and_channels(tmp_path / "a.exr")
+    assert header["lidar.seed"] == "1099511627776"  # stored as a number it would come back as 0
+    assert header["lidar.small"] == -3
+    assert header["lidar.width"] == pytest.approx(0.1, rel=1e-7)
+    assert header["lidar.huge"] == "1e+300"
+    assert "lidar.nothing" not in header
+    assert results.open(tmp_path / "a.exr").attrs == dataset.attrs
+
+
 def test_every_truncation_and_a_flipped_byte_are_detected(tmp_path, capfd):
     values = np.broadcast_to(np.arange(20.0)[:, np.newaxis, np.newaxis], (20, 8, 2))  # two ZIP blocks of 16 lines
     whole, part = tmp_path / "whole.exr", tmp_path / "part.exr"

@@ -144,6 +144,14 @@ def test_sequence_is_read_from_its_folder_and_its_first_file(tmp_path):
     xr.testing.assert_identical(results.open(tmp_path), stack)
 
 
+def test_one_gate_and_unknown_depth(tmp_path):
+    stack = make(gates=1).drop_vars("gate_depth")
+    results.save(stack, tmp_path / "a.exr")
+    xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
+    assert "gateDepthM" not in parts_by_other_reader(tmp_path / "a.exr")[0][0]
+    xr.testing.assert_identical(results.open(save_sequence(stack, tmp_path, "s")[0]), stack)
+
+
 @pytest.mark.parametrize("dim", ["origin", "parameter", "batch"])
 def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
     """As of a render with gates and `components`, `derivatives` or `batches`, whose time bins another file holds."""
@@ -166,6 +174,14 @@ def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
     assert not (tmp_path / "b.exr").exists()
     results.save(more, tmp_path / "b.nc")
     xr.testing.assert_identical(results.open(tmp_path / "b.nc"), more)
+
+
+def test_wrong_names(tmp_path):
+    with pytest.raises(UserError, match="without folders"):
+        save_sequence(make(), tmp_path, "a/b")
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(UserError, match="cannot write"):
+        save_sequence(make(), tmp_path / "file", "a")
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])

@@ -10,7 +10,12 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, share_in_view
+from mitransient_lidar.results.geometry import (
+    LinesOfSight,
+    lidar_geometry,
+    lidar_system,
+    share_in_view,
+)
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -35,6 +40,14 @@ def test_times_depths_and_paths():
     assert geometry.depth_of_time(time) == pytest.approx(8.0, abs=1e-9)
     assert geometry.path_of_time(time) == pytest.approx(8.0 / COS_WATER, abs=1e-9)
     assert geometry.depth_per_ns == pytest.approx(C0 / (2 * GROUP) * COS_WATER)
+
+
+def test_system_of_the_lidar_equation():
+    system = lidar_system(ATTRIBUTES)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.9**2 * 0.8), 0.025)
+    obscured = {**ATTRIBUTES, "obscuration": 0.3}
+    system = lidar_system(obscured, efficiency=0.5)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.5), pytest.approx(0.7 * 0.025))
 
 
 def test_share_of_the_beam_in_view():
@@ -100,3 +113,12 @@ def test_lines_of_sight_without_coordinates_are_those_of_the_centres():
     # Times and depths are inverse, in any shape.
     depths = np.linspace(0, 9, 12).reshape(6, 2)
     np.testing.assert_allclose(lines.depth_of_time(lines.time_of_depth(depths)), depths, atol=1e-9)
+
+
+def test_sum_of_pixels_looks_where_most_light_is():
+    """A mixture has the mean variance plus the variance of the means."""
+    _, lines = image()
+    total, weight, number = lines.combined(), np.arange(6.0) / 15, np.arange(6.0)
+    assert total.surface_time[0] == pytest.approx(1419 + weight @ number)
+    variance = weight @ (0.1 * number) ** 2 + weight @ (number - weight @ number) ** 2
+    assert total.surface_spread[0] == pytest.approx(math.sqrt(variance))

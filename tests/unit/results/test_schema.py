@@ -1,7 +1,9 @@
 """Kinds and ranges of the attributes and arrays of results, and checksums of their files."""
 
+import h5py
 import numpy as np
 import pytest
+import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -97,3 +99,12 @@ def test_a_damaged_file_is_refused_before_hdf5_reads_it(tmp_path, dataset):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
         with pytest.raises(UserError, match=r"a\.nc is damaged or truncated: its SHA-256 is another one"):
             results.open(path)
+
+
+def test_files_that_other_programs_have_changed_are_read(tmp_path, dataset):
+    path = tmp_path / "a.nc"
+    results.save(dataset, path)
+    assert xr.load_dataset(path, engine="h5netcdf", decode_times=False).sizes == dataset.sizes
+    with h5py.File(path, "r+") as file:
+        file.attrs["notes"] = "changed"
+    assert results.open(path).attrs["notes"] == "changed"

@@ -1,5 +1,6 @@
 """Errors of sums over bins: blocks at the end of a record, few passes, and records of very many bins."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.stats import norm
 from synthetic_shots import ATTRIBUTES, SIGMA, SURFACE
 
 from mitransient_lidar import results
+from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_fits import column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.records import Waveforms
@@ -65,6 +67,23 @@ def test_two_passes_make_no_errors_of_nearly_nothing():
     records = replace(Records.of(values[np.newaxis], time, 1e-9), shared=shared)
     fit = column_fit(records, [SURFACE + 10], [SURFACE + 60], [SURFACE])
     assert np.isfinite([fit.level, fit.decay, fit.correlation]).all()
+
+
+def test_a_record_of_very_many_bins_needs_little_memory():
+    """200 000 bins, whose correlations would be 320 GB."""
+    bins, step = 200_000, 0.5
+    time, blocks = 1385 + step * (np.arange(bins) + 0.5), np.arange(0, bins, 391)
+    values = 2e-4 * norm.pdf(time, SURFACE, SIGMA) + 1e-4 * norm.pdf(time, SURFACE + 70, SIGMA)
+    correlation = 0.9 ** np.abs(np.subtract.outer(*2 * [np.arange(blocks.size)]))
+    middles = np.add.reduceat(time, blocks) / np.diff(np.append(blocks, bins))
+    tracemalloc.start()
+    try:
+        dataset = with_correlation(record(values, 1e-2 * values + 1e-9, step, passes=20), middles, correlation)
+        table = echo_table.extract(dataset)
+        assert tracemalloc.get_traced_memory()[1] < 0.2e9
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_allclose(table["time_ns"].sel(echo="bottom"), SURFACE + 70, atol=0.05)
 
 
 def test_joined_results_have_the_mean_of_their_correlations():

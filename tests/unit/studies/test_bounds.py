@@ -138,6 +138,18 @@ def test_receivers_are_compared_on_the_same_renders(rendered):
     np.testing.assert_allclose(ratio[:, 1] / ratio[:, 0], 0.7**-0.5, rtol=1e-6)
 
 
+def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
+    def render(scene, **options):
+        return light(scene, **options).assign_attrs(interrupted=1)
+
+    monkeypatch.setattr(study, "render", render)
+    small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
+    done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
+    assert done.exit_code == 130
+    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept.\n"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_command_writes_figure_data_and_table(rendered, tmp_path):
     figure = tmp_path / "made" / "bounds.png"

@@ -124,6 +124,13 @@ def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
     assert ("set bin_width_ns to 0.12 or less" in caplog.text) == (given is not None)
 
 
+def test_values_of_layers_are_set_in_their_list():
+    model = model_of("fig15_2x2", ["attenuation[1]"], wind_speed=3)
+    assert model.starts({}) == {"attenuation[1]": 0.5}
+    assert model.with_values({"attenuation[1]": 0.4}) == {"wind_speed": 3, "attenuation": "0.9, 0.4"}
+    assert model.with_values({"attenuation[0]": 1.0, "attenuation[1]": 0.4})["attenuation"] == "1.0, 0.4"
+
+
 @each_row(
     ("free", "options", "message"),
     [

@@ -1,5 +1,6 @@
 """Measures and statements of the publication on waveforms whose answers are known; the command, and one figure."""
 
+import csv
 import math
 
 import matplotlib.image
@@ -10,9 +11,10 @@ from rows import each_row
 from scipy.special import erf
 
 import mitransient_lidar
+from mitransient_lidar.plots.publication import figures as publication
 from mitransient_lidar.studies.publication import measures
 from mitransient_lidar.studies.publication.measures import Series, Waveform
-from mitransient_lidar.studies.publication.statements import Statement
+from mitransient_lidar.studies.publication.statements import COLUMNS, Statement, write_statements
 
 TIME = np.arange(0.125, 120, 0.25)
 
@@ -102,6 +104,16 @@ def test_whether_a_statement_holds(value, error, share, holds):
     assert Statement("fig10", "s", "q", "4 to 5", value, error, (4.0, 5.0), "w", share).holds == holds
 
 
+def test_table_of_statements(tmp_path):
+    one = Statement("fig10", "a, b", "q", "4 to 5", 4.2, 0.02, (4.0, 5.0), "place", 0.25, "8 places", "facets")
+    write_statements([one], tmp_path / "statements.csv")
+    with open(tmp_path / "statements.csv", newline="", encoding="utf-8") as file:
+        header, row = csv.reader(file)
+    assert tuple(header) == COLUMNS
+    expected = ["fig10", "a, b", "q", "4 to 5", "4.2", "0.02", "partly", "0.25"]
+    assert row == [*expected, "place; holds at 25 % of 8 places", "facets"]
+
+
 def test_drawn_figures_need_no_render(tmp_path):
     done = run("figures", "fig08", "fig05", "-o", tmp_path, "-q")
     assert done.exit_code == 0, done.stderr
@@ -115,6 +127,18 @@ def test_drawn_figures_need_no_render(tmp_path):
         # Drawn with an opacity of 0.85 over white.
         drawn = 0.85 * np.array(colour) + 0.15
         assert (np.abs(picture - drawn).max(axis=-1) < 0.03).sum() > 1000
+
+
+def test_an_interruption_keeps_the_figures_that_are_done(tmp_path, monkeypatch):
+    def interrupt(_renders):
+        raise KeyboardInterrupt
+
+    broken = publication._FIGURES["fig12"]._replace(measure=interrupt)
+    monkeypatch.setitem(publication._FIGURES, "fig12", broken)
+    done = run("figures", "fig05", "fig12", "fig13", "-o", tmp_path, "-q")
+    assert done.exit_code == 130
+    assert "interrupted after 1 of 3 figures" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fig05.png", "statements.csv"]
 
 
 @pytest.mark.slow

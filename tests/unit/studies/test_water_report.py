@@ -88,6 +88,22 @@ def test_mistakes_are_one_sentence(arguments, message):
     assert_refused(done, message)
 
 
+@each_row(
+    ("name", "a", "b", "ratio"),
+    # a and b of his table at 530 nm, and bb/b to its two digits (Petzold 1972).
+    [("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020)],
+)
+def test_petzold_waters(name, a, b, ratio):
+    done = run("water", "petzold", name)
+    assert done.exit_code == 0, done.output
+    assert "measured at 514 to 530 nm" in done.stdout
+    named, options = figures(done.stdout)
+    assert named["absorption a (1/m)"] == a
+    assert named["bb/b"] == pytest.approx(ratio, abs=5.5e-4)
+    assert options["attenuation"] == pytest.approx(a + b, rel=1e-6)
+    assert options["backscattering"] == pytest.approx(named["bb/b"] * b, rel=1e-4)
+
+
 def test_profile_is_described(station):
     done = run("water", "profile", str(station), "--tolerance", "0.05")
     assert done.exit_code == 0, done.output

@@ -1,5 +1,6 @@
 """Gate stacks cut from results: energies, standard errors, labels and invalid input."""
 
+import logging
 from itertools import pairwise
 
 import numpy as np
@@ -104,6 +105,13 @@ def test_pulses_add_up():
     assert many.attrs["pulses"] == 1000
 
 
+def test_error_without_inflation_is_the_upper_bound(caplog):
+    with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
+        stack = gating.cut_gates(record(relative=0.03), GateTrain(1425.0, 10.0, 10.0, 3))
+    np.testing.assert_allclose(stack["gate_energy_stderr"], 0.03 * stack["gate_energy"], rtol=1e-12)
+    assert "upper bounds" in caplog.text
+
+
 def test_error_is_inflated_as_measured_in_the_render():
     inflation = {"error_inflation_bins": [1, 2, 4, 8, 16], "error_inflation": [1.0, 1.3, 1.8, 2.2, 2.4]}
     flat = record(values=np.full((1, BINS), 1e-5), relative=0.1, attributes=GEOMETRY | inflation)
@@ -177,6 +185,14 @@ def test_nan_stays_in_its_gates():
 def test_trains_outside_the_record_are_rejected(train, message):
     with pytest.raises(UserError, match=message):
         gating.cut_gates(record(), train)
+
+
+def test_train_before_a_record_of_unknown_surface():
+    with pytest.raises(UserError, match=r"before the surface: .* the record starts at 1400\.0 ns"):
+        gating.cut_gates(record(attributes={}), GateTrain(1380.0, 5.0, 5.0, 2))
+    # Near pixels see the surface before the mean: their gates are welcome.
+    early = record(attributes=GEOMETRY | {"window_start_ns": 1410.0})
+    assert gating.cut_gates(early, GateTrain(1402.0, 5.0, 5.0, 3)).sizes["gate"] == 3
 
 
 def test_train_from_options(tmp_path):

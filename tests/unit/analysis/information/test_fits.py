@@ -136,6 +136,17 @@ def test_errors_of_all_bins_that_agree_are_in_the_covariance():
     assert_mean(distances)
 
 
+@pytest.mark.slow
+def test_standard_errors_from_few_passes_widen_the_covariance():
+    """Data of 8 passes, whose own standard errors as weights gave mean squared distances of 5.9 to 9.1."""
+    random = np.random.default_rng(10)
+    distances = []
+    for _ in range(100):
+        data = rendered(TRUTH, *of_passes(random, 8, 0.01))
+        distances.append(distance(fit(data.drop_vars("waveform_derivative"), TRUTH)))
+    assert_mean(distances)
+
+
 def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
     """Near a render the model is taken as linear: last steps are not rendered."""
     fitted = fit(closed_form(TRUTH), noise=0.001)
@@ -241,6 +252,19 @@ def test_an_interrupted_fit_has_its_last_step(complete):
         np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=0.1)
 
 
+def test_some_pixels_are_fitted_by_their_names():
+    data = noisy(0.002, np.random.default_rng(7), pixels=("a", "b", "c")).isel(pixel=[2, 0])
+
+    def model(values):
+        return closed_form(values, pixels=("a", "b", "c"))
+
+    fitted = fit(data, model=model)
+    assert fitted["fitted"]["pixel"].values.tolist() == ["c", "a"]
+    assert abs(fitted["residual"]).max() < 6
+    with pytest.raises(UserError, match="the scene has no pixel c: its pixels are a, b"):
+        fit(data, model=lambda values: closed_form(values, pixels=("a", "b")))
+
+
 @each_row(
     ("options", "message"),
     [
@@ -267,3 +291,15 @@ def test_an_interrupted_fit_has_its_last_step(complete):
 def test_invalid_input_is_refused(options, message):
     with pytest.raises(UserError, match=message):
         fit(noisy(0.002, np.random.default_rng(8)), **options)
+
+
+def test_samples_without_value_or_error_are_left_out(tmp_path):
+    lines = [
+        f"{time},{light:.9g},0.002" for time, light in zip(TIME, closed_form(TRUTH)["waveform"][0].values, strict=True)
+    ]
+    lines[50], lines[60] = "50,,0.002", "60,7,"
+    (tmp_path / "gaps.csv").write_text("\n".join(["time_ns,single,single_stderr", *lines]))
+    fitted = fit(tmp_path / "gaps.csv", free_scale=False, free_time=False)
+    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-5)
+    assert np.flatnonzero(fitted["used"][0] == 0).tolist() == [50, 60]
+    assert fitted.attrs["expected"] == pytest.approx(TIME.size - 2 - len(TRUTH))

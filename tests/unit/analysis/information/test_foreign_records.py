@@ -82,6 +82,15 @@ def test_light_lasts_to_the_bottom_however_bright_the_surface_is():
     assert light_duration(np.arange(100.0), lit) == 50
 
 
+def test_the_squares_of_stored_residuals_are_the_chi_squared(tmp_path):
+    """With noise of the receiver, of the user, and unknown: the last one had those of other units."""
+    path = shot(tmp_path / "shot.csv")
+    for options in ({"receiver": "riegl_vq840g"}, {"noise": 0.05}, {}):
+        fitted = fit(path, (1, 1, 1), **options)
+        assert float(np.nansum(fitted["residual"] ** 2)) == pytest.approx(fitted.attrs["chi_squared"], rel=1e-9)
+        assert int(fitted["used"].sum()) == np.isfinite(fitted["residual"]).sum()
+
+
 def test_errors_grow_with_a_misfit_and_a_bad_fit_is_refused(tmp_path):
     """Noise stated 1.5 and 4 times too small, of the same samples: the errors are those of the noise that they have."""
     random, light = np.random.default_rng(3), 1e6 * model(TRUTH)["waveform"].values[0]

@@ -6,6 +6,7 @@ import xarray as xr
 from closed_form_waveform import TIME, TRUTH, closed_form, noisy
 from rows import each_row
 from scipy.special import ndtr
+from significance import largest_z
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.information.errors import noise_of_mean
@@ -129,6 +130,26 @@ def test_batches_of_passes_give_the_covariance_of_the_mean():
     found = batch_deviations(in_batches(closed_form(TRUTH), deviations, np.ones(6, dtype=int)), ("pixel", "time"))
     np.testing.assert_allclose(np.einsum("bpi,bpj->ij", found, found), np.cov(deviations[:, 0].T) / 6, atol=1e-12)
     assert batch_deviations(closed_form(TRUTH), ("pixel", "time")) is None
+
+
+def test_batches_of_unequal_numbers_of_passes_are_weighted():
+    """Means of 1 to 3 passes: the expected outer products are the variance of the mean of all passes, 1/8 of one."""
+    random, passes = np.random.default_rng(3), np.array([3, 2, 2, 1])
+    means = random.normal(size=(4, 1, 40_000)) / np.sqrt(passes)[:, None, None]
+    light = xr.Dataset({"waveform": (("pixel", "time"), np.average(means, axis=0, weights=passes))})
+    found = batch_deviations(in_batches(light, means - light["waveform"].values, passes), ("pixel", "time"))
+    variances = np.sum(found[:, 0] ** 2, axis=0)
+    assert abs(variances.mean() - 1 / 8) < largest_z(variances.size) * variances.std() / np.sqrt(variances.size)
+
+
+def test_batches_of_passes_are_taken_through_the_receiver():
+    """Batches that deviate as by another attenuation change the record by the derivative."""
+    light, step = closed_form(TRUTH, power=3e-7, pixels=("a", "b")), 1e-3
+    other = step * light["waveform_derivative"].sel(parameter="attenuation").values
+    found = measured(detect_waveforms(light, "apd", background_power=1e-9))
+    one = predict(found, in_batches(light, np.stack([other, -other]), [4, 4]), list(TRUTH))
+    slope = step * one.derivative[0] * 0.5 * np.sqrt(2)
+    np.testing.assert_allclose(one.batches, [slope, -slope], atol=2e-3 * np.abs(slope).max())
 
 
 def test_correlations_have_the_inflation_that_they_follow_from():

@@ -79,6 +79,15 @@ def test_light_of_a_target_is_not_the_bottoms():
             assert np.isnan(found[name]).all() if refused else np.isfinite(found[name]).any()
 
 
+def test_an_echo_before_the_bottoms_leaves_no_reflectance():
+    """A second echo from 5 m, without a target in the scene that would tell how much light it takes."""
+    values = np.stack([waveform() + waveform(depth=5.0, glint=0.0)] * 4)
+    found = retrieve.bottom(result(values), LEVEL)
+    assert int(found["reflectance_flags"]) & ReflectanceFlag.EARLIER_ECHO
+    assert np.isnan(found["reflectance"]).all()
+    np.testing.assert_allclose(found["depth_m"].sel(correction="level"), DEPTH, atol=0.02)
+
+
 def test_share_of_the_beam_that_a_target_hides():
     """A square of 2 x 2 m in a beam of 10 mrad: a product of error functions; its share adds to the error."""
     attributes = {"receiver_pose": POSE, "divergence_mrad": 10.0}

@@ -42,6 +42,19 @@ def test_bounds_of_attenuation_include_waters_by_name(name):
     assert found.attenuation_low < water.attenuation < found.attenuation_high
 
 
+def test_columns_that_no_water_makes_are_nan():
+    found = water_of_column([0.05, np.nan, -0.1, 0.1, 0.1], [1e-3, 1e-3, 1e-3, np.nan, -1e-3], 0.06, 1.0)
+    assert np.isnan(found.kd).all()
+
+
+def test_kd_is_near_that_of_an_independent_study():
+    """Kirk (1984), doi:10.4319/lo.1984.29.2.0350, for the sun at the zenith and a phase function of Petzold."""
+    waters = (0.0532, 0.124, 0.00196), (0.179, 0.219, 0.00293), (0.0951, 0.432, 0.00944)
+    for absorption, scattering, backscattering in waters:
+        found = water_of_column(absorption, backscattering / (2 * math.pi), 0.0, 1.0)
+        assert 0.87 < float(found.kd) / math.sqrt(absorption**2 + 0.235 * absorption * scattering) < 0.98
+
+
 def test_reflectance_is_the_ratio_of_bottom_and_column():
     """Both from the lidar equation, single scattering: what lies above cancels, at any depth."""
     water = WaterColumn([0], [0.3], [0.15], [0.006])

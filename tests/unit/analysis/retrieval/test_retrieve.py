@@ -13,6 +13,7 @@ from synthetic_shots import (
     ANGLE_X,
     ANGLE_Y,
     BB,
+    BINS,
     C0,
     COS_WATER,
     DEPTH,
@@ -36,6 +37,34 @@ from mitransient_lidar.plots import retrieval
 from mitransient_lidar.rendering.shots import series as shot_series
 
 pytestmark = pytest.mark.usefixtures("scattered_once")
+
+
+def test_a_slope_that_the_sea_cannot_have_is_refused():
+    """A plane of 40 degrees along, in a sea whose slopes have a standard deviation of 0.1 in each direction."""
+    shot = result(np.stack([waveform(delay) for delay in plane_delays(0.84, 0.05)]), surface_slope_variance=0.02)
+    found = retrieve.surface_slopes(shot)
+    assert np.isnan([found["slope_along"], found["slope_along_stderr"]]).all()
+    assert float(found["slope_refused"]) == 1
+    assert float(found["slope_across"]) == pytest.approx(0.05, abs=0.03)
+    # With a prior, only the prior is left; of an unknown sea, it is kept.
+    along = retrieve.surface_slopes(shot, slope_deviation=(0.1, 0.1))
+    assert (float(along["slope_along"]), float(along["slope_along_stderr"])) == (0.0, pytest.approx(0.1))
+    kept = retrieve.surface_slopes(result(shot["waveform"].values))
+    assert float(kept["slope_along"]) == pytest.approx(0.84, rel=0.1)
+
+
+def test_a_receiver_of_one_pixel_gives_bottom_and_water():
+    """Refused for want of slopes before, which neither needs."""
+    one = result(4 * waveform()[np.newaxis])
+    found = retrieve.retrieve(one)
+    assert np.isnan(found["slope_along"])
+    assert float(found["surface_height"]) == pytest.approx(0, abs=0.1)
+    assert float(found["depth_m"].sel(correction="level")) == pytest.approx(DEPTH, abs=0.02)
+    # The error of the surface's range by a glint of 4 ns is an optical depth of 0.03.
+    np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.04)
+    np.testing.assert_allclose([found["absorption"], found["backscattering"]], [A, BB], rtol=0.05)
+    with pytest.raises(UserError, match="at least 2 pixels"):
+        retrieve.surface_slopes(one)
 
 
 def test_the_tail_of_a_bottom_counts_and_its_focusing_does_not():
@@ -184,6 +213,28 @@ def test_errors_of_depths_hold_slope_and_range():
     unseen = exact.assign(slope_along_stderr=np.nan, surface_range_stderr=0.1)
     found = errors(unseen.assign_attrs(slope_prior_deviation=[0.01, 0.0, 1.0]))[1]
     assert found == pytest.approx(math.hypot(0.01 * turn, 0.1 * per_range), rel=0.02)
+
+
+def short(bins=0, depth=DEPTH):
+    """Four pixels whose record ends before the bottom, or whose column is too short to be fitted."""
+    shot = result(np.stack([waveform(delay, depth=depth) for delay in plane_delays(0.1, 0.0)]))
+    return shot.isel(time=slice(0, bins or None))
+
+
+def test_estimates_without_a_column(caplog):
+    """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
+    for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):
+        found = retrieve.retrieve(shot)
+        assert float(found["slope_along"]) == pytest.approx(0.1, abs=0.02)
+        assert float(found["depth_m"].sel(correction="slope")) == pytest.approx(depth, abs=0.1, nan_ok=True)
+        for name in ("reflectance", "class_probability", "kd"):
+            assert np.isnan(found[name]).all()
+        assert "no waveform has a column long enough for a fit" in caplog.text
+
+
+def test_no_estimate():
+    with pytest.raises(UserError, match="nothing can be estimated: no waveform has a surface echo"):
+        retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
 
 
 @pytest.mark.slow

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar
+from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 
 THETA, HEIGHT, BEAM, N = math.radians(20), 200.0, 2e-3, 1.34
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 10e-3
@@ -37,6 +38,12 @@ def test_plane(along, across, wind):
     # The beam of 1 mrad averages the density, which falls with the angle: 2e-3 of the energy, and 0.02 ns.
     assert energy[0, 0] == pytest.approx(REFLECTANCE * density / (4 * cosine * distance**2), rel=4e-3)
     assert time[0, 0] == pytest.approx(2e9 * distance / C0, abs=0.03)
+
+
+def test_lidars_just_above_waves_are_refused():
+    """The places at which waves may reflect the light of a narrow beam are millions for each shot."""
+    with pytest.raises(UserError, match=r"altitude = 0.1: the light of a shot meets these waves at up to \d+ places"):
+        sea_shots(lidar([SQUARE], height=0.1), 3.0, 0.0)
 
 
 def test_pixels_share_the_light():

@@ -52,6 +52,21 @@ def test_a_plane_is_found_exactly(theta, along, across, height):
     assert plane.misfit_ns[0] == pytest.approx(0, abs=1e-6)
 
 
+def test_undetermined_slopes_are_nan():
+    """Of four, three, two and one pixels, of strips, and of none."""
+    some = np.stack([plane_times(ANGLE_X, ANGLE_Y, 0.1, 0.05)] * 4)
+    some[1, 3] = some[2, 2:] = some[3, 1:] = np.nan
+    plane = fit_plane(some, POINTS, THETA)
+    for found, slope in ((plane.along, 0.1), (plane.across, 0.05)):
+        np.testing.assert_allclose(found, [slope, slope, np.nan, np.nan], atol=1e-9)
+    assert np.isfinite(plane.range_m).all()
+    strips = PixelLight(np.array([5.1e-3, 1.8e-3, -1.8e-3, -5.1e-3]), np.zeros(4), np.zeros(4))
+    strip = fit_plane(plane_times(strips.angle_x, strips.angle_y, -0.1, 0.0)[np.newaxis], strips, THETA)
+    assert (strip.along[0], strip.across[0]) == (pytest.approx(-0.1, abs=1e-9), pytest.approx(np.nan, nan_ok=True))
+    empty = fit_plane(np.full((1, 4), np.nan), POINTS, THETA)
+    assert np.isnan([empty.along[0], empty.range_m[0]]).all()
+
+
 def test_standard_errors_are_those_of_noise():
     """Variance of 4000 noisy fits over the stated one: chi-squared with 3999 degrees."""
     rng = np.random.default_rng(7)
@@ -164,3 +179,20 @@ def test_slopes_on_a_gaussian_sea(scale):
     with_strengths = slopes_on_sea(measured(shots), gaussian_shots(2000, 1), 1.0)
     without = slopes_on_sea(measured(shots), gaussian_shots(2000, 1), None)
     assert np.all(with_strengths.covariance[:, 0, 0] < 0.5 * without.covariance[:, 0, 0])
+
+
+def test_echoes_that_are_missing_or_lost_tell_less():
+    shots = gaussian_shots(3, 2)
+    sea = gaussian_shots(4000, 1)
+    nothing = np.full_like(shots.energy, np.nan)
+    dark = measured(shots, time_ns=nothing, energy=nothing, column_energy=np.full(4, 1e3))
+    lost = slopes_on_sea(dark, sea, 1.0)
+    np.testing.assert_allclose(lost.covariance, np.broadcast_to(lost.prior, (3, 3, 3)), rtol=1e-2, atol=1e-4)
+    np.testing.assert_allclose(lost.mean, 0, atol=0.02)
+    one = shots.time_ns.copy()
+    one[:, 2] = np.nan
+    full, part = (slopes_on_sea(measured(shots, time_ns=times), sea, None) for times in (shots.time_ns, one))
+    assert np.all(part.covariance[:, 1, 1] > full.covariance[:, 1, 1])
+    np.testing.assert_allclose(part.mean[:, 2], shots.height, atol=0.2)
+    hidden = measured(shots, time_spread_ns=np.ones(4), column_energy=np.full(4, 1e3))
+    assert np.all(slopes_on_sea(hidden, sea, None).covariance[:, 0, 0] > 1.05 * full.covariance[:, 0, 0])

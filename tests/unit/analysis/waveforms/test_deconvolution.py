@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.analysis.waveforms.deconvolution import deconvolution_offset, deconvolved_echo, richardson_lucy
 from mitransient_lidar.analysis.waveforms.echo_detection import Records, find_echoes
@@ -70,3 +71,19 @@ def test_time_without_noise_has_no_bias(tau):
     np.testing.assert_allclose(echoes.time_ns - offset, arrivals, atol=0.005)
     np.testing.assert_allclose(echoes.energy, record.sum(axis=1) * DT * 1e-9, rtol=0.02)
     assert (echoes.width_ns < 0.5 * template.fwhm_ns).all()
+
+
+def test_errors_of_time_and_energy_are_those_of_the_noise_within_a_fifth():
+    count, noise = 600, 0.02
+    rng = np.random.default_rng(5)
+    arrivals = 60 + rng.random(count)
+    power = echo(arrivals) + noise * rng.normal(size=(count, TIME.size))
+    records = Records.of(power, TIME, noise)
+    # From early on, in one of 50 sets noise would be a first peak.
+    found = find_echoes(records, TEMPLATE.fwhm_ns, earliest_ns=55)
+    sharp = richardson_lucy(power, KERNEL, offset=noise, iterations=40)
+    got = deconvolved_echo(records, sharp, found.surface, TEMPLATE, found.flags[0], TEMPLATE.fwhm_ns)
+    truth = np.sqrt(2 * np.pi) * SIGMA * 1e-9
+    for value, error in ((got.time_ns - arrivals, got.time_stderr), (got.energy - truth, got.energy_stderr)):
+        assert abs((value / error).std(ddof=1) - 1) < 0.2 + largest_z(count, 2) / np.sqrt(2 * count)
+    assert abs(np.mean(got.time_ns - arrivals)) < 0.01

@@ -6,7 +6,13 @@ import xarray as xr
 from rows import each_row
 
 from mitransient_lidar.analysis.waveforms import depth_correction
-from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, turned_pixels
+from mitransient_lidar.analysis.waveforms.depth_correction import (
+    AXES,
+    correct_depths,
+    summarize_depths,
+    turned_pixels,
+)
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
 
 ECHO = ["surface", "column", "target", "bottom"]
@@ -131,6 +137,50 @@ def test_ripples_are_an_axis_of_level_seas():
     assert bottom["depth_m_method_error"].item() == pytest.approx(np.sqrt(whole * depth_correction._OF_RIPPLES))
 
 
+def test_columns_with_and_without_attenuation_have_no_bias_in_common():
+    """At 2 m no column is measured, and the bias is -20 cm; at 6 and 10 m it is 10 cm."""
+    made = table()
+    made["attenuation"] = made["attenuation"].where(made["depth"] > 2)
+    made["bias"] = xr.zeros_like(made["bias"]) + xr.where(made["depth"] > 2, 0.1, -0.2)
+    for attenuation, bias in ((0.3, 0.1), (np.nan, -0.2)):
+        corrected = correct_depths(echoes([4.0], attenuation, several=False), made).isel(pixel=0, echo=-1)
+        assert corrected["depth_correction_m"].item() == pytest.approx(bias)
+        # The spread is 2 cm at 2 m, 6 cm at 6 m.
+        assert corrected["depth_m_method_error"].item() == pytest.approx(0.06 if bias > 0 else 0.02)
+    # Of a single depth without attenuation, the walk of the other columns counts.
+    made["bias"] = made["bias"] + xr.where(made["depth"] > 6, 0.04, 0.0)
+    corrected = correct_depths(echoes([4.0], np.nan, several=False), made).isel(pixel=0, echo=-1)
+    walked = 2 * 0.47 * 0.04**2 / 4
+    assert corrected["depth_m_method_error"].item() == pytest.approx(np.sqrt(0.02**2 + walked))
+
+
+def test_noise_in_the_table_counts_once():
+    """Of a spread of 5 cm, 3 cm are the noise that the shots state; 8 cm of noise are reduced to the 5 cm."""
+    made = table()
+    made["bias"][:] = 0.0
+    made["spread"][:] = 0.05
+    for noise, method, share in ((0.03, 0.04, 1.0), (0.08, 0.0, 0.05 / 0.08)):
+        made["noise_error"][:] = noise
+        bottom = correct_depths(echoes([6.0]), made).sel(echo="bottom")
+        np.testing.assert_allclose(bottom["depth_m_method_error"], method, atol=1e-9)
+        np.testing.assert_allclose(bottom["depth_m_stderr"], 0.02 * share)
+
+
+def test_a_bias_within_its_error_counts_little():
+    made = table().assign_attrs(shots=4)
+    made["bias"][:], made["spread"][:] = 0.02, 0.08
+    # A level sea has one place, of which several renders differ as places of waves do.
+    for wind, renders, share in ((6.0, 1, 0.2), (0.0, 1, 1.0), (0.0, 4, 0.2)):
+        given = made.assign_attrs(level_renders=renders)
+        heights = [0.0, 0.0] if wind == 0 else [-0.5, 0.5]
+        found = echoes([6.0], surface_heights_m=heights)
+        corrected = correct_depths(found, given, wind or 5.0).sel(echo="bottom")
+        np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * share)
+        # The variance of four places, and that of their mean where they are independent.
+        variance = 0.08**2 / (1 - 1 / 4) + (0.08**2 / 4 if share < 1 else 0)
+        np.testing.assert_allclose(corrected["depth_m_method_error"], np.sqrt(variance))
+
+
 def stated(seed, realisations=20):
     """Mean squares of error over stated error of the shots of independent tables with biases of random walks.
 
@@ -173,6 +223,22 @@ def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     error = squares.std(ddof=1) / np.sqrt(squares.size)
     assert error < 0.12
     assert abs(squares.mean() - 1) < 4 * error
+
+
+def test_summary_of_depths():
+    """Three of four found, one of them 0.7 m off; flagged errors are not wrong ones."""
+    found = echoes([5.1, 4.9, 5.7, np.nan])
+    found["flags"][{"shot": 3, "echo": 3}] = int(EchoFlag.NO_ECHO)
+    numbers = summarize_depths(found, np.full(4, 5.0))
+    assert numbers["found"].shape == (2, 2)
+    np.testing.assert_allclose(numbers["found"], 0.75)
+    np.testing.assert_allclose(numbers["bias"], 0.7 / 3)
+    np.testing.assert_allclose(numbers["spread"], np.std([0.1, -0.1, 0.7]))
+    np.testing.assert_allclose(numbers["wrong"], 0.25)
+    np.testing.assert_allclose(numbers["error"], np.hypot(0.02, 0.05))
+    np.testing.assert_allclose(numbers["z"], np.sqrt(np.mean(np.square([0.1, 0.1, 0.7]))) / np.hypot(0.02, 0.05))
+    found["flags"][{"shot": 2, "echo": 3}] = int(EchoFlag.FEW_EVENTS)
+    np.testing.assert_allclose(summarize_depths(found, np.full(4, 5.0))["wrong"], 0)
 
 
 @each_row(

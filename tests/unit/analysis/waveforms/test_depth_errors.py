@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import mitransient_lidar
+from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.geometry import LinesOfSight
@@ -74,8 +76,38 @@ def test_light_in_bins_has_the_error_of_its_centroid(spread):
     assert math.sqrt(max(found, 0)) == pytest.approx(expected, rel=0.3, abs=2e-3)
 
 
+def test_surface_times_of_waves_and_of_lost_echoes_are_less_certain():
+    level, waves = errors(), errors(surface_heights_m=(-0.6, 0.6))
+    unknown = errors(surface_heights_m=(math.nan, math.nan))
+    assert (level.slope, level.height) == (0.0, 0.0)
+    assert (waves.slope, waves.height) == (pytest.approx(0.4 * (waves.beam_width / 2) ** -0.25 * math.sqrt(0.02)), 0.15)
+    assert (unknown.slope, unknown.height) == (waves.slope, 0.0)
+    wide = replace(level.lines, surface_spread=np.array([2.0, 2.0]))
+    faint = np.array([False, True])
+    for one, share in ((level, 0.4), (waves, 0.85)):
+        found = replace(one, lines=wide).of_surface(faint)
+        np.testing.assert_allclose(found, [math.hypot(2 * share, 0.03 * 5), math.hypot(2, 0.15 * 5)])
+
+
 def test_scattered_light_counts_with_the_beam_inside_the_view():
     wide = of_depth(errors(), attenuation=0.2)[0]
     assert of_depth(errors(field_of_view_mrad=5.0), attenuation=0.2)[0] < 0.6 * wide
     # A tenth of a percent to two percent of the depth, as measured for waters of this attenuation.
     assert 0.001 < wide / 8 < 0.02
+
+
+@pytest.mark.slow
+def test_published_biases_of_depth_appear_in_rendered_results():
+    """Turbid water: 8 m too deep at nadir, too shallow far off it, by undercutting (Guenther and Thomas 1984)."""
+
+    def depth(off_nadir, estimator, scattering, backscattering):
+        params = {"attenuation": scattering + 0.1, "scattering": scattering, "backscattering": backscattering}
+        params |= {"spectrum": "flat", "slope_variance": 0.01, "divergence_mrad": 2, "pulse_fwhm_ns": 4}
+        params |= {"field_of_view_mrad": 60, "bottom_reflectance": 0.5, "off_nadir_deg": off_nadir, "bin_count": 200}
+        params |= {"time_start_ns": round(2e9 * 200 / np.cos(np.radians(off_nadir)) / 299792458 - 60)}
+        shot = mitransient_lidar.render("fig09_1x1", params={**params, "bin_width_ns": 1}, passes=6, seed=1)
+        return float(echo_table.extract(shot, estimator, depth_from="mean")["depth_m"].sel(echo="bottom")[0])
+
+    assert 0.05 < depth(5.0, "peak", 0.8, 0.008) - 8 < 0.3
+    # The beam's footprint alone makes a leading edge early there.
+    assert -0.6 < depth(50.0, "leading_edge", 0.8, 0.008) - depth(50.0, "leading_edge", 0.02, 0.0005) < -0.1

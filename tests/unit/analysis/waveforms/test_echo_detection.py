@@ -233,6 +233,18 @@ def test_light_scattered_behind_a_bottom_does_not_hide_it():
     assert shares[1] < 0.004
 
 
+def test_echoes_nearer_than_a_pulse_are_flagged_as_merged():
+    resolved = echoes(60, 1.0)[0] + echoes(60 + 1.3 * FWHM, 1.0)[0]
+    near = echoes(60, 1.0)[0] + echoes(60 + 1.1 * FWHM, 1.0)[0]
+    single = echoes(60, 1.0)[0]
+    hidden = echoes(60, 1.0)[0] + echoes(60 + 0.6 * FWHM, 1.0)[0]
+    found = find_echoes(Records.of(np.stack([resolved, near, single, hidden]), TIME), FWHM)
+    assert (found.bins[2] >= 0).tolist() == [True, True, False, False]
+    merged = EchoFlag.MERGED
+    assert (found.flags[0] & merged).astype(bool).tolist() == [False, True, False, True]
+    assert (found.flags[2] & merged).astype(bool).tolist() == [False, True, False, True]
+
+
 @each_row(
     ("arguments", "sentence"),
     [

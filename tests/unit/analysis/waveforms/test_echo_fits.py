@@ -191,3 +191,19 @@ def test_change_points_find_layers_where_they_are():
     assert found.decay_before[:, 0].mean() == pytest.approx(0.05, abs=1e-3)
     assert found.decay_after[:, 0].mean() == pytest.approx(0.02, abs=1e-3)
     assert np.mean(found.p_value[:, 1] < 0.01) < 0.05
+
+
+def test_coarse_samples_of_short_pulses_determine_a_bottom():
+    """Echoes of 1.2 ns in samples of 1 ns, of which a span of echo widths holds no more than parameters."""
+    time, sigma = np.arange(120) + 0.5, 0.53
+    places = 60 + np.random.default_rng(5).uniform(0, 1, COUNT)
+    signal = np.exp(-0.5 * ((time - places[:, np.newaxis]) / sigma) ** 2) + 0.02 * (time < places[:, np.newaxis])
+    records = Records.of(signal + 0.02 * np.random.default_rng(6).normal(size=signal.shape), time, 0.02)
+    width = sigma * np.sqrt(8 * np.log(2))
+    found = gaussian_echo(
+        records, np.argmax(signal, axis=1), width, 0.0, np.zeros(COUNT, int), EchoShape.gaussian(width)
+    )
+    z = (found.time_ns - places) / found.time_stderr
+    assert np.isfinite(z).mean() > 0.99
+    assert abs(np.nanmean(z)) < largest_z(COUNT) / np.sqrt(COUNT) + 0.1
+    assert 0.8 < np.nanstd(z) < 1.2

@@ -6,13 +6,29 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from lake_waveforms import BINS, DECAY, PER_NS, SHIFTS, SURFACE, TIME, column, echo, lit, recorded, result, waveform
+from lake_waveforms import (
+    BINS,
+    DECAY,
+    PER_NS,
+    SHIFTS,
+    SURFACE,
+    TIME,
+    column,
+    echo,
+    lit,
+    recorded,
+    result,
+    waveform,
+)
 from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
+
+#: Delays of targets behind the surface [ns], of four waveforms.
+PLACES = [[], [40], [40, 28], [44, 34, 54]]
 
 
 @each_row("estimator", echo_table.ESTIMATORS)
@@ -78,6 +94,22 @@ def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
     # Without shares of the beam, every first echo is the surface.
     unknown = echo_table.extract(result(dataset["waveform"].values))
     assert not (unknown["flags"] & EchoFlag.NO_SURFACE_LIGHT).any()
+
+
+def test_all_targets_of_a_waveform_are_listed():
+    """None, one, two and three targets: the table has as many as the waveform with most, the strongest first."""
+    shots = [waveform() + sum(echo(SURFACE + at, 5e-13 / (1 + k)) for k, at in enumerate(places)) for places in PLACES]
+    table = echo_table.extract(result(np.stack(shots)))
+    names = ["target", "target_2", "target_3"]
+    assert table["echo"].values.tolist() == ["surface", "column", *names, "bottom"]
+    for pixel, places in enumerate(PLACES):
+        own = table.isel(pixel=pixel)
+        delay = own["time_ns"].sel(echo=names[: len(places)]).values - SURFACE
+        np.testing.assert_allclose(delay, places, atol=0.3)
+        assert (own["flags"].sel(echo=names[: len(places)]) == 0).all()
+        assert (own["flags"].sel(echo=names[len(places) :]) == EchoFlag.NO_ECHO).all()
+        assert float(own["time_ns"].sel(echo="bottom")) - SURFACE == pytest.approx(70, abs=0.1)
+    assert echo_table.extract(result(np.stack(shots)), targets=1)["echo"].values.tolist() == list(echo_table.ECHOES)
 
 
 @pytest.mark.parametrize("rise", [1.5, 3.0])
