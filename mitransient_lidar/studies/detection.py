@@ -163,7 +163,7 @@ def detect(
     Images: all pixels and gates are weighted by difference over variance, behind the covariance of pixels that share
     the noise of an intensifier, and of the images of seas. The level without the target, or its mean over the seas, is
     known. Each render is filtered with the weights of the others, so that the errors of renders lower the probability
-    and never raise it.
+    and never raise it. The sum has the mean, variance and skewness of rare events (`statistics.Statistic`).
     """
     device = receiver_of("receiver", receiver)
     camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
