@@ -318,6 +318,27 @@ FAULTS = (
         "self.null_sd",
         near=f"{_UNIT}/analysis/detection",
     ),
+    Fault(
+        *("camera_without_efficiency", f"{_P}/receiver/camera.py"),
+        "factor = self.quantum_efficiency * photons",
+        "factor = photons",
+        near=f"{_UNIT}/physics/receiver/test_camera.py",
+    ),
+    Fault(
+        *("platform_to_the_left", f"{_P}/lidar/gate_sequence.py"),
+        "[math.sin(heading), math.cos",
+        "[-math.sin(heading), math.cos",
+        near=f"{_UNIT}/physics/lidar/test_gate_sequence.py",
+    ),
+    Fault(
+        *("frames_of_one_pulse", f"{_A}/gates/recording.py"),
+        'int(dataset.attrs.get("pulses", 1)), "pat',
+        '1, "pat',
+        near=f"{_UNIT}/analysis/gates",
+    ),
+    Fault(
+        "frames_add_up", f"{_A}/detection/images.py", ".mean() / frames", ".mean()", near=f"{_UNIT}/analysis/detection"
+    ),
 )
 
 
