@@ -97,10 +97,12 @@ def exit_on_error() -> Iterator[None]:
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit as after an interruption if one ended the render of a result or of a series of shots, or a fit."""
+    """Exit as after an interruption if one ended the render of a result, a series of shots or frames, or a fit."""
     if dataset.attrs.get("interrupted"):
         if "shot" in dataset.dims:
             done = f"{dataset.sizes['shot']} of the shots"
+        elif "pulse_time" in dataset:  # images by daylight have frames, too, all of which are there
+            done = f"{dataset.sizes['frame']} of {dataset.attrs['frames']} frames"
         elif "renders" in dataset.attrs:
             done = f"{dataset.attrs['renders']} renders, before the fit has converged"
         else:

@@ -5,6 +5,7 @@ import pytest
 from significance import largest_z
 
 import mitransient_lidar
+from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
@@ -122,6 +123,19 @@ def test_images_forget_the_waves_as_their_spectrum_does():
     assert found[0] > 0.6
     assert found[3] < -0.5
     assert np.abs(found[-2:]).mean() < 0.4
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_the_frames_that_are_complete():
+    def interrupt(progress):
+        if progress.done >= 3:
+            raise KeyboardInterrupt
+
+    few, options = {**PATHS, "paths_per_pass": 2**10}, {"frames": 500, "passes": 2, "progress": interrupt}
+    frames = mitransient_lidar.render_frames("table1", {**GATES, "spectrum": "flat"}, integrator=few, **options)
+    assert 1 <= frames.sizes["frame"] < 500
+    with pytest.raises(KeyboardInterrupt, match=f"interrupted after {frames.sizes['frame']} of 500 frames"):
+        exit_if_interrupted(frames)
 
 
 def test_frames_beyond_the_memory_are_refused_before_the_render():
