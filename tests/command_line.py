@@ -20,7 +20,7 @@ def run(*arguments):
 
 
 def stub(monkeypatch, command, function):
-    """Let a command call another function; its options stay as they are."""
+    """Replace the function that a command calls, and keep its options."""
     GROUP.commands[command].params  # noqa: B018 (reads the signature)
     place, _, name = COMMANDS[command].function.partition(":")
     monkeypatch.setattr(f"mitransient_lidar.{place}.{name}", function)

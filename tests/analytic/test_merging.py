@@ -382,6 +382,23 @@ def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, tw
 
 
 @pytest.mark.slow
+def test_every_pixel_of_an_image_has_the_light_of_the_water():
+    """One path a pixel, whose places are the same in all passes: those that are merged must not be."""
+    wide = {"divergence_mrad": 150, "attenuation": 0.6, "scattering": 0.5, "bottom_reflectance": 0}
+    view = {"layout": "64x64", "field_of_view_shape": "square", "spectrum": "flat"}
+    session = open_scene("fig09_2x2", {**view, **wide})
+    few = {**FEW, "paths_per_pass": 64 * 64}
+    renderer = choose_integrator(session.scene, few).prepare(session.scene, session.sensor)
+    light = np.array([renderer.render_pass(seed).histogram.energy()[..., 20:80].sum(axis=-1) for seed in range(16)])
+    row, column = np.mgrid[:64, :64]
+    for kind in (row + column, row, column, row + column // 2, row // 2 + column):
+        found, other = (light[:, kind % 2 == parity].mean(axis=1) for parity in (0, 1))
+        mean, error = mean_and_error(found - other)
+        assert abs(mean) < largest_z(16, 5) * error
+        assert error < 0.1 * light.mean()
+
+
+@pytest.mark.slow
 def test_every_second_path_of_an_image_stands_for_two(monkeypatch):
     """The light of water and bottom is that of all paths; without the weight, the water would have half of it."""
     session = open_scene("fig09_2x2", {"layout": "64x64", "spectrum": "flat"})

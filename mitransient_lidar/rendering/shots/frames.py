@@ -166,7 +166,7 @@ def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> P
 
 
 def _check_size(sequence: GateSequence, pixels: int, max_memory: float) -> None:
-    """Say what the frames of a sequence take, and refuse more than `max_memory` [GB] or the machine has."""
+    """Log the memory of all frames; refuse more than `max_memory` [GB], or than the memory of the machine."""
     images, sums = sequence.frames * sequence.gates, pixels * sequence.gates
     size = _BYTES_PER_VALUE * pixels * images + _BYTES_PER_SUM * max(sums, min(sums * images, _SUMS))
     what = f"{sequence.frames} frames of {sequence.gates} gates of {pixels} pixels"

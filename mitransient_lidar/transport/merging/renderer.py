@@ -15,7 +15,7 @@ from mitransient_lidar.transport.merging.layout import PATCH_PER_CELL, PHOTONS, 
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids
 from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
-from mitransient_lidar.transport.merging.segments import SegmentBuffer, memory_of_path
+from mitransient_lidar.transport.merging.segments import PATHS_OF_GROUP, SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.opaque import changed, opaque
 from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.paths.path_classes import PathClasses
@@ -29,7 +29,7 @@ from mitransient_lidar.transport.solids import met_shape
 
 #: Numbers of the random streams within a pass; the path tracer has number 3.
 _COMMON_STREAM, _LIGHT_STREAM, _SENSOR_STREAM = 0, 1, 2
-_MERGE_STREAM, _CONNECTION_STREAM, _SOLID_CONNECTION_STREAM = 4, 5, 6
+_MERGE_STREAM, _CONNECTION_STREAM, _SOLID_CONNECTION_STREAM, _TURN_STREAM = 4, 5, 6, 7
 
 #: Default numbers of paths and photons of a pass.
 _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
@@ -153,7 +153,7 @@ class MergingRenderer(PassRenderer):
     def _every(self, paths: int) -> int:
         """Return of how many paths of the receiver one is merged in the water."""
         is_imager = self.scene.receiver.is_imager
-        return _EVERY_IN_IMAGES if is_imager and paths % _EVERY_IN_IMAGES == 0 else 1
+        return _EVERY_IN_IMAGES if is_imager and paths % (_EVERY_IN_IMAGES * PATHS_OF_GROUP) == 0 else 1
 
     def _trace_light(
         self, received: ReceivedLight, shots: Shots, patches: SolidPatches, rates: ConnectionRates
@@ -220,7 +220,9 @@ class MergingRenderer(PassRenderer):
         every = self._every(paths)
         count //= every
         capacity = int(layout.sensor_segments * count)
-        segments = SegmentBuffer(scene, self.classes, layout.spacing, paths, capacity, shots.count, every)
+        # At random in each pass, as the places of paths in the view are the same in all.
+        turn = mi.UInt32(every * lanes.pick(shots.uniform(_TURN_STREAM, 1)[0])) if every > 1 else None
+        segments = SegmentBuffer(scene, self.classes, layout.spacing, paths, capacity, shots.count, every, turn)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.walking(scene, scene.receiver_pose, start.angles, start.weight, offset)
         path.pixel = start.pixel

@@ -41,11 +41,15 @@ _FIELDS = {
 }
 
 
+#: Neighbouring paths that are stored together: the sets of the receiver's samples take turns.
+PATHS_OF_GROUP = 4
+
+
 class SegmentBuffer:
     """Segments in the water of `paths` paths of each shot, with points at equal distances `spacing` [m] along them.
 
     At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path. Of each
-    `every` neighbouring paths, one in turn is stored, and stands for all of them.
+    `every` neighbouring groups of paths, that of number `turn` is stored, and stands for all of them.
     """
 
     def __init__(
@@ -57,9 +61,10 @@ class SegmentBuffer:
         capacity: int,
         shots: int = 1,
         every: int = 1,
+        turn: mi.UInt32 | None = None,
     ) -> None:
         self._water, self._perturbations, self._classes = scene.required_water, scene.perturbations, classes
-        self.paths, self._shots, self._every = paths // every, shots, every
+        self.paths, self._shots, self._every, self._turn = paths // every, shots, every, turn
         self.spacing = opaque(spacing)
         self.capacity, self._capacity = capacity, opaque_index(capacity)
         self._stored = dr.zeros(mi.UInt32, 1)
@@ -75,8 +80,9 @@ class SegmentBuffer:
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         lane, throughput = path.lane, mi.Float(path.throughput)
         if self._every > 1:
-            lane = path.lane // self._every
-            active &= path.lane - lane * self._every == lane % self._every
+            group = path.lane // PATHS_OF_GROUP
+            active &= group % self._every == self._turn
+            lane = group // self._every * PATHS_OF_GROUP + path.lane % PATHS_OF_GROUP
             throughput *= self._every
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
