@@ -55,7 +55,7 @@ class Canopy:
             raise UserError(f"leaf_width = {self.leaf_width:g} must be at most height = {self.height:g}")
         if self.shoot_density is not None and self.shoot_density > self.density:
             raise UserError(
-                f"shoot_density = {self.shoot_density:g} must be at most the {self.density:.4g} blades per square metre "
+                f"shoot_density = {self.shoot_density:g} must be at most {self.density:.4g}, the blades per square metre "
                 f"of leaf_area_index = {self.leaf_area_index:g}"
             )
 
@@ -73,7 +73,7 @@ class Canopy:
         """Return the mean projection of leaves on a direction at an angle from the vertical [rad].
 
         1/2 for leaves in all directions alike; 2/pi times the mean sine of the angle to blades that lean in any
-        direction and face any way (Warren Wilson 1959, doi:10.1111/j.1469-8137.1960.tb06210.x).
+        direction and face any way (Warren Wilson 1960, doi:10.1111/j.1469-8137.1960.tb06210.x).
         """
         if self.bending is None:
             return 0.5

@@ -7,8 +7,6 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from scipy.interpolate import RegularGridInterpolator
-
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import CANOPY
 from mitransient_lidar.core.validation import FloatArray
@@ -38,15 +36,15 @@ class CanopyShape(mi.Mesh):
     So that gaps stay open for both, ``lidar_merging`` connects the solids of a scene with plants to the laser, instead
     of merging light on them (its parameter ``solids``).
 
-    Plants stand in a square. A nested reference to a ``seabed`` puts them on it, wherever it is; otherwise the bottom
-    is level at ``depth``.
+    Plants stand in a square, on the level ``depth``, or on a ``seabed`` to which a reference is nested, as
+    ``<ref id="bottom"/>`` in the scene ``seagrass``.
 
     .. code-block:: xml
 
-        <shape type="canopy" id="seagrass">
-            <ref id="bottom"/>
-            <float name="leaf_area_index" value="2"/>
-            <float name="height" value="0.4"/>
+        <shape type="canopy">
+            <float name="depth" value="5"/>
+            <float name="leaf_area_index" value="1.5"/>
+            <float name="height" value="0.8"/>
         </shape>
 
     .. code-block:: python
@@ -84,9 +82,7 @@ class CanopyShape(mi.Mesh):
                 "the mean sea level"
             )
         if not any(isinstance(child, mi.BSDF) for _, child in props.objects()):
-            props["leaf"] = create_object(
-                "leaf", reflectance=read("reflectance"), transmittance=read("transmittance")
-            )
+            props["leaf"] = create_object("leaf", reflectance=read("reflectance"), transmittance=read("transmittance"))
         props["face_normals"] = True
         vertices, faces = leaf_triangles(feet - props.frame_origin, width, length)
         super().__init__("canopy", len(vertices), len(faces), props, has_vertex_texcoords=True)
@@ -101,6 +97,8 @@ def _ground(props: DeclaredProperties, grounds: list[mi.Shape], feet: FloatArray
     if len(grounds) > 1 or bottom is None:
         names = ", ".join(repr(shape.id()) for shape in grounds)
         raise UserError(f"canopy: the nested shape must be one seabed, not {names}")
+    from scipy.interpolate import RegularGridInterpolator
+
     x, y = bottom.lines()
     return np.asarray(RegularGridInterpolator((y, x), bottom.heights(x, y))(feet[:, 1::-1]))
 
