@@ -55,7 +55,7 @@ class Canopy:
             raise UserError(f"leaf_width = {self.leaf_width:g} must be at most height = {self.height:g}")
         if self.shoot_density is not None and self.shoot_density > self.density:
             raise UserError(
-                f"shoot_density = {self.shoot_density:g} must be at most {self.density:.4g}, the blades per square metre "
+                f"shoot_density = {self.shoot_density:g} must be at most {self.density:.4g} blades per square metre "
                 f"of leaf_area_index = {self.leaf_area_index:g}"
             )
 
