@@ -98,7 +98,7 @@ class LidarMerging(PassIntegrator):
         given = [name for name in ("paths_per_pass", "photons_per_pass") if name in props]
         counts = {name: props.read(name) for name in given}
         lengths = {name: props.read(name) for name in ("cell_size", "point_spacing")}
-        self.options = MergingOptions(**counts, **lengths)
+        self.options = MergingOptions(**counts, **lengths, solids=props.read("solids"))
 
     def prepare(
         self,

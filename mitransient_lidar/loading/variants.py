@@ -41,6 +41,8 @@ PLUGIN_MODULES = {
     "ocean_surface": "shape",
     "seabed": "shape",
     "retroreflector": "bsdf",
+    "plants.leaf": "bsdf",
+    "plants.canopy": "shape",
     "sediment": "bsdf",
     "lidar_transmitter": "emitter",
     "sun": "emitter",

@@ -21,7 +21,7 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
+from mitransient_lidar.transport.plugin_types import OpenShape, SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import box_of, children
@@ -180,6 +180,11 @@ class WaterScene:
         lowest, _ = self.sea_heights or (0.0, 0.0)
         mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
         return self._have_solids(mirror) or any(float(solid.bbox().max.z) > lowest for solid in self.solids)
+
+    @property
+    def has_shared_gaps(self) -> bool:
+        """Whether a solid has gaps, finer than patches, through which both laser and receiver look."""
+        return any(isinstance(solid, OpenShape) and solid.shares_gaps for solid in self.solids)
 
     @property
     def has_veils(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitransient_lidar.core.parameters.fields import AUTO, file, nested, number, plugin, text
+from mitransient_lidar.core.parameters.fields import AUTO, count, file, nested, number, plugin, text
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 
 # A parameter a row, which the formatter would spread over five.
@@ -80,6 +80,34 @@ RETROREFLECTOR = plugin(
     number("width_deg", 2.0, "degree", 0.01, 180,
         "Full angle between the directions where the lobe has fallen to e^-1/2 of its peak"),
     number("diffuse_share", 0.0, "1", 0, 1, "Lambertian share of the reflected light"),
+)
+
+_REFLECTANCE = number("reflectance", 0.08, "1", 0, 1, "Share of the light that a leaf reflects diffusely", by_id=True)
+_TRANSMITTANCE = number("transmittance", 0.1, "1", 0, 1, "Share that it transmits diffusely", by_id=True)
+
+LEAF = plugin("leaf", _REFLECTANCE, _TRANSMITTANCE)
+
+CANOPY = plugin(
+    "canopy",
+    number("leaf_area_index", 2.0, "1", 0, 20, "Area of leaves, of one side, per area of the bottom", above=True),
+    number("height", 0.5, "m", 0, 100, "Height of the plants above the bottom", above=True, by_id=True),
+    text("form", "blades", "``blades`` that stand on the bottom, or ``leaves`` everywhere in the layer",
+        ("blades", "leaves"), by_id=True),
+    number("leaf_width", 0.01, "m", 0, 10, "Width of a blade, side of a square leaf", above=True),
+    number("bending_deg", 25.0, "degree", 0, 80, "Angle of blades with the vertical"),
+    number("bending_azimuth_deg", None, "degree", -3600, 3600,
+        "Azimuth towards which they lean, from +x towards +y", otherwise="any, at random"),
+    number("shoot_density", None, "1/m2", 0, 1e6, "Shoots, whose blades stand at one place", above=True,
+        otherwise="blades stand alone"),
+    number("depth", 8.0, "m", 0, 1e5, "Depth of a level bottom without a nested one"),
+    number("centre_x", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Centre of the square with plants",
+        by_id=True),
+    number("centre_y", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y", by_id=True),
+    number("size", 10.0, "m", 0, 1e4, "Its side", above=True, by_id=True),
+    count("seed", 1, 0, 2**31 - 1, "Seed of their places", by_id=True),
+    _REFLECTANCE,
+    _TRANSMITTANCE,
+    nested("(nested)", "shape, bsdf", "A ``seabed`` on which they stand; any BSDF instead of ``leaf``"),
 )
 
 #: Shares of light that BSDFs of Mitsuba reflect or transmit.

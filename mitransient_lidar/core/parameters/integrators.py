@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitransient_lidar.core.parameters.fields import Parameter, count, number, plugin, switch
+from mitransient_lidar.core.parameters.fields import Parameter, count, number, plugin, switch, text
 
 # A parameter a row, which the formatter would spread over five.
 # fmt: off
@@ -35,6 +35,9 @@ LIDAR_MERGING = plugin(
     number("point_spacing", 0.0, "m", 0, 1e4,
         "Distance between points along a path; 0: a fourteenth of the distance to the bottom or to the depth that the "
         "time axis allows, a tenth from 4096 pixels on"),
+    text("solids", "auto",
+        "``merged`` with light, or ``connected`` to the laser as by ``lidar_volpath``, which keeps gaps that laser and "
+        "receiver share; ``auto``: connected where the scene has a ``canopy``", ("auto", "merged", "connected")),
 )
 
 LIDAR_VOLPATH = plugin(

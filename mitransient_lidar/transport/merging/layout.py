@@ -84,6 +84,7 @@ class MergingOptions:
     photons_per_pass: int | None = None
     cell_size: float = 0.0
     point_spacing: float = 0.0
+    solids: str = "auto"
 
 
 @dataclass

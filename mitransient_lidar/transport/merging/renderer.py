@@ -75,6 +75,7 @@ class MergingRenderer(PassRenderer):
         self.photons = options.photons_per_pass or (_PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else PHOTONS)
         self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_probe(self.probe, options)
         self._connections = connections
+        self._merges_solids = not scene.has_shared_gaps if options.solids == "auto" else options.solids == "merged"
         self._beam = BeamSampler(scene.transmitter, scene.receiver, self.layout.spread)
 
     @property
@@ -128,9 +129,10 @@ class MergingRenderer(PassRenderer):
         if points > 0:
             self._join(received, shots, segments, points, patches, rates, light)
         # The path tracer adds the light that merging leaves out.
-        if not scene.has_specular_or_dry_solids:
+        if self._merges_solids and not scene.has_specular_or_dry_solids:
             paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, _COMPLEMENT_PATHS // shots.count)
-        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), received, shots, paths)
+        complement = VolpathOptions(complement_only=True, connects_solids=not self._merges_solids)
+        trace_connected(scene, self.sampler, complement, received, shots, paths)
         return True
 
     def _fit_segments(self, shots: Shots, paths: int) -> None:
@@ -172,6 +174,8 @@ class MergingRenderer(PassRenderer):
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates_of_paths)
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
+            if not self._merges_solids:
+                return
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
             once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
             connectable = active & once & path.before_first_solid
@@ -179,7 +183,7 @@ class MergingRenderer(PassRenderer):
             even = path.throughput / foreshortening(dr.abs(dr.dot(si.n, path.direction)), patch.cosine)
             hits.add(path, even, si.p, patch, active, connectable)
 
-        path = walk.run(path, rng, segments, on_solid=store, past_solids=True)
+        path = walk.run(path, rng, segments, on_solid=store, past_solids=self._merges_solids)
         received.rays = dr.sum(mi.Float64(path.rays))
         dr.schedule(received.rays)
         points, wanted = segments.finalize()

@@ -67,6 +67,8 @@ class VolpathOptions:
         emitter's direction, instead of throughput alone.
     weights_absorption
         Whether absorption reduces the weight of paths, instead of the number of those that scatter or arrive.
+    connects_solids
+        Whether `complement_only` has the paths whose first solid is under water, too.
     """
 
     max_scatterings: int = -1
@@ -77,6 +79,7 @@ class VolpathOptions:
     solid_guiding_probability: float | None = None
     expects_emitter: bool = False
     weights_absorption: bool = False
+    connects_solids: bool = False
 
 
 class PathLight:
@@ -341,7 +344,8 @@ class PathTracer:
 
     def _merged(self, path: ConnectedPath, vertex: Vertex, first: mi.Bool) -> mi.Bool:
         """Return whether ``lidar_merging`` finds the connections of a vertex by merging."""
-        seen_through = vertex.submerged | (vertex.at_sea & (path.scatterings > 0))
+        submerged = vertex.scattered if self.options.connects_solids else vertex.submerged
+        seen_through = submerged | (vertex.at_sea & (path.scatterings > 0))
         return (first & vertex.on_surface) | (path.before_first_solid & seen_through)
 
     def _optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Float:
@@ -432,7 +436,7 @@ class PathTracer:
             factor = dr.select(mixed, value / mixed_pdf, factor)
         specular = vertex.on_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         passes = ~mixed & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        if self.options.complement_only:
+        if self.options.complement_only and not self.options.connects_solids:
             # Merging also finds the rest of the path, unless it can meet a mirror or a solid in the air first.
             path.active &= ~(path.before_first_solid & vertex.on_solid & ~passes & submerged & ~specular)
             if not self.scene.has_specular_or_dry_solids:

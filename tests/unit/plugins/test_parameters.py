@@ -23,6 +23,7 @@ WITHOUT_VALUE = {
         *("jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"),
         *("bubble_void_fraction", "bubble_depth"),
     },
+    "canopy": {"bending_azimuth_deg", "shoot_density"},
     "ocean_surface": {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
