@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import number_list
 from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.water_types import water_of
+from mitransient_lidar.physics.water.seawater import (
+    VISIBLE_RANGE,
+    WAVELENGTH_RANGE,
+    group_index,
+    refractive_index,
+    water_absorption,
+)
+from mitransient_lidar.physics.water.water_types import InherentProperties, near_infrared, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
@@ -24,6 +34,14 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
+
+logger = logging.getLogger(__name__)
+
+#: Indices of sea water as functions of the wavelength [nm].
+_INDICES = {"refractive_index": refractive_index, "group_index": group_index}
+
+#: Absorption over that of pure water below which coefficients given as numbers are doubted.
+_LEAST_ABSORPTION = 0.8
 
 #: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
@@ -37,7 +55,11 @@ class LayeredWater(mi.Medium):
 
     Of coefficients, the six ways to give a water, and ``profile`` one is allowed; an empty text counts as not given. A
     water holds for all layers, or is a list with one value a layer: ``1C, 5C``. Sources and uncertainties are those of
-    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients; the indices do not follow.
+    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients.
+
+    At a ``wavelength_nm`` above 700, a water by name, or the default one, absorbs as pure water does there (14.4 1/m at
+    1064 nm), and its particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay as they are,
+    with a warning where they absorb less than pure water.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -132,7 +154,16 @@ def _read_water(
     read = props.read
     kind, phase_g = read("phase_function"), read("phase_g")
     column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
-    indices = [LAYERED_WATER[name].per_layer(read(name), column.count) for name in ("refractive_index", "group_index")]
+    given = {name: name in props for name in (*_INDICES, *COEFFICIENTS)}
+    by_name = any(_is_given(props, name) for name in WATER_KINDS)
+    if wavelength is None and not (all(map(given.get, _INDICES)) and any(map(given.get, COEFFICIENTS))):
+        wavelength = 532.0
+    indices = [
+        LAYERED_WATER[name].per_layer(
+            read(name, None if is_green(wavelength) else f"{float(of(wavelength)):.6g}"), column.count
+        )
+        for name, of in _INDICES.items()
+    ]
     plume, ratio = _bubbles(props)
     if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
         molecules = np.zeros(1)
@@ -157,6 +188,7 @@ def _read_water(
         plume,
         _is_given(props, "profile"),
         wavelength,
+        by_name,
     )
 
 
@@ -164,19 +196,21 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
 
     That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
-    wavelength [nm], None of coefficients as numbers. `is_of_phase` says that backscattering follows from a phase
+    wavelength [nm], None where none is given. `is_of_phase` says that backscattering follows from a phase
     function: the parameter then counts up to the scattering.
     """
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
     way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
     if way is None:
-        values = {name: read(name) for name in COEFFICIENTS}
+        values = _coefficients(props, wavelength)
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
             values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
-        return WaterColumn.from_text(layer_tops, **values), np.zeros(1), None
+        column = WaterColumn.from_text(layer_tops, **values)
+        _warn_of_absorption(column, wavelength)
+        return column, np.zeros(1), wavelength
     if way == "profile":
         return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
     tops = number_list("layer_tops", layer_tops)
@@ -191,6 +225,31 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
     *coefficients, molecules = np.transpose(rows)
     return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
+
+
+def _coefficients(props: DeclaredProperties, wavelength: float | None) -> dict[str, Any]:
+    """Return the coefficients of a water by numbers, as given; without any, those of the default water."""
+    if any(name in props for name in COEFFICIENTS) or is_green(wavelength):
+        return {name: props.read(name) for name in COEFFICIENTS}
+    assert wavelength is not None
+    c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
+    if wavelength <= VISIBLE_RANGE[1]:
+        raise UserError(
+            f"wavelength_nm = {wavelength:g} needs attenuation, scattering and backscattering, or chlorophyll: the "
+            f"defaults {c:g}, {b:g} and {bb:g} 1/m are those at 532 nm"
+        )
+    water = near_infrared(InherentProperties(c - b, b, bb), wavelength)
+    return {name: props.read(name, repr(getattr(water, name))) for name in COEFFICIENTS}
+
+
+def _warn_of_absorption(column: WaterColumn, wavelength: float | None) -> None:
+    """Warn of a water by numbers that absorbs less than pure water at its wavelength [nm], which is not green."""
+    if is_green(wavelength) or not WAVELENGTH_RANGE[0] <= float(wavelength or 0) <= WAVELENGTH_RANGE[1]:
+        return
+    least, pure = float(column.absorption.min()), float(water_absorption(wavelength))
+    if least < _LEAST_ABSORPTION * pure:
+        text = "attenuation - scattering = %.3g 1/m is less than pure water absorbs at wavelength_nm = %g, %.3g 1/m: "
+        logger.warning(text + "the coefficients are kept as given", least, wavelength, pure)
 
 
 def _bubbles(props: DeclaredProperties) -> tuple[BubblePlume | BubbleLayer | None, float]:

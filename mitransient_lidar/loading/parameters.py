@@ -15,7 +15,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import PLUGINS, declared
-from mitransient_lidar.core.parameters.fields import Parameter, Plugin
+from mitransient_lidar.core.parameters.fields import Parameter, Plugin, is_green
 from mitransient_lidar.core.validation import finite, is_number, shown
 from mitransient_lidar.loading.document import SceneDocument, Setting, drop_line, parameters_of
 
@@ -65,7 +65,10 @@ class ScenePlugin:
         setting = self.settings.get(parameter.name)
         if setting is not None and setting.value != "":
             return setting.value
-        return "" if parameter.name in self._replaced else parameter.text
+        # What the plugin chooses at another wavelength is no value of the scene.
+        given = self.settings.get("wavelength_nm")
+        chosen = parameter.of_green and given and is_number(given.value) and not is_green(float(given.value))
+        return "" if chosen or parameter.name in self._replaced else parameter.text
 
     @cached_property
     def _replaced(self) -> set[str]:
