@@ -18,14 +18,8 @@ from mitransient_lidar.core.validation import number_list
 from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.seawater import (
-    VISIBLE_RANGE,
-    WAVELENGTH_RANGE,
-    group_index,
-    refractive_index,
-    water_absorption,
-)
-from mitransient_lidar.physics.water.water_types import InherentProperties, near_infrared, water_of
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption
+from mitransient_lidar.physics.water.water_types import default_water, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
@@ -37,8 +31,7 @@ from mitransient_lidar.transport.medium.water_phases import LayerPhases, Scatter
 
 logger = logging.getLogger(__name__)
 
-#: Indices of sea water as functions of the wavelength [nm].
-_INDICES = {"refractive_index": refractive_index, "group_index": group_index}
+_INDICES = ("refractive_index", "group_index")
 
 #: Absorption over that of pure water below which coefficients given as numbers are doubted.
 _LEAST_ABSORPTION = 0.8
@@ -154,16 +147,11 @@ def _read_water(
     read = props.read
     kind, phase_g = read("phase_function"), read("phase_g")
     column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
-    given = {name: name in props for name in (*_INDICES, *COEFFICIENTS)}
-    by_name = any(_is_given(props, name) for name in WATER_KINDS)
-    if wavelength is None and not (all(map(given.get, _INDICES)) and any(map(given.get, COEFFICIENTS))):
+    is_given = {name: name in props for name in (*_INDICES, *COEFFICIENTS)}
+    is_numbers = any(map(is_given.get, COEFFICIENTS)) or _is_given(props, "profile")
+    if wavelength is None and not (is_numbers and all(map(is_given.get, _INDICES))):
         wavelength = 532.0
-    indices = [
-        LAYERED_WATER[name].per_layer(
-            read(name, None if is_green(wavelength) else f"{float(of(wavelength)):.6g}"), column.count
-        )
-        for name, of in _INDICES.items()
-    ]
+    indices = [LAYERED_WATER[name].per_layer(_chosen(props, name, wavelength), column.count) for name in _INDICES]
     plume, ratio = _bubbles(props)
     if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
         molecules = np.zeros(1)
@@ -188,7 +176,7 @@ def _read_water(
         plume,
         _is_given(props, "profile"),
         wavelength,
-        by_name,
+        any(_is_given(props, name) for name in WATER_KINDS),
     )
 
 
@@ -203,7 +191,7 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
     way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
     if way is None:
-        values = _coefficients(props, wavelength)
+        values = {name: _chosen(props, name, wavelength) for name in COEFFICIENTS}
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
@@ -227,24 +215,22 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
 
 
-def _coefficients(props: DeclaredProperties, wavelength: float | None) -> dict[str, Any]:
-    """Return the coefficients of a water by numbers, as given; without any, those of the default water."""
-    if any(name in props for name in COEFFICIENTS) or is_green(wavelength):
-        return {name: props.read(name) for name in COEFFICIENTS}
+def _chosen(props: DeclaredProperties, name: str, wavelength: float | None) -> Any:
+    """Return a coefficient or index as given, or the default at a wavelength [nm], None for 532 nm."""
+    if name in props or is_green(wavelength):
+        return props.read(name)
     assert wavelength is not None
-    c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
-    if wavelength <= VISIBLE_RANGE[1]:
+    if (default := default_water(wavelength).get(name)) is None:
+        known = LAYERED_WATER[name].default
         raise UserError(
-            f"wavelength_nm = {wavelength:g} needs attenuation, scattering and backscattering, or chlorophyll: the "
-            f"defaults {c:g}, {b:g} and {bb:g} 1/m are those at 532 nm"
+            f"wavelength_nm = {wavelength:g} needs {name}, or chlorophyll: the default {known:g} 1/m is that at 532 nm"
         )
-    water = near_infrared(InherentProperties(c - b, b, bb), wavelength)
-    return {name: props.read(name, repr(getattr(water, name))) for name in COEFFICIENTS}
+    return props.read(name, f"{default:.6g}")
 
 
 def _warn_of_absorption(column: WaterColumn, wavelength: float | None) -> None:
     """Warn of a water by numbers that absorbs less than pure water at its wavelength [nm], which is not green."""
-    if is_green(wavelength) or not WAVELENGTH_RANGE[0] <= float(wavelength or 0) <= WAVELENGTH_RANGE[1]:
+    if wavelength is None or is_green(wavelength) or not WAVELENGTH_RANGE[0] <= wavelength <= WAVELENGTH_RANGE[1]:
         return
     least, pure = float(column.absorption.min()), float(water_absorption(wavelength))
     if least < _LEAST_ABSORPTION * pure:

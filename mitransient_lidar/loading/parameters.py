@@ -18,6 +18,8 @@ from mitransient_lidar.core.parameters.catalogue import PLUGINS, declared
 from mitransient_lidar.core.parameters.fields import Parameter, Plugin, is_green
 from mitransient_lidar.core.validation import finite, is_number, shown
 from mitransient_lidar.loading.document import SceneDocument, Setting, drop_line, parameters_of
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE
+from mitransient_lidar.physics.water.water_types import default_water
 
 #: Plugins of Mitsuba that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
@@ -66,9 +68,13 @@ class ScenePlugin:
         if setting is not None and setting.value != "":
             return setting.value
         # What the plugin chooses at another wavelength is no value of the scene.
+        if parameter.name in self._replaced:
+            return ""
         given = self.settings.get("wavelength_nm")
-        chosen = parameter.of_green and given and is_number(given.value) and not is_green(float(given.value))
-        return "" if chosen or parameter.name in self._replaced else parameter.text
+        if parameter.of_green and given and is_number(given.value) and not is_green(nm := float(given.value)):
+            chosen = default_water(nm) if WAVELENGTH_RANGE[0] <= nm <= WAVELENGTH_RANGE[1] else {}
+            return f"{chosen[parameter.name]:.6g}" if parameter.name in chosen else ""
+        return parameter.text
 
     @cached_property
     def _replaced(self) -> set[str]:

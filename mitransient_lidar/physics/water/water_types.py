@@ -13,12 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.water import WATER_KINDS
+from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
 from mitransient_lidar.physics.water.data_tables import read_columns
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.physics.water.seawater import VISIBLE_RANGE, WAVELENGTH_RANGE, water_absorption, water_scattering
+from mitransient_lidar.physics.water.seawater import (
+    VISIBLE_RANGE,
+    WAVELENGTH_RANGE,
+    group_index,
+    refractive_index,
+    water_absorption,
+    water_scattering,
+)
 
 _CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, of the Case 1 model
 _SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than that of pure water
@@ -242,6 +249,20 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
         found.backscattering + ratio * back,
         found.water_scattering,
     )
+
+
+def default_water(wavelength_nm: float) -> dict[str, float]:
+    """Return what a medium has by default at a wavelength [nm] that is not green.
+
+    These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm, and above 700 nm ``attenuation``,
+    ``scattering`` and ``backscattering`` [1/m] of the default water of 532 nm (`near_infrared`).
+    """
+    found = {"refractive_index": refractive_index(wavelength_nm), "group_index": group_index(wavelength_nm)}
+    if wavelength_nm > VISIBLE_RANGE[1]:
+        c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
+        water = near_infrared(InherentProperties(c - b, b, bb), wavelength_nm)
+        found |= {name: getattr(water, name) for name in COEFFICIENTS}
+    return {name: float(f"{float(value):.6g}") for name, value in found.items()}
 
 
 def from_kd(kd: float) -> InherentProperties:
