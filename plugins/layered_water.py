@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import number_list
 from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.water_types import water_of
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption
+from mitransient_lidar.physics.water.water_types import default_water, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
@@ -24,6 +28,13 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
+
+logger = logging.getLogger(__name__)
+
+_INDICES = ("refractive_index", "group_index")
+
+#: Absorption over that of pure water below which coefficients given as numbers are doubted.
+_LEAST_ABSORPTION = 0.8
 
 #: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
@@ -37,7 +48,11 @@ class LayeredWater(mi.Medium):
 
     Of coefficients, the six ways to give a water, and ``profile`` one is allowed; an empty text counts as not given. A
     water holds for all layers, or is a list with one value a layer: ``1C, 5C``. Sources and uncertainties are those of
-    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients; the indices do not follow.
+    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients.
+
+    At a ``wavelength_nm`` above 700, a water by name, or the default one, absorbs as pure water does there (14.4 1/m at
+    1064 nm), and its particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay as they are,
+    with a warning where they absorb less than pure water.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -132,7 +147,11 @@ def _read_water(
     read = props.read
     kind, phase_g = read("phase_function"), read("phase_g")
     column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
-    indices = [LAYERED_WATER[name].per_layer(read(name), column.count) for name in ("refractive_index", "group_index")]
+    is_given = {name: name in props for name in (*_INDICES, *COEFFICIENTS)}
+    is_numbers = any(map(is_given.get, COEFFICIENTS)) or _is_given(props, "profile")
+    if wavelength is None and not (is_numbers and all(map(is_given.get, _INDICES))):
+        wavelength = 532.0
+    indices = [LAYERED_WATER[name].per_layer(_chosen(props, name, wavelength), column.count) for name in _INDICES]
     plume, ratio = _bubbles(props)
     if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
         molecules = np.zeros(1)
@@ -157,6 +176,7 @@ def _read_water(
         plume,
         _is_given(props, "profile"),
         wavelength,
+        any(_is_given(props, name) for name in WATER_KINDS),
     )
 
 
@@ -164,19 +184,21 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
 
     That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
-    wavelength [nm], None of coefficients as numbers. `is_of_phase` says that backscattering follows from a phase
+    wavelength [nm], None where none is given. `is_of_phase` says that backscattering follows from a phase
     function: the parameter then counts up to the scattering.
     """
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
     way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
     if way is None:
-        values = {name: read(name) for name in COEFFICIENTS}
+        values = {name: _chosen(props, name, wavelength) for name in COEFFICIENTS}
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
             values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
-        return WaterColumn.from_text(layer_tops, **values), np.zeros(1), None
+        column = WaterColumn.from_text(layer_tops, **values)
+        _warn_of_absorption(column, wavelength)
+        return column, np.zeros(1), wavelength
     if way == "profile":
         return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
     tops = number_list("layer_tops", layer_tops)
@@ -191,6 +213,29 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
     *coefficients, molecules = np.transpose(rows)
     return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
+
+
+def _chosen(props: DeclaredProperties, name: str, wavelength: float | None) -> Any:
+    """Return a coefficient or index as given, or the default at a wavelength [nm], None for 532 nm."""
+    if name in props or is_green(wavelength):
+        return props.read(name)
+    assert wavelength is not None
+    if (default := default_water(wavelength).get(name)) is None:
+        known = LAYERED_WATER[name].default
+        raise UserError(
+            f"wavelength_nm = {wavelength:g} needs {name}, or chlorophyll: the default {known:g} 1/m is that at 532 nm"
+        )
+    return props.read(name, f"{default:.6g}")
+
+
+def _warn_of_absorption(column: WaterColumn, wavelength: float | None) -> None:
+    """Warn of a water by numbers that absorbs less than pure water at its wavelength [nm], which is not green."""
+    if wavelength is None or is_green(wavelength) or not WAVELENGTH_RANGE[0] <= wavelength <= WAVELENGTH_RANGE[1]:
+        return
+    least, pure = float(column.absorption.min()), float(water_absorption(wavelength))
+    if least < _LEAST_ABSORPTION * pure:
+        text = "attenuation - scattering = %.3g 1/m is less than pure water absorbs at wavelength_nm = %g, %.3g 1/m: "
+        logger.warning(text + "the coefficients are kept as given", least, wavelength, pure)
 
 
 def _bubbles(props: DeclaredProperties) -> tuple[BubblePlume | BubbleLayer | None, float]:

@@ -46,7 +46,9 @@ class Sky(EmitterWithoutExtent):
         self.sun = direction_of(zenith, props.read("sun_azimuth_deg"))
         if "irradiance" not in props and self.distribution != "clear":
             raise UserError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
-        self.irradiance = props.read("irradiance", clear_sky_irradiance(zenith).diffuse)
+        wavelength = props.read("wavelength_nm")
+        clear = None if "irradiance" in props else clear_sky_irradiance(zenith, wavelength_nm=wavelength)
+        self.irradiance = props.read("irradiance", clear and clear.diffuse)
         self._scale = self.irradiance / relative_irradiance(self.distribution, self.sun)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value

@@ -41,7 +41,9 @@ class Sun(EmitterWithoutExtent):
         super().__init__(props)
         self.zenith_deg = props.read("zenith_deg")
         self.direction = direction_of(self.zenith_deg, props.read("azimuth_deg"))
-        self.irradiance = props.read("irradiance", clear_sky_irradiance(self.zenith_deg).direct_normal)
+        wavelength = props.read("wavelength_nm")
+        clear = None if "irradiance" in props else clear_sky_irradiance(self.zenith_deg, wavelength_nm=wavelength)
+        self.irradiance = props.read("irradiance", clear and clear.direct_normal)
         radius = props.read("angular_radius_deg")
         # sin^2 of half the radius, as the cosine of so small an angle is 1 to rounding.
         self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)

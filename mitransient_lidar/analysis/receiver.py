@@ -30,6 +30,7 @@ from mitransient_lidar.physics.receiver.receiver_files import (
 from mitransient_lidar.physics.receiver.receiver_files import camera as camera_of
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import label
 
 #: A power, or those of pixels.
@@ -247,6 +248,7 @@ def receiver_of_result(
         receiver = chain_of("chain", chain)
     else:
         receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or waveform_receiver("apd")
+    receiver = receiver.for_light(optional_number(dataset.attrs, "wavelength_nm") or 532.0)
     if gain is None and optical_density is None:
         return receiver
     return receiver.with_settings(gain, optical_density)

@@ -15,9 +15,11 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import PLUGINS, declared
-from mitransient_lidar.core.parameters.fields import Parameter, Plugin
+from mitransient_lidar.core.parameters.fields import Parameter, Plugin, is_green
 from mitransient_lidar.core.validation import finite, is_number, shown
 from mitransient_lidar.loading.document import SceneDocument, Setting, drop_line, parameters_of
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE
+from mitransient_lidar.physics.water.water_types import default_water
 
 #: Plugins of Mitsuba that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
@@ -65,7 +67,14 @@ class ScenePlugin:
         setting = self.settings.get(parameter.name)
         if setting is not None and setting.value != "":
             return setting.value
-        return "" if parameter.name in self._replaced else parameter.text
+        # What the plugin chooses at another wavelength is no value of the scene.
+        if parameter.name in self._replaced:
+            return ""
+        given = self.settings.get("wavelength_nm")
+        if parameter.of_green and given and is_number(given.value) and not is_green(nm := float(given.value)):
+            chosen = default_water(nm) if WAVELENGTH_RANGE[0] <= nm <= WAVELENGTH_RANGE[1] else {}
+            return f"{chosen[parameter.name]:.6g}" if parameter.name in chosen else ""
+        return parameter.text
 
     @cached_property
     def _replaced(self) -> set[str]:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.axis_limits import COLUMN_LEVEL
 from mitransient_lidar.physics.lidar.pulse import waveform
 
 if TYPE_CHECKING:
@@ -212,12 +214,20 @@ class ErrorWindow:
 
     @classmethod
     def of_probe(cls, probe: Probe) -> ErrorWindow:
-        """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
+        """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width.
+
+        Where the record has no bottom, the window ends with the light of the water: when absorption alone has reduced
+        it to `COLUMN_LEVEL` after the surface echo, in the near infrared after nanoseconds, or else with the record.
+        """
         scene, echoes, time_ns = probe.scene, probe.echoes, probe.scene.axis.centres_ns
-        start, end = echoes.surface_ns[:, 0], echoes.bottom_ns[:, 1] + 0.5 * scene.transmitter.pulse.fwhm_ns
-        # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
+        half_pulse = 0.5 * scene.transmitter.pulse.fwhm_ns
+        (start, middle), end = echoes.surface_ns.T, echoes.bottom_ns[:, 1] + half_pulse
+        least = 0.0 if scene.water is None else float(scene.water.column.absorption.min())
+        column_ns = -1e9 / C0 * scene.group_index * np.log(COLUMN_LEVEL) / max(least, 1e-9)
+        of_water = np.fmin(2 * middle - start + half_pulse + column_ns, time_ns[-1])
+        # Without a surface (a plate in the air), the window begins with the record.
         start = np.where(np.isnan(start), time_ns[0], start)
-        return cls(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
+        return cls(start, np.where(end <= scene.axis.end_ns, end, of_water), time_ns)
 
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
         """Return the relative standard errors of a waveform, infinite where it is 0.

@@ -25,6 +25,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_e
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -157,14 +158,17 @@ def depth_bias(
     Raises
     ------
     UserError
-        If the instrument is unknown, a number or parameter is out of range, or the receiver counts photons and has
-        less than one count in the brightest sample of a record.
+        If the instrument is unknown or not green, a number or parameter is out of range, or the receiver counts photons
+        and has less than one count in the brightest sample of a record.
     KeyboardInterrupt
         If a render was interrupted.
     """
     own = read_instrument(instrument)
     former = None if corrections is None else corrections_for(instrument, corrections)
-    usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
+    values = {one.name: one.value for one in own.parameters}
+    if not is_green(laser := float(values["wavelength_nm"])):
+        raise UserError(f"instrument = {instrument!r} has wavelength_nm = {laser:g}: depth errors are of green light")
+    usual = float(values["off_nadir_deg"])
     other = usual + (_FURTHER if usual < _GRAZING else -_FURTHER)
     axes = {
         "off_nadir_deg": np.asarray(sorted((usual, other)) if angles_deg is None else angles_deg, float),

@@ -61,7 +61,10 @@ def describe_water(
         ),
     ] = None,
     wavelength_nm: Annotated[
-        float, Option("Wavelength, with less of Jerlov's and Petzold's waters", 400, 700, "nm", flag="--wavelength")
+        float,
+        Option(
+            "Wavelength; of Jerlov's and Petzold's waters green, or 700 or more", 400, 1100, "nm", flag="--wavelength"
+        ),
     ] = 532.0,
     temperature: Annotated[float, Option("Temperature, for the indices", 0, 30, "degrees Celsius")] = 20.0,
     salinity: Annotated[float, Option("Salinity, for the indices", 0, 40, "per mille")] = 35.0,
@@ -103,6 +106,8 @@ def describe_water(
     }
     parameters = {name: getattr(found, name) for name in ("attenuation", "scattering", "backscattering")}
     parameters |= {"refractive_index": index, "group_index": group}
+    if wavelength_nm != 532:
+        parameters["wavelength_nm"] = wavelength_nm
     if found.water_scattering > 0:
         parameters["water_scattering"] = found.water_scattering
     options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())

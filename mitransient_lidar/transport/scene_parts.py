@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
@@ -303,12 +304,14 @@ def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
 
 
 def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
-    """Refuse a water by name or profile of another wavelength than the laser's."""
+    """Refuse a water of another wavelength than the laser's."""
     laser = transmitter.wavelength_nm
-    if water is not None and water.wavelength_nm is not None and abs(water.wavelength_nm - laser) > _SAME_NM:
+    if water is None or water.wavelength_nm is None or abs(water.wavelength_nm - laser) <= _SAME_NM:
+        return
+    if water.by_name or not (is_green(water.wavelength_nm) and is_green(laser)):
         raise UserError(
             f"wavelength_nm = {water.wavelength_nm:g} of the water must be that of the lidar_transmitter, {laser:g}: "
-            "give both the same, or the water's coefficients as numbers"
+            "give both the same, or the water's coefficients and indices as numbers"
         )
 
 

@@ -60,9 +60,10 @@ SEDIMENT = plugin(
     "sediment",
     text("model", "lambertian", "Law of reflection", ("lambertian", "hapke")),
     text("reflectance", None,
-        "Share of the light that is reflected, at vertical incidence, or ``coral_sand``, ``green_algae``, "
-        "``brown_algae`` or ``red_algae``", unit="1", low=0, high=1, otherwise="``0.1``"),
-    number("wavelength_nm", 532.0, "nm", 400, 700, "Wavelength of a reflectance by name"),
+        "Share of the light that is reflected, at vertical incidence, or, to 700 nm, ``coral_sand``, ``green_algae``, "
+        "``brown_algae`` or ``red_algae``; to 1100 nm ``sand``, ``wet_sand``, ``asphalt``, ``concrete``, ``basalt``, "
+        "``limestone``, ``grass`` or ``rush`` (of salt marshes)", unit="1", low=0, high=1, otherwise="``0.1``"),
+    number("wavelength_nm", 532.0, "nm", 300, 1100, "Wavelength of a reflectance by name, 400 or more"),
     number("single_scattering_albedo", None, "1", 0, 1, "hapke: albedo of the particles, instead of ``reflectance``"),
     number("lobe_asymmetry", 0.0, "1", 0, 0.9,
         "hapke: asymmetry *b* of the lobes of the particles' phase function; 0 of particles that scatter evenly"),
@@ -130,6 +131,9 @@ GRAM_CHARLIER_DIELECTRIC = plugin(
     number("ext_ior", 1.0, "1", 1, 3, "Refractive index outside"),
 )
 
+_WAVELENGTH = number("wavelength_nm", 532.0, "nm", 300, 1100,
+    "Wavelength of the light; the irradiance of a clear sky is known from 510 to 540 nm")
+
 _OF_A_CLEAR_SKY = "that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)"
 
 SUN = plugin(
@@ -139,6 +143,7 @@ SUN = plugin(
         "Its azimuth, from +x (the receiver's viewing direction) towards +y"),
     number("irradiance", None, "W m-2 nm-1", 0, 1e6, "Irradiance at the sea on a plane normal to its rays",
         otherwise=_OF_A_CLEAR_SKY),
+    _WAVELENGTH,
     number("angular_radius_deg", 0.2666, "degree", 1e-3, 5, "Radius of its disc"),
 )
 
@@ -150,6 +155,7 @@ SKY = plugin(
         ("clear", "overcast", "uniform")),
     number("irradiance", None, "W m-2 nm-1", 0, 1e6, "Irradiance at the sea on a level plane",
         otherwise=f"for ``clear`` {_OF_A_CLEAR_SKY}; required for the others"),
+    _WAVELENGTH,
     number("sun_zenith_deg", 40.0, "degree", 0, 89, "``clear``: angle of the sun from the vertical"),
     number("sun_azimuth_deg", 0.0, "degree", -3600, 3600, "``clear``: azimuth of the sun, from +x towards +y"),
 )

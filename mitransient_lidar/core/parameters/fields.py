@@ -22,6 +22,14 @@ from mitransient_lidar.core.validation import (
 #: Text that leaves the choice of a value to the scene.
 AUTO = "auto"
 
+#: Wavelengths [nm] of lasers for which values at 532 nm stand.
+GREEN_LASERS = (510.0, 540.0)
+
+
+def is_green(wavelength_nm: float | None) -> bool:
+    """Return whether values at 532 nm stand for a wavelength [nm]; None is 532 nm."""
+    return wavelength_nm is None or GREEN_LASERS[0] <= wavelength_nm <= GREEN_LASERS[1]
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -50,6 +58,8 @@ class Parameter:
     by_id
         Whether its name alone stands for a parameter of other plugins, so that only one with an id or the name of its
         plugin reaches it.
+    of_green
+        Whether `default` holds for green lasers alone (`is_green`).
     otherwise
         What holds without a value where `default` does not say it.
     """
@@ -68,6 +78,7 @@ class Parameter:
     may_be_empty: bool = False
     is_file: bool = False
     by_id: bool = False
+    of_green: bool = False
     otherwise: str = ""
 
     def checked(self, value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from mitransient_lidar.core.parameters.fields import Parameter, file, nested, number, numbers, plugin, text
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 
@@ -9,13 +11,15 @@ from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 # fmt: off
 
 
-def _of_layers(name: str, default: float | str | None, meaning: str, **more: str) -> Parameter:
+def _of_layers(name: str, default: float | str | None, meaning: str, **more: Any) -> Parameter:
     return numbers(name, default, "1/m", 0, 1000, meaning, **more)
 
 
 def _water(name: str, meaning: str, unit: str = "") -> Parameter:
     return text(name, None, meaning, may_be_empty=True, unit=unit)
 
+
+_NOT_GREEN = "outside 510 to 540 nm that at ``wavelength_nm`` (`physics.water.seawater`), 400 to 1100 nm"
 
 #: Coefficients of layers, and waters by name in their place.
 COEFFICIENTS = ("attenuation", "scattering", "backscattering")
@@ -24,9 +28,9 @@ WATER_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
 LAYERED_WATER = plugin(
     "layered_water",
     numbers("layer_tops", "0", "m", 0, 1e5, "Depth of each layer's upper edge, first 0, increasing: ``0, 3``"),
-    _of_layers("attenuation", 0.3, "Beam attenuation c of each layer, or one value for all"),
-    _of_layers("scattering", 0.15, "Scattering b, at most c"),
-    _of_layers("backscattering", 0.006, "Backscattering bb, at most b"),
+    _of_layers("attenuation", 0.3, "Beam attenuation c of each layer, or one value for all", of_green=True),
+    _of_layers("scattering", 0.15, "Scattering b, at most c", of_green=True),
+    _of_layers("backscattering", 0.006, "Backscattering bb, at most b", of_green=True),
     _water("jerlov",
         "Instead of the three coefficients, the water's type: ``I``, ``IA``, ``IB``, ``II``, ``III``, ``1C``, ``3C``, "
         "``5C``, ``7C`` or ``9C``"),
@@ -36,9 +40,9 @@ LAYERED_WATER = plugin(
     _water("petzold",
         "Or Petzold's ``clear``, ``coastal``, ``turbid``, or a station of the phase function ``petzold``"),
     _water("pure", "Or ``true``: sea water without particles, whose scattering is ``water_scattering``"),
-    number("wavelength_nm", None, "nm", 0, float("inf"),
-        "Wavelength of these waters: 532, or 400 to 700 for ``chlorophyll`` and ``pure``, 514 to 533 for ``petzold``; "
-        "or of the columns of a profile that has several, as ``a488, a532``", above=True,
+    number("wavelength_nm", None, "nm", 300, 1100,
+        "Wavelength of these waters: 532, or 400 to 700 for ``chlorophyll`` and ``pure``, 514 to 533 for ``petzold``, "
+        "700 to 1100 for all but a profile; or of the columns of a profile that has several, as ``a488, a532``",
         otherwise="``532``, or that of the only columns"),
     file("profile",
         "A file instead of the above, with ``depth`` or ``z``, two of ``a``, ``b``, ``c``, ``omega``, and ``bb`` or "
@@ -58,9 +62,10 @@ LAYERED_WATER = plugin(
     nested("(nested)", "phase",
         "Any phase function, used in all layers instead; or one a layer, named ``phase_0``, ``phase_1``, ... from the "
         "top; ``plume_phase`` is that of the bubbles"),
-    numbers("refractive_index", 1.34, "1", 1.0001, 2, "Phase index of each layer or all", may_be_empty=False),
-    numbers("group_index", 1.364, "1", 1, 2,
-        "Group index of each layer or all; the default is that of sea water at 532 nm", may_be_empty=False),
+    numbers("refractive_index", 1.34, "1", 1.0001, 2, "Phase index of each layer or all", may_be_empty=False,
+        of_green=True, otherwise=f"``1.34``; {_NOT_GREEN}"),
+    numbers("group_index", 1.364, "1", 1, 2, "Group index of each layer or all", may_be_empty=False, of_green=True,
+        otherwise=f"``1.364``, that of sea water at 532 nm; {_NOT_GREEN}"),
     number("plume_scattering", 0.0, "1/m", 0, 1000,
         "Scattering of bubbles behind a ship, added to b; 0 for no bubbles"),
     number("plume_x", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Start of the bubbles, at the stern"),

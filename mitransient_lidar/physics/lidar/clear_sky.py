@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
 
 #: Angular radius of the sun [deg].
@@ -47,6 +49,7 @@ def clear_sky_irradiance(
     angstrom_exponent: float = 1.0,
     ozone_cm: float = 0.3,
     pressure_hpa: float = _SEA_LEVEL_PRESSURE,
+    wavelength_nm: float = 532.0,
 ) -> ClearSkyIrradiance:
     """Irradiance of sun and sky at 532 nm on the sea under a clear sky.
 
@@ -62,6 +65,8 @@ def clear_sky_irradiance(
         Ozone column [atm cm], 0 to 1.
     pressure_hpa : float
         Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
+    wavelength_nm : float
+        Wavelength [nm] for which the irradiance is to stand, 510 to 540.
 
     Notes
     -----
@@ -70,6 +75,8 @@ def clear_sky_irradiance(
     measured spectra is 6.6 %. Air mass of Kasten and Young (1989, doi:10.1364/AO.28.004735). Light reflected by the sea
     and scattered back by the sky is left out, as in the original model; the sun is at its mean distance.
     """
+    if not is_green(wavelength_nm):
+        raise UserError(f"wavelength_nm = {wavelength_nm:g} needs irradiance: that of a clear sky is known at 532 nm")
     zenith = in_range("zenith_deg", zenith_deg, 0.0, LARGEST_SUN_ZENITH_DEG)
     depth = in_range("aerosol_optical_depth", aerosol_optical_depth, 0.0, 5.0)
     exponent = in_range("angstrom_exponent", angstrom_exponent, -1.0, 3.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import inspect
+import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
@@ -15,6 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.formats.toml_files import check_keys, parse_toml, required
 from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
@@ -24,6 +26,8 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
+
+_LOG = logging.getLogger(__name__)
 
 Setting = float | Literal["auto"]
 
@@ -142,6 +146,21 @@ class ReceiverChannels:
                 given |= {other: usual} if automatic else {}
         channels = {name: replace(one, **given) for name, one in self.channels.items()}
         return replace(self, default=replace(self.default, **given), channels=channels)
+
+    def for_light(self, wavelength_nm: float) -> ReceiverChannels:
+        """Return the receiver for light of a wavelength [nm]; one for green light counts photons of other light, too.
+
+        A warning says that its quantum efficiency is kept.
+        """
+        if is_green(wavelength_nm) or not is_green(self.default.chain.wavelength_nm):
+            return self
+        _LOG.warning(
+            "the quantum efficiency of receiver %s is that at %g nm, and the light has wavelength_nm = %g: give a "
+            "receiver file with both",
+            *(self.name, self.default.chain.wavelength_nm, wavelength_nm),
+        )
+        changed = [replace(one, chain=replace(one.chain, wavelength_nm=wavelength_nm)) for one in self.all_channels]
+        return replace(self, default=changed[0], channels=dict(zip(self.channels, changed[1:], strict=True)))
 
     def with_channel_settings(self, settings: Mapping[int, tuple[Setting, Setting]]) -> ReceiverChannels:
         """Return the receiver with other gains and filters, by the number of the channel in `all_channels`."""

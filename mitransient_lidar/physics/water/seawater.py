@@ -12,8 +12,11 @@ from mitransient_lidar.core.constants import AVOGADRO, BOLTZMANN
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 from mitransient_lidar.physics.water.data_tables import read_columns
 
-WAVELENGTH_RANGE = (400.0, 700.0)
+WAVELENGTH_RANGE = (400.0, 1100.0)
 """Wavelengths [nm] of all formulas and tables in this module."""
+
+VISIBLE_RANGE = (400.0, 700.0)
+"""Wavelengths [nm] of Quan and Fry's index; beyond it pure water has the index of Daimon and Masumura."""
 
 _TEMPERATURE_RANGE = (0.0, 30.0)  # degrees C
 _SALINITY_RANGE = (0.0, 40.0)  # per mille; the index was fitted up to 35 and is extrapolated linearly
@@ -22,6 +25,14 @@ DEPOLARISATION = 0.039
 """Depolarisation ratio of light scattered by water (Farinato and Rowell 1976, as taken by Zhang, Hu and He 2009)."""
 
 _MOLAR_MASS = 0.018  # of water, kg/mol
+
+#: Strengths and squares of the resonances [um^2] of pure water at 20 degrees C (Daimon and Masumura 2007, Table 2).
+_RESONANCES = (
+    (5.684027565e-1, 5.101829712e-3),
+    (1.726177391e-1, 1.821153936e-2),
+    (2.086189578e-2, 2.620722293e-2),
+    (1.130748688e-1, 1.069792721e1),
+)
 
 
 def refractive_index(
@@ -32,7 +43,7 @@ def refractive_index(
     Parameters
     ----------
     wavelength_nm : array_like
-        Wavelength [nm], 400 to 700.
+        Wavelength [nm], 400 to 1100.
     temperature : array_like
         Temperature [degrees C], 0 to 30.
     salinity : array_like
@@ -45,13 +56,16 @@ def refractive_index(
 
     Notes
     -----
-    Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. The index relative to air determines refraction
-    at the surface; the simulator uses the index 1 for air.
+    Up to 700 nm Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. Beyond, their formula is not
+    valid: at 1064 nm its index of pure water is 0.001 too high, and its group index 0.005 too low. There pure water at
+    20 degrees C has the index of Daimon and Masumura (2007), Appl. Opt. 46, 3811, doi:10.1364/AO.46.003811, which is
+    valid to 1129 nm, over that of air (Ciddor 1996). The change with temperature and salinity, 0.006 for sea water, is
+    that of Quan and Fry's formula, extrapolated. At 700 nm the index of both differs by 4e-5, the group index by 2e-4.
+    The index relative to air determines refraction at the surface; the simulator uses the index 1 for air.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
-    by_salinity = (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2 + 0.01155 / lam) * s
-    by_colour = (15.868 - 0.00423 * t) / lam - 4382 / lam**2 + 1.1455e6 / lam**3
-    return np.asarray(1.31405 - 2.02e-6 * t**2 + by_salinity + by_colour)
+    visible = _quan_fry(lam, t, s)
+    return np.asarray(np.where(lam <= VISIBLE_RANGE[1], visible, visible - _quan_fry(lam, 20, 0) + _pure_index(lam)))
 
 
 def group_index(
@@ -67,12 +81,14 @@ def group_index(
     Returns
     -------
     ndarray
-        n - wavelength dn/dwavelength [1], of the broadcast shape, with the derivative of the same formula. Travel times
-        are too short by 0.03 % in all media alike, since air has the index 1 here.
+        n - wavelength dn/dwavelength [1], of the broadcast shape, with the derivative of the same formulas. Travel
+        times are too short by 0.03 % in all media alike, since air has the index 1 here.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
-    slope = -(15.868 + 0.01155 * s - 0.00423 * t) / lam**2 + 2 * 4382 / lam**3 - 3 * 1.1455e6 / lam**4
-    return np.asarray(refractive_index(lam, t, s) - lam * slope)
+    visible = _quan_fry(lam, t, s) - lam * _quan_fry_slope(lam, t, s)
+    pure_slope = (_pure_index(lam + 0.1) - _pure_index(lam - 0.1)) / 0.2
+    pure = _pure_index(lam) - lam * pure_slope - (_quan_fry(lam, 20, 0) - lam * _quan_fry_slope(lam, 20, 0))
+    return np.asarray(np.where(lam <= VISIBLE_RANGE[1], visible, visible + pure))
 
 
 def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
@@ -81,17 +97,22 @@ def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     wavelength_nm : array_like
-        Wavelength [nm], 400 to 700.
+        Wavelength [nm], 400 to 1100.
 
     Returns
     -------
     ndarray
-        Absorption [1/m], linear between tabulated values 2.5 nm apart. The effects of salt and temperature, which
-        matter in the red, are neglected. A later compilation (WOPP v3 of 2016) gives 2 % more at 532 nm.
+        Absorption [1/m], linear between tabulated values, 2.5 nm apart up to 700 nm and 1 to 3 nm from 705 nm. The
+        effects of salt and temperature, which matter in the red and infrared, are neglected. A later compilation (WOPP
+        v3 of 2016) gives 2 % more at 532 nm.
 
     Notes
     -----
-    Table 3 of Pope and Fry (1997), Appl. Opt. 36, 8710, doi:10.1364/AO.36.008710, measured at 22 degrees C.
+    Up to 700 nm Table 3 of Pope and Fry (1997), Appl. Opt. 36, 8710, doi:10.1364/AO.36.008710, measured at 22 degrees
+    C. From 705 nm Kou, Labrie and Chylek (1993), Appl. Opt. 32, 3531, doi:10.1364/AO.32.003531: 14.4 1/m at 1064 nm,
+    like Kedenburg et al. (2012), doi:10.1364/OME.2.001588; the compilation of Segelstein (1981) has 15.1 1/m. At 700 nm
+    Kou's value is 7 % above that of Pope and Fry. The table of Hale and Querry (1973) has no values between 1000 and
+    1200 nm: a line between these would give 61 1/m at 1064 nm.
     """
     nodes, values = read_columns("water_absorption.csv")
     return np.asarray(np.interp(_within("wavelength_nm", wavelength_nm, WAVELENGTH_RANGE), nodes, values))
@@ -122,7 +143,8 @@ def water_scattering(
     Notes
     -----
     Zhang, Hu and He (2009), Opt. Express 17, 5698, doi:10.1364/OE.17.005698: fluctuations of density and of salt
-    concentration, with the equation of state of UNESCO (1981) and the index of Quan and Fry (1995) relative to vacuum.
+    concentration, with the equation of state of UNESCO (1981) and the `refractive_index` relative to vacuum. Beyond 700
+    nm no measurements confirm it; 1.1e-4 1/m at 1064 nm does not matter beside the absorption.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     delta = in_range("depolarisation", depolarisation, 0, 0.2)
@@ -176,6 +198,24 @@ def _within(name: str, values: npt.ArrayLike, limits: tuple[float, float]) -> Fl
     for bad in array[(array < limits[0]) | (array > limits[1])][:1]:
         in_range(name, bad, *limits)
     return array
+
+
+def _quan_fry(lam: FloatArray, t: FloatArray | float, s: FloatArray | float) -> FloatArray:
+    """Index of Quan and Fry (1995) relative to air."""
+    by_salinity = (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2 + 0.01155 / lam) * s
+    by_colour = (15.868 - 0.00423 * t) / lam - 4382 / lam**2 + 1.1455e6 / lam**3
+    return np.asarray(1.31405 - 2.02e-6 * t**2 + by_salinity + by_colour)
+
+
+def _quan_fry_slope(lam: FloatArray, t: FloatArray | float, s: FloatArray | float) -> FloatArray:
+    """Return the derivative of `_quan_fry` with respect to the wavelength [1/nm]."""
+    return np.asarray(-(15.868 + 0.01155 * s - 0.00423 * t) / lam**2 + 2 * 4382 / lam**3 - 3 * 1.1455e6 / lam**4)
+
+
+def _pure_index(lam: FloatArray) -> FloatArray:
+    """Index of pure water at 20 degrees C by Daimon and Masumura (2007), relative to air."""
+    square = (1e-3 * lam) ** 2
+    return np.asarray(np.sqrt(1 + sum(a * square / (square - b) for a, b in _RESONANCES)) / _air_index(lam))
 
 
 def _air_index(lam: FloatArray) -> FloatArray:

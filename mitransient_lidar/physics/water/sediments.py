@@ -22,11 +22,12 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, is_number, shown
 from mitransient_lidar.physics.water.data_tables import read_columns
 
-#: Bottoms in the order of the columns of the table.
-BOTTOMS = ("coral_sand", "green_algae", "brown_algae", "red_algae")
-
-#: Wavelengths of the table [nm].
-_WAVELENGTH_RANGE = (400.0, 700.0)
+#: Bottoms and land in the order of the columns of their tables.
+_TABLES = {
+    "bottom_reflectance.csv": ("coral_sand", "green_algae", "brown_algae", "red_algae"),
+    "land_reflectance.csv": ("sand", "wet_sand", "asphalt", "concrete", "basalt", "limestone", "grass", "rush"),
+}
+BOTTOMS = tuple(name for names in _TABLES.values() for name in names)
 
 #: Halvings of the range of albedos that leave the rounding error.
 _BISECTIONS = 52
@@ -154,7 +155,7 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
     value
         Number from 0 to 1, or its text, or one of `BOTTOMS`.
     wavelength_nm
-        Wavelength of a bottom by name [nm], 400 to 700.
+        Wavelength of a bottom by name [nm], 400 to 700 of coral sand and algae, 400 to 1100 of the others.
 
     Returns
     -------
@@ -170,13 +171,20 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
     -----
     Reflectance of irradiance by clean coral sand, the green alga Boodlea, brown algae (mean of Turbinaria and
     Sargassum) and red algae (mean of Porolithon and Corallinaceae), from figure 6 of Maritorena, Morel and Gentili
-    (1994), Limnol. Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Single samples: other sands and algae differ by
-    factors.
+    (1994), Limnol. Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Dry and wet sand of one beach, an old road of
+    asphalt, a light grey one of concrete, weathered basalt, limestone, lawn grass and green salt-marsh rush: Kokaly et
+    al. (2017), USGS Spectral Library Version 7, doi:10.3133/ds1035, measured in air. Single samples: other sands and
+    plants differ by factors.
     """
     if not isinstance(value, str) or is_number(value):
         return in_range(name, value, 0.0, 1.0)
     if value not in BOTTOMS:
         raise UserError(f"{name} = {shown(value)} must be a number from 0 to 1, or one of {', '.join(BOTTOMS)}")
-    wavelength = in_range("wavelength_nm", wavelength_nm, *_WAVELENGTH_RANGE)
-    wavelengths, *reflectances = read_columns("bottom_reflectance.csv")
-    return float(np.interp(wavelength, wavelengths, reflectances[BOTTOMS.index(value)]))
+    file, names = next(table for table in _TABLES.items() if value in table[1])
+    wavelengths, *reflectances = read_columns(file)
+    low, high = wavelengths[0], wavelengths[-1]
+    if not low <= wavelength_nm <= high:
+        raise UserError(
+            f"wavelength_nm = {wavelength_nm:g} must lie between {low:g} and {high:g} for {name} = {value!r}"
+        )
+    return float(np.interp(wavelength_nm, wavelengths, reflectances[names.index(value)]))

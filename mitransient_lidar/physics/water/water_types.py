@@ -1,8 +1,8 @@
 """Absorption, scattering and backscattering of water given by type, chlorophyll, Kd or Secchi depth.
 
 These are rough estimates: waters of the same Kd differ in scattering by a factor of 2, which changes the column signal
-of a lidar. Scattering is that of molecules and of particles with a Fournier-Forand function. `pure_seawater` and
-`chlorophyll` are valid from 400 to 700 nm, the others at 532 nm.
+of a lidar. Scattering is that of molecules and of particles with a Fournier-Forand function. `pure_seawater` is valid
+from 400 to 1100 nm, `chlorophyll` from 400 to 700 nm, the others at 532 nm; `near_infrared` takes them beyond 700 nm.
 """
 
 from __future__ import annotations
@@ -13,12 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.water import WATER_KINDS
+from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
 from mitransient_lidar.physics.water.data_tables import read_columns
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption, water_scattering
+from mitransient_lidar.physics.water.seawater import (
+    VISIBLE_RANGE,
+    WAVELENGTH_RANGE,
+    group_index,
+    refractive_index,
+    water_absorption,
+    water_scattering,
+)
 
 _CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, of the Case 1 model
 _SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than that of pure water
@@ -31,6 +38,9 @@ GREEN_RANGE = (531.0, 533.0)
 
 #: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
 _PETZOLD_RANGE = (514.0, GREEN_RANGE[1])
+
+#: Decay of the absorption by dissolved matter with the wavelength [1/nm].
+_DISSOLVED_SLOPE = 0.014
 
 #: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
 _NODES = 32768
@@ -196,7 +206,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
     of 2.
     """
     c = in_range("concentration", concentration, *_CHLOROPHYLL_RANGE)
-    lam = in_range("wavelength_nm", wavelength_nm, *WAVELENGTH_RANGE)
+    lam = in_range("wavelength_nm", wavelength_nm, *VISIBLE_RANGE)
     water = pure_seawater(lam)
     kw, factor, exponent = _case1_terms(lam)
 
@@ -208,6 +218,51 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
 
     scattered = float(b), float(bb), water.scattering
     return InherentProperties(_absorption_for(kw + factor * c**exponent, lambda _: scattered), *scattered)
+
+
+def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentProperties:
+    """Return a water of 532 nm at a wavelength in the near infrared.
+
+    Parameters
+    ----------
+    green : InherentProperties
+        The water at 532 nm.
+    wavelength_nm : float
+        Wavelength [nm], above 700 to 1100.
+
+    Notes
+    -----
+    Absorption is that of `water_absorption`, at least 0.62 1/m, and of what the water at 532 nm absorbs beyond pure
+    water, times exp(-0.014 (wavelength - 532)), as dissolved matter does (Bricaud, Morel and Prieur 1981, Limnol.
+    Oceanogr. 26, 43, doi:10.4319/lo.1981.26.1.0043); at 1064 nm a ten thousandth of it is left. Scattering and
+    backscattering by particles are proportional to 1/wavelength (Gordon and Morel 1983); exponents of real waters lie
+    between 0 and 2. At 1064 nm this scattering is a hundredth of the attenuation.
+    """
+    lam = in_range("wavelength_nm", wavelength_nm, VISIBLE_RANGE[1], WAVELENGTH_RANGE[1])
+    ratio, pure, molecules = 532.0 / lam, pure_seawater(), green.water_scattering
+    found = pure_seawater(lam) if molecules > 0 else InherentProperties(float(water_absorption(lam)), 0.0, 0.0)
+    other = max(green.absorption - pure.absorption, 0.0) * np.exp(-_DISSOLVED_SLOPE * (lam - 532.0))
+    particles, back = max(green.scattering - molecules, 0.0), max(green.backscattering - molecules / 2, 0.0)
+    return InherentProperties(
+        found.absorption + float(other),
+        found.scattering + ratio * particles,
+        found.backscattering + ratio * back,
+        found.water_scattering,
+    )
+
+
+def default_water(wavelength_nm: float) -> dict[str, float]:
+    """Return what a medium has by default at a wavelength [nm] that is not green.
+
+    These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm, and above 700 nm ``attenuation``,
+    ``scattering`` and ``backscattering`` [1/m] of the default water of 532 nm (`near_infrared`).
+    """
+    found = {"refractive_index": refractive_index(wavelength_nm), "group_index": group_index(wavelength_nm)}
+    if wavelength_nm > VISIBLE_RANGE[1]:
+        c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
+        water = near_infrared(InherentProperties(c - b, b, bb), wavelength_nm)
+        found |= {name: getattr(water, name) for name in COEFFICIENTS}
+    return {name: float(f"{float(value):.6g}") for name, value in found.items()}
 
 
 def from_kd(kd: float) -> InherentProperties:
@@ -285,7 +340,8 @@ def water_of(
         Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
         ``coastal`` or ``turbid``; None for pure sea water.
     wavelength_nm, temperature, salinity
-        Wavelength [nm], temperature [deg C] and salinity [per mille].
+        Wavelength [nm], temperature [deg C] and salinity [per mille]. Above 700 nm a water with particles is that at
+        532 nm, taken there by `near_infrared`.
 
     Raises
     ------
@@ -300,6 +356,8 @@ def water_of(
         return pure_seawater(wavelength_nm, temperature, salinity)
     if value is None:
         raise UserError(f"value is missing: {kind} needs one")
+    if wavelength_nm > VISIBLE_RANGE[1]:
+        return near_infrared(water_of(kind, value), wavelength_nm)
     text = value
     if kind == "jerlov":
         return jerlov(text, wavelength_nm)
@@ -312,7 +370,7 @@ def water_of(
     if kind == "chlorophyll":
         return chlorophyll(number, wavelength_nm)
     if wavelength_nm != 532.0:
-        raise UserError(f"wavelength = {wavelength_nm:g} must be 532 nm for {kind}")
+        raise UserError(f"wavelength_nm = {wavelength_nm:g} must be 532, or 700 to 1100, for {kind}")
     return from_kd(number) if kind == "kd" else from_secchi(number)
 
 
@@ -321,7 +379,9 @@ def _petzold(name: str, wavelength_nm: float) -> InherentProperties:
         raise UserError(f"value = {name!r} must be one of {', '.join(PETZOLD_WATERS)} for petzold")
     low, high = _PETZOLD_RANGE
     if not low <= wavelength_nm <= high:
-        raise UserError(f"wavelength = {wavelength_nm:g} must lie between {low:g} and {high:g} nm for petzold")
+        raise UserError(
+            f"wavelength_nm = {wavelength_nm:g} must lie between {low:g} and {high:g}, or above 700, for petzold"
+        )
     a, b = PETZOLD_WATERS[name]
     share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
     return InherentProperties(a, b, b * share)

@@ -38,7 +38,9 @@ class Water:
     from_profile
         Whether the layers approximate a profile from a file.
     wavelength_nm
-        Wavelength of a water by name or of a profile's column [nm]; None where coefficients are given as numbers.
+        Wavelength of the water [nm]; None where its coefficients and indices are given as numbers without one.
+    by_name
+        Whether the water is computed at this wavelength; one of numbers at a green wavelength stands for green lasers.
     flight, scattering_flight, absorption_flight
         Free flights by attenuation, scattering and absorption.
     """
@@ -51,6 +53,7 @@ class Water:
     plume: BubblePlume | BubbleLayer | None = None
     from_profile: bool = False
     wavelength_nm: float | None = None
+    by_name: bool = False
     flight: LayeredFlight = field(init=False)
     scattering_flight: LayeredFlight = field(init=False)
     absorption_flight: LayeredFlight = field(init=False)

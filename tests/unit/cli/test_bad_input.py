@@ -143,6 +143,12 @@ OPTIONS = [
     (("detect", "fig13_2x2"), "--depths", "4,,8", "has an empty entry"),
     (("detect", "fig13_2x2"), "--receiver", "eye", "must be one of ideal"),
     (("depth-bias", "eye"), "--seed", "1", "instrument = 'eye' is not known"),
+    (
+        ("depth-bias", "riegl_vq880g2_infrared"),
+        "--seed",
+        "1",
+        "has wavelength_nm = 1064: depth errors are of green light",
+    ),
     (("depth-bias", "riegl_vq840g"), "--waters", ",", "--waters = ',' has an empty entry"),
     (("tpu", "eye"), "--seed", "1", "instrument = 'eye' is not known"),
     (("tpu", "riegl_vq840g"), "--estimator", "eye", "estimator = 'eye' must be one of threshold"),

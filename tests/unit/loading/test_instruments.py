@@ -13,7 +13,7 @@ from mitransient_lidar.loading import catalogue, instruments, scenes
 
 NAMES = (
     *("icesat2_atlas", "leica_chiroptera4x", "leica_hawkeye4x_deep", "published_airborne", "published_mast"),
-    *("riegl_vq840g", "riegl_vq840gl", "riegl_vq880g2", "teledyne_czmil", "usgs_eaarl_b"),
+    *("riegl_vq840g", "riegl_vq840gl", "riegl_vq880g2", "riegl_vq880g2_infrared", "teledyne_czmil", "usgs_eaarl_b"),
 )
 
 #: Parameters that every instrument has; beam and view may be given in several ways.

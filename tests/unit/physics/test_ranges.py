@@ -144,8 +144,8 @@ RANGES = [
     (PowerLawTable.from_function(np.ones_like).with_chi, {}, {"chi": 0}),
     (PowerLawTable.from_values, {"values": [1.0, 1.0]}, {"log_s0": 1}),
     (refractive_index, {"wavelength_nm": 532}, {"wavelength_nm": 399, "temperature": 31, "salinity": 41}),
-    (group_index, {"wavelength_nm": 532}, {"wavelength_nm": 701, "temperature": -1}),
-    (water_absorption, {}, {"wavelength_nm": 720}),
+    (group_index, {"wavelength_nm": 532}, {"wavelength_nm": 1101, "temperature": -1}),
+    (water_absorption, {}, {"wavelength_nm": 1550}),
     (water_scattering, {"wavelength_nm": 532}, {"salinity": 41, "depolarisation": 0.3}),
     (water_phase_function, {"theta": 0}, {"depolarisation": -0.1}),
     (

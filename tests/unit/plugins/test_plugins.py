@@ -59,7 +59,10 @@ REFUSED = {
         ({"jerlov": "1C", "secchi": 5.0}, "jerlov = '1C' and secchi = 5.0 describe the same: give one"),
         ({"jerlov": "2C"}, "jerlov = '2C': water_type = '2C' must be one of I, IA"),
         ({"kd": "0.1, 0.2"}, "kd has 2 values but must have 1"),
-        ({"kd": 0.1, "wavelength_nm": 500.0}, "kd = 0.1: wavelength = 500 must be 532 nm"),
+        ({"kd": 0.1, "wavelength_nm": 500.0}, "kd = 0.1: wavelength_nm = 500 must be 532, or 700 to 1100"),
+        ({"wavelength_nm": 450.0}, "wavelength_nm = 450 needs attenuation, or chlorophyll: the default 0.3 1/m is"),
+        ({"wavelength_nm": 1550.0}, "wavelength_nm = 1550 must lie between 300 and 1100"),
+        ({"wavelength_nm": 350.0, "attenuation": 1.0}, "wavelength_nm = 350 must lie between 400 and 1100"),
         ({"secchi": "deep"}, "secchi = 'deep': value = 'deep' must be a number"),
         ({"pure": "maybe"}, "pure = 'maybe' must be true or false"),
         ({"profile": "a.csv", "layer_tops": "0"}, "layer_tops = '0' and profile = 'a.csv' describe the same"),
@@ -269,6 +272,25 @@ def test_other_integrators_see_the_layers():
     np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
     np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
     np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
+
+
+def test_the_default_water_follows_the_wavelength_and_numbers_stay(caplog):
+    """Kou et al. 1993 and half of the particles' scattering at 1064 nm; a green laser keeps the values at 532 nm."""
+    plain, green, red = (
+        mi.load_dict({"type": "layered_water", **({"wavelength_nm": nm} if nm else {})}).water for nm in (0, 515, 1064)
+    )
+    assert (green.refractive_index, green.group_index) == (plain.refractive_index, plain.group_index) == (1.34, 1.364)
+    assert green.column.attenuation == plain.column.attenuation == 0.3
+    assert (red.refractive_index, red.group_index) == pytest.approx((1.3303, 1.3464), abs=1e-4)
+    assert red.column.attenuation == pytest.approx(14.369 + 0.075, abs=2e-3)
+    assert (*red.column.scattering, *red.column.backscattering) == pytest.approx((0.075, 0.003))
+    part = mi.load_dict({"type": "layered_water", "wavelength_nm": 1064.0, "attenuation": 15.0}).water
+    assert (*part.column.attenuation, *part.column.scattering) == pytest.approx((15.0, 0.075))
+    assert caplog.messages == []
+    kept = mi.load_dict({"type": "layered_water", "attenuation": 0.3, "wavelength_nm": 1064.0}).water
+    assert (kept.column.attenuation, kept.refractive_index) == (0.3, red.refractive_index)
+    sentence = "attenuation - scattering = 0.225 1/m is less than pure water absorbs at wavelength_nm = 1064, 14.4 1/m"
+    assert [sentence in one for one in caplog.messages] == [True]
 
 
 @pytest.mark.parametrize("scattering", [0.004, "0.004, 0.1", 0.0])

@@ -168,3 +168,16 @@ def test_water_by_name_has_the_wavelength_of_the_laser(lidar_scene, water, laser
     sentence = "wavelength_nm = 532 of the water must be that of the lidar_transmitter, 515"
     with pytest.raises(UserError, match=sentence):
         scene.integrator().prepare(scene, scene.sensors()[0])
+
+
+@pytest.mark.parametrize(("laser", "group", "refused"), [(1064, "", True), (515, "", False), (1064, 1.36, False)])
+def test_numbers_of_green_water_are_for_green_lasers(lidar_scene, laser, group, refused):
+    """Coefficients and both indices as numbers are those at any wavelength."""
+    of_water = {"attenuation": 14.5} | ({"group_index": group} if group else {})
+    scene = lidar_scene(tx={"wavelength_nm": laser}, water=of_water | ({} if group else {"refractive_index": 1.34}))
+    if refused:
+        scene = lidar_scene(tx={"wavelength_nm": laser})
+        with pytest.raises(UserError, match="wavelength_nm = 532 of the water must be that of the lidar_transmitter"):
+            scene.integrator().prepare(scene, scene.sensors()[0])
+    else:
+        scene.integrator().prepare(scene, scene.sensors()[0])

@@ -105,6 +105,18 @@ def test_settings_replace_those_of_all_channels():
     assert (other.default.gain, other.default.optical_density) == (1.0, "auto")
 
 
+def test_infrared_light_has_photons_of_its_own(caplog):
+    """Twice as many in a joule at 1064 nm as at 532 nm; one that is made for the infrared is as it is."""
+    green = parse(WHOLE)
+    assert green.for_light(532.0) is green
+    assert green.for_light(1064.0).of("deep").chain.wavelength_nm == 1064
+    assert [f"the quantum efficiency of receiver {green.name} is that at 515 nm" in one for one in caplog.messages] == [
+        True
+    ]
+    infrared = receiver("riegl_vq880g2_infrared")
+    assert infrared.for_light(1064.0) is infrared
+
+
 def test_every_instrument_has_a_receiver_with_sources():
     """Each number has a source or is marked as assumed, as in the file of the optics."""
     for name in instrument_names():

@@ -80,8 +80,15 @@ def test_more_light_than_arrives_is_refused():
 
 
 def test_bottoms_by_name_have_the_values_of_the_table():
-    """At 530 nm, and between it and 540 nm (Maritorena et al. 1994, fig. 6)."""
-    assert [bottom_reflectance("reflectance", name, 530.0) for name in BOTTOMS] == [0.429, 0.246, 0.044, 0.075]
+    """At 530 nm, and between it and 540 nm (Maritorena et al. 1994, fig. 6); land at 532 and 1064 nm (splib07a)."""
+    assert [bottom_reflectance("reflectance", name, 530.0) for name in BOTTOMS[:4]] == [0.429, 0.246, 0.044, 0.075]
+    land = {
+        **{"sand": (0.2048, 0.32), "wet_sand": (0.1094, 0.1536), "asphalt": (0.0816, 0.1435)},
+        **{"concrete": (0.2743, 0.31), "basalt": (0.1228, 0.1575), "limestone": (0.1844, 0.2731)},
+        **{"grass": (0.0905, 0.6994), "rush": (0.1015, 0.7129)},
+    }
+    found = {name: [bottom_reflectance("reflectance", name, nm) for nm in (532.0, 1064.0)] for name in BOTTOMS[4:]}
+    assert found == {name: pytest.approx(values, abs=1.5e-3) for name, values in land.items()}
     assert bottom_reflectance("reflectance", "coral_sand") == pytest.approx(0.8 * 0.429 + 0.2 * 0.442)
 
 

@@ -27,7 +27,7 @@ def test_group_index_at_532():
     np.testing.assert_allclose(group_index(532, [20, 10], [35, 7]), [1.363796, 1.358813], rtol=0, atol=1e-6)
 
 
-@each_row("wavelength", [410, 532, 690])
+@each_row("wavelength", [410, 532, 690, 710, 1064])
 @each_row(("temperature", "salinity"), [(0, 0), (5, 38), (30, 7)])
 def test_group_index_is_the_derivative_of_the_index(wavelength, temperature, salinity):
     step = 0.01
@@ -42,6 +42,27 @@ def test_absorption_is_pope_and_fry():
     )
     np.testing.assert_array_equal(water_absorption([400, 600, 700]), [0.00663, 0.2224, 0.624])
     assert water_absorption(532) == pytest.approx(0.04444, abs=1e-8)
+
+
+@each_row(("wavelength", "extinction", "tolerance"), [(1064, 1.21925e-6, 0.005), (1000, 3.19106e-6, 0.02)])
+def test_near_infrared_agrees_with_kedenburg(wavelength, extinction, tolerance):
+    """Absorption 4 pi k / wavelength, and index of water at 20 degrees C, by Kedenburg et al. 2012 (other cells)."""
+    assert water_absorption(wavelength) == pytest.approx(4e9 * np.pi * extinction / wavelength, rel=tolerance)
+
+    def index(lam):
+        square = (1e-3 * lam) ** 2
+        return np.sqrt(1 + 0.75831 * square / (square - 0.01007) + 0.08495 * square / (square - 8.91377)) / 1.000274
+
+    assert refractive_index(wavelength, 20, 0) == pytest.approx(index(wavelength), abs=1e-3)
+    group = index(wavelength) - wavelength * (index(wavelength + 1) - index(wavelength - 1)) / 2
+    assert group_index(wavelength, 20, 0) == pytest.approx(group, abs=2e-3)
+    # The formula for the visible is 0.0049 lower at 1064 nm.
+    assert refractive_index(wavelength) - refractive_index(wavelength, 20, 0) == pytest.approx(0.0061, abs=1e-4)
+
+
+def test_nothing_jumps_at_700_nm():
+    for of, most in ((refractive_index, 5e-5), (group_index, 3e-4), (water_absorption, 1e-3), (water_scattering, 1e-6)):
+        assert of(700.001) == pytest.approx(of(700), abs=most)
 
 
 def test_scattering_is_zhang_hu_and_he():

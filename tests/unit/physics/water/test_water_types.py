@@ -6,6 +6,7 @@ import significance
 from oracles.diffuse_attenuation import diffuse_attenuation
 from rows import each_row
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.seawater import water_absorption
 from mitransient_lidar.physics.water.water_types import (
     InherentProperties,
@@ -13,6 +14,7 @@ from mitransient_lidar.physics.water.water_types import (
     from_kd,
     from_secchi,
     jerlov,
+    near_infrared,
     pure_seawater,
     water_of,
 )
@@ -53,6 +55,26 @@ def test_pure_seawater_at_532():
     assert water.absorption == pytest.approx(0.04444, abs=1e-6)
     assert water.scattering == pytest.approx(0.001962, abs=1e-6)
     assert water.backscatter_ratio == 0.5
+
+
+@each_row(
+    ("kind", "value"), [("jerlov", "9C"), ("chlorophyll", "1"), ("kd", "0.1"), ("secchi", "3"), ("petzold", "turbid")]
+)
+def test_waters_with_particles_in_the_near_infrared(kind, value):
+    """Pure water absorbs; half of the particles' scattering at 532 nm is left, and 6e-4 of the dissolved matter's."""
+    green, found = water_of(kind, value), water_of(kind, value, 1064.0)
+    other = green.absorption - water_absorption(532)
+    assert found.absorption - water_absorption(1064) == pytest.approx(np.exp(-0.014 * 532) * other, rel=1e-6)
+    assert found.scattering - found.water_scattering == pytest.approx(0.5 * (green.scattering - green.water_scattering))
+    if kind != "petzold":
+        assert found.particle_backscatter_ratio == pytest.approx(green.particle_backscatter_ratio)
+        assert found.water_scattering == water_of("pure", None, 1064.0).scattering
+
+
+def test_particles_of_no_molecules_stay_without():
+    assert near_infrared(InherentProperties(0.15, 0.15, 0.006), 1064.0).water_scattering == 0
+    with pytest.raises(UserError, match="wavelength_nm = 690 must lie between 700 and 1100"):
+        near_infrared(jerlov("II"), 690.0)
 
 
 @each_row(("water_type", "kd"), JERLOV_KD.items())
