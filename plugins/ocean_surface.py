@@ -13,7 +13,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
-from mitransient_lidar.physics.sea.sea_surface import SeaSurface
+from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
+from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
@@ -84,6 +85,13 @@ class OceanSurface(mi.Mesh):
     longest waves are the same as in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31)
     of the last one's period.
 
+    Over a shallow bottom (``shoaling``) waves are divided into bands of half an octave, each with the amplitude of the
+    TMA spectrum at the local depth. The significant height is at most half of the depth, by the loss of the longest
+    waves, and all waves end at the water line; ripples stay. The depth is that of the largest solids under each vertex:
+    their rendered faces, without instances, targets and piers, continued beyond their edges. At 10 m/s over 0.3 m the
+    waves have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not
+    run up the shore. The heights of a wake stay within a quarter of the depth; a mean slope stays as given.
+
     A mean slope turns the sea about the centre of the patch, or about the place of each shot of a series. It is as wide
     as the patch; beyond it the sea is level. It adds to the slopes of the waves, and not to ``slope_variance``.
 
@@ -145,23 +153,26 @@ class OceanSurface(mi.Mesh):
         if self.footprints is None:
             self._edited |= _BUFFERS & set(keys)
 
-    def fit(self, footprints: Sequence[Footprint]) -> bool:
+    def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
 
-        Edits of the ripples stay. Raises UserError if the mesh has been edited, and must change.
+        Waves follow the depths of a bottom in the frame of the scene as `followed_depths` says. Edits of the ripples
+        stay. Raises UserError if the mesh has been edited, and must change.
         """
         read = OCEAN_SURFACE.reader(self._values.get)
         resolution = Resolution.read(read, footprints)
-        if self._edited and resolution != self._resolution:
+        followed = followed_depths(read, depths and depths.seen_from(self._frame_origin))
+        is_new = resolution != self._resolution or followed is not None
+        if self._edited and is_new:
             raise UserError(
                 f"ocean_surface {self.id()!r}: {sorted(self._edited)[0]} was changed before the mesh was fitted to the "
                 "lidar, as the first render does: render once, then change it and update"
             )
-        former, self._resolution, self.footprints = self._resolution, resolution, footprints
-        if resolution == former:
+        self._resolution, self.footprints = resolution, footprints
+        if not is_new:
             return False
         unfitted = self._roughness()
-        self.sea = SeaSurface.read(read, footprints)
+        self.sea = SeaSurface.read(read, footprints, depths=followed)
         fill_mesh(self, self.sea.mesh(self._frame_origin))
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.sea.ripple_variance, self.sea.slope_series)
@@ -175,12 +186,16 @@ class OceanSurface(mi.Mesh):
         return True
 
     @property
-    def used_values(self) -> dict[str, float]:
-        """Values used for parameters that may be automatic [m]; without cells for a sea without waves."""
+    def used_values(self) -> dict[str, Any]:
+        """Values used for parameters that may be automatic [m]; without cells for a sea without waves.
+
+        With ``shoaling`` for waves that follow the bottom.
+        """
         sea = self.sea
         values = {"centre_x": sea.centre[0], "centre_y": sea.centre[1], "size": sea.size}
         fine = {"cell_size": sea.cell_size, "refined_size": sea.refined_size}
-        return values | (fine if np.isfinite(sea.cell_size) else {})
+        shoaling = {"shoaling": "bottom"} if isinstance(sea.waves, ShoalingHeights) else {}
+        return values | (fine if np.isfinite(sea.cell_size) else {}) | shoaling
 
     @property
     def time_s(self) -> float:

@@ -50,6 +50,11 @@ OCEAN_SURFACE = plugin(
     number("water_depth", 1e4, "m", 0, 1e5,
         "Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et al. 1985)", above=True,
         otherwise="deep"),
+    text("shoaling", "auto",
+        "``bottom``: waves have the heights of the TMA spectrum of the local depth of the scene's bottom, at most half "
+        "of it, 0 at the water line, and ``water_depth`` is for dispersion; ``none``: waves do not know the bottom; "
+        "``auto``: ``bottom`` if the significant height would exceed half of the least depth, without ``water_depth``",
+        ("auto", "bottom", "none")),
     number("current_speed", 0.0, "m s-1", 0, 10, "Current that carries the waves"),
     _angle("current_direction_deg", "Direction the current flows towards"),
     number("wake_speed", 0.0, "m s-1", 0, 40, "Speed of a ship whose Kelvin wake is added, 0 for none"),

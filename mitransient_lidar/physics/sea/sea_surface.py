@@ -20,6 +20,14 @@ from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
+from mitransient_lidar.physics.sea.shoaling import (
+    BottomDepths,
+    DepthResponse,
+    ShoalingHeights,
+    band_wavenumbers,
+    is_limited,
+    limited_wake,
+)
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import (
     CosineSpectrum,
@@ -70,7 +78,7 @@ class SeaSurface:
     spectrum: str  #: Name of the source of the waves.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
-    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    waves: PeriodicHeights | ShoalingHeights | HeightMap | None  #: Elevations, None for a flat sea.
     cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
     centre: tuple[float, float]  #: Position of the patch [m].
     refined_size: float  #: Side of the patch [m].
@@ -84,11 +92,17 @@ class SeaSurface:
     #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
-    waves_at: Callable[[float], PeriodicHeights] | None = None
+    waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
 
     @classmethod
-    def read(cls, read: Read, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
+    def read(
+        cls,
+        read: Read,
+        footprints: Sequence[Footprint] = (),
+        is_placeholder: bool = False,
+        depths: BottomDepths | None = None,
+    ) -> SeaSurface:
         """Build a sea from parameters of the plugin ``ocean_surface``.
 
         Parameters
@@ -99,6 +113,8 @@ class SeaSurface:
             Those of the lasers and receivers above the sea, for its automatic values.
         is_placeholder
             Whether to check the parameters only, and return a sea without waves.
+        depths
+            Depths that waves shall follow (see `followed_depths`), None for deep water.
 
         Raises
         ------
@@ -111,6 +127,7 @@ class SeaSurface:
             math.radians(read(name)) for name in ("wind_direction_deg", "current_direction_deg")
         )
         state = _read_waves(read, spectrum, wind_speed, wind_direction)
+        _check_shoaling(read("shoaling"), spectrum)
         slope_variance, seed, time, current = map(read, ("slope_variance", "surface_seed", "time", "current_speed"))
         wake = _read_wake(read)
         slope = tuple(math.tan(math.radians(read(name))) for name in ("slope_x_deg", "slope_y_deg"))
@@ -120,10 +137,12 @@ class SeaSurface:
         series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
-        waves: PeriodicHeights | HeightMap | None = None
-        waves_at: Callable[[float], PeriodicHeights] | None = None
+        waves: PeriodicHeights | ShoalingHeights | HeightMap | None = None
+        waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
+        if wake is not None and depths is not None:
+            wake = limited_wake(wake, depths)
         if is_placeholder:
             cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
@@ -134,10 +153,15 @@ class SeaSurface:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
+                bands = None if depths is None else band_wavenumbers(state, resolution.shortest_wave)
                 given = state, period, cell, seed
-                axis_and_shortest = wind_direction, resolution.shortest_wave
-                waves, cell, resolved = realise_heights(*given, motion, *axis_and_shortest)
-                waves_at = partial(_waves_at, given, motion, axis_and_shortest)
+                rest = wind_direction, resolution.shortest_wave, bands
+                waves, cell, resolved = realise_heights(*given, motion, *rest)
+                waves_at = partial(_waves_at, given, motion, rest, None)
+                if depths is not None and bands is not None:
+                    response = DepthResponse.of_state(state, bands)
+                    waves_at = partial(_waves_at, given, motion, rest, (response, depths))
+                    waves = ShoalingHeights(waves, response, depths)
             elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
@@ -280,7 +304,8 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
                 deep = JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction)
             else:
                 deep = PiersonMoskowitzSpectrum(wind_speed, wind_direction)
-            depth = read("water_depth")
+            # Waves that follow the bottom have the water's depth for dispersion alone.
+            depth = DEEP if read("shoaling") == "bottom" else read("water_depth")
             components.append(deep if depth >= DEEP else ShallowSpectrum(deep, depth))
     if swell_height > 0:
         if spectrum in ("flat", "height_map"):
@@ -290,10 +315,42 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
 
 
 def _waves_at(
-    given: tuple[SeaState, float, float, int], motion: Motion, rest: tuple[float, float], time: float
-) -> PeriodicHeights:
-    """Return the waves of `realise_heights`, whose parameters are given, at a time [s]."""
-    return realise_heights(*given, replace(motion, time=time), *rest)[0]
+    given: tuple[SeaState, float, float, int],
+    motion: Motion,
+    rest: tuple[float, float, FloatArray | None],
+    bottom: tuple[DepthResponse, BottomDepths] | None,
+    time: float,
+) -> PeriodicHeights | ShoalingHeights:
+    """Return the waves of `realise_heights`, whose parameters are given, at a time [s], maybe over a bottom."""
+    waves = realise_heights(*given, replace(motion, time=time), *rest)[0]
+    return waves if bottom is None else ShoalingHeights(waves, *bottom)
+
+
+def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | None:
+    """Return the depths of a bottom that the waves of an ``ocean_surface`` follow, None if they need not.
+
+    That is for the parameter ``shoaling``, and for ``auto`` for whether the significant height of deep water would be
+    more than half of the least depth.
+    """
+    shoaling, spectrum = read("shoaling"), read("spectrum")
+    if depths is None or shoaling == "none" or spectrum in ("flat", "height_map"):
+        return None
+    if shoaling == "bottom":
+        return depths
+    if read("water_depth") < DEEP:
+        return None
+    wind = read("wind_speed")
+    state = _read_waves(read, spectrum, wind if wind >= _CALM else 0.0, 0.0)
+    if state is None or not is_limited(state, depths):
+        return None
+    logger.info("the waves follow the depth of the bottom, by %.3g m at least: shoaling", depths.least)
+    return depths
+
+
+def _check_shoaling(shoaling: str, spectrum: str) -> None:
+    """Refuse waves that shall follow the bottom without a spectrum of waves."""
+    if shoaling == "bottom" and spectrum in ("flat", "height_map"):
+        raise UserError(f"shoaling = 'bottom' needs a spectrum of waves, not {spectrum!r}")
 
 
 def _read_series(distribution: str, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
