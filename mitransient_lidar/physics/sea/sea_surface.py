@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
+from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_on_crests
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
@@ -68,6 +69,9 @@ _SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 #: Grid lines along x and y of a level sea, over its size.
 _LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
 
+#: Places on each side of a period by which the highest crests are found.
+_CREST_SAMPLES = 512
+
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
 
@@ -94,6 +98,8 @@ class SeaSurface:
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
     waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
+    foam: float = 0.0  #: Share of the sea with foam [1].
+    surf_foam: float = 0.0  #: That of surf, where the depth limits the waves [1].
 
     @classmethod
     def read(
@@ -201,6 +207,8 @@ class SeaSurface:
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
             (slope[0], slope[1]),
+            foam_cover(read("foam"), wind_speed),
+            _read_surf_foam(read),
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -218,13 +226,15 @@ class SeaSurface:
         if not math.isfinite(self.cell_size):
             # No edge is near the centre: rays pass between triangles of a kilometre in a gap of micrometres.
             x, y = (np.array(ends) * self.size + at for ends, at in zip(_LEVEL_LINES, self.centre, strict=True))
-            return triangulate(np.zeros((len(y), len(x))), x - at_x, y - at_y, self.wind_direction)
+            mesh = triangulate(np.zeros((len(y), len(x))), x - at_x, y - at_y, self.wind_direction)
+            return self._with_foam(mesh, x, y)
         cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
         indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
         # Integer cells: the sea does not depend on the position of the patch.
         first = [round(centre / self.cell_size) for centre in self.centre]
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
-        return triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
+        mesh = triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
+        return self._with_foam(mesh, x, y)
 
     def patches(
         self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
@@ -262,13 +272,49 @@ class SeaSurface:
             # On the cells of the sea, as in `mesh`.
             x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
             lines = (x - place[0] + position[0], y - place[1] + position[1])
-            meshes.append(triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction))
+            mesh = triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction)
+            meshes.append(sea._with_foam(mesh, x, y))
         return joined(meshes), positions
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""
         heights = np.zeros((len(y), len(x))) if self.waves is None else self.waves.sample(x, y)
         return heights if self.wake is None else heights + self.wake(x, y)
+
+    @property
+    def has_foam(self) -> bool:
+        """Whether faces may have foam."""
+        return self.foam > 0 or self.surf_foam > 0
+
+    @property
+    def _crested(self) -> PeriodicHeights | HeightMap | None:
+        """Waves whose crests have foam: those of deep water, with the same crests."""
+        return self.waves.waves if isinstance(self.waves, ShoalingHeights) else self.waves
+
+    @cached_property
+    def _all_crests(self) -> FloatArray:
+        """Crests of places on a period or a height map [m], shape (n,)."""
+        waves = self._crested
+        if waves is None:
+            return np.zeros(1)
+        if isinstance(waves, HeightMap):
+            lines = waves.x, waves.y
+        else:
+            ticks = np.unique(np.rint(np.linspace(0, waves.cells, _CREST_SAMPLES, endpoint=False))) * waves.cell_size
+            lines = ticks, ticks
+        return crest_heights(waves.sample, *lines).ravel()
+
+    def _with_foam(self, mesh: SeaMesh, x: FloatArray, y: FloatArray) -> SeaMesh:
+        """Return a mesh on grid lines of the sea [m] with the foam of its faces, the mean of their corners."""
+        if not self.has_foam:
+            return mesh
+        shape, waves = (len(y), len(x)), self._crested
+        crests = np.zeros(shape) if waves is None else crest_heights(waves.sample, x, y)
+        cover = np.full(shape, self.foam)
+        if isinstance(self.waves, ShoalingHeights):
+            cover += (max(self.surf_foam, self.foam) - self.foam) * self.waves.broken(x, y)
+        share = foam_on_crests(crests, self._all_crests, cover)
+        return replace(mesh, foam=share.ravel()[mesh.faces].mean(axis=1))
 
     def heights_about(self, place: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return `heights` under a lidar that is aimed at a place (x, y) [m], inclined by the mean slope.
@@ -416,6 +462,14 @@ def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, f
     along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
     across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
     return along, across
+
+
+def _read_surf_foam(read: Read) -> float:
+    """Return the share of surf with foam; none without foam."""
+    surf: float = read("surf_foam")
+    if surf > 0 and read("foam") == "none":
+        raise UserError(f"surf_foam = {surf:g} needs foam: give its cover of the open sea, 0 or more")
+    return surf
 
 
 def _read_wake(read: Read) -> Wake | None:

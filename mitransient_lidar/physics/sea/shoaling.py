@@ -86,6 +86,8 @@ class DepthResponse:
     #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
     amplitude: FloatArray
     top: int  #: Number of the band of the shortest wind waves.
+    #: Share by which the largest height lessens the effective depth [1], 0 in deep water to 1 at the shore, shape (n,)
+    broken: FloatArray
 
     @classmethod
     def of_state(cls, state: SeaState, wavenumbers: FloatArray) -> DepthResponse:
@@ -113,7 +115,8 @@ class DepthResponse:
         used = _smooth_minimum(effective, np.maximum(capped, 1e-3 * _LEAST_DEPTH))
         amplitude = np.array([np.interp(used, effective, row, left=0.0) for row in rows])
         amplitude[amplitude > 1 - _NO_CHANGE] = 1.0
-        return cls(np.append(0.0, effective), np.insert(amplitude, 0, 0.0, axis=1), len(wavenumbers) - 1)
+        broken = np.insert(1 - used / effective, 0, 1.0)
+        return cls(np.append(0.0, effective), np.insert(amplitude, 0, 0.0, axis=1), len(wavenumbers) - 1, broken)
 
 
 def _factor(wind: CosineSpectrum, k: FloatArray, depth: float) -> FloatArray:
@@ -148,6 +151,12 @@ class ShoalingHeights:
     def cell_size(self) -> float:
         """Spacing of the grid of the longest waves [m]."""
         return self.waves.cell_size
+
+    def broken(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the share of breaking on grid lines x and y [m], shape (len(y), len(x)), 0 over land."""
+        depth = self.depths.sample(x, y)
+        share = np.interp(depth, self.response.depth, self.response.broken)
+        return np.where(depth > 0, share, 0.0)
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`.
