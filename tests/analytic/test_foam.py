@@ -43,6 +43,7 @@ def test_whole_cover_is_a_lambertian_plate(lidar_scene, passes, integrator):
     assert_equal(energy, closed_form((0.01, 0.01), 0.4, 1.0).bottom, error=0.003)
 
 
+@pytest.mark.slow
 @each_row("wind, foam", [(5.0, LAWS[0]), (10.0, LAWS[1]), (15.0, LAWS[2]), (15.0, "0.3")])
 def test_mean_surface_echo_is_the_sum_of_its_shares(lidar_scene, passes, wind, foam):
     """A level sea has the cover everywhere; its water is black."""
@@ -75,6 +76,9 @@ def test_foam_lies_on_crests():
         heights.append(z[mesh.foam == 1].mean() - z.mean())
     assert_equal(np.array(shares)[:, None], np.array([0.05]), error=0.1)
     assert np.mean(heights) > 0.1
+    # No cover is no foam: the same faces with the same BSDF.
+    assert not read(**patch, foam="0").has_foam
+    assert read(**patch, foam="0").mesh().foam is None
     sea = read(**patch, foam="0.05")
     both, _ = sea.patches(np.array([[0.0, 0.0], [40.0, 9.0]]), 16.0, [sea, sea])
     alone, _ = sea.patches(np.array([[40.0, 9.0]]), 16.0, [sea])
