@@ -309,11 +309,17 @@ class EmitterWithoutExtent(mi.Emitter):
         return ds
 
 
+#: Mesh attribute of the share of foam.
+FOAM = "face_foam"
+
+
 def fill_mesh(shape: mi.Mesh, mesh: SeaMesh) -> None:
-    """Set the buffers of a new Mitsuba mesh."""
+    """Set the buffers of a new Mitsuba mesh, which has an attribute `FOAM` if there is foam."""
     buffers = mi.traverse(shape)
     buffers["vertex_positions"] = aligned(mi.Float, mesh.vertices)
     buffers["vertex_texcoords"] = aligned(mi.Float, mesh.texcoords)
     buffers["faces"] = aligned(mi.UInt32, mesh.faces)
+    if mesh.foam is not None:
+        buffers[FOAM] = aligned(mi.Float, mesh.foam)
     buffers.update()
     shape.initialize()

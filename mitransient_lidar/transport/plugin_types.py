@@ -14,6 +14,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.physics.sea.shoaling import BottomDepths
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
@@ -113,8 +114,11 @@ class SeaShape(Protocol):
     def time_s(self) -> float:
         """Time of the waves [s]."""
 
-    def fit(self, footprints: Sequence[Footprint]) -> bool:
-        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
+    def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
+
+        Waves may follow depths of a bottom.
+        """
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""

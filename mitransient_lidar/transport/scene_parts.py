@@ -16,6 +16,7 @@ from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.transport.bottom_depths import bottom_depths
 from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
@@ -128,8 +129,11 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
     """Set the automatic values of each ``ocean_surface`` that has none from the lasers and receivers of the scene.
 
     A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
-    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
+    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves. Those of
+    shallow seas follow the bottom, of the model as well.
     """
+    if not (waiting := [sea for sea in seas_of(scene) if sea.footprints is None]):
+        return
     footprints = []
     for emitter in (model or scene).emitters():
         if not isinstance(emitter, Transmitter):
@@ -144,7 +148,8 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
             pixels = sensor.receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
             footprints.append(Footprint.receiver(*place, pixels.field_of_view, side))
-    if any([sea.fit(footprints) for sea in seas_of(scene) if sea.footprints is None]):
+    depths = bottom_depths(model or scene)
+    if any([sea.fit(footprints, depths) for sea in waiting]):
         scene.parameters_changed([])
 
 

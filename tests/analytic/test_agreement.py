@@ -78,6 +78,8 @@ DRY = {
 }
 PARTICLES = {"type": "sediment", "model": "hapke", "reflectance": 0.2, "lobe_asymmetry": 0.4, "backward_share": 0.8}
 PATCHES = {"type": "seabed", "slope_x_deg": 6.0, "slope_y_deg": -3.0, "size": 100.0, "patches": "2 0 1 0.4; 3 1 1 0"}
+#: From 0.1 to 0.6 m deep in the field of view, where deep waves of 10 m/s would be 2.6 m high.
+SHALLOW = {"type": "seabed", "depth": 0.35, "slope_x_deg": 5.0, "reflectance": 0.2, "size": 40.0}
 BALL = {"type": "sphere", "center": [0.1, 0.05, -4.0], "radius": 0.2, "bsdf": {"type": "diffuse"}}
 #: Bins of a record [ns]: start, width, number.
 FROM_200_M = 1400.0, 2.0, 70
@@ -114,6 +116,10 @@ CASES = {
     ),
     "plates in the air": ({"sea": ROUGH, "extra": DRY}, FROM_200_M, 5, 0.01, None),
     "patches on a slope": ({"sea": ROUGH, "bottom": None, "extra": {"bottom": PATCHES}}, FROM_200_M, 5, 0.02, None),
+    "waves over a shallow slope": (
+        {"sea": {**WAVES, "wind_speed": 10.0}, "bottom": None, "extra": {"bottom": SHALLOW}},
+        *((1400.0, 1.0, 80), 5, 0.01, None),
+    ),
     "50 m aside over waves": ({"rx": look_from(-40.0, 50.0, 190.0), "sea": WAVES}, (1370.0, 2.0, 70), *(5, 0.01, None)),
     "150 m aside": (
         {
@@ -275,7 +281,7 @@ NOISY = "beam of 2 rad over waves"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water, strata
 #: (the quick case) and turbid water (the layers). Closed forms cover solids, plates in the air, masts, poses under
 #: water, beam and view of millimetres over ripples, and the opposition effect.
-SLOW = {"layers and bubbles under waves", "materials and bitmaps"}
+SLOW = {"layers and bubbles under waves", "materials and bitmaps", "waves over a shallow slope"}
 
 
 def tier_of(name):

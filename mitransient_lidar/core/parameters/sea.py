@@ -43,6 +43,15 @@ OCEAN_SURFACE = plugin(
     text("slope_distribution", "gaussian",
         "``gram_charlier``: skewed and peaked slopes, as measured by Cox and Munk from 1 to 14 m/s, with "
         "``slope_variance`` ``cox_munk``", ("gaussian", "gram_charlier")),
+    text("foam", "none",
+        "Share of the sea that foam covers: ``none``, a number, or by wind speed ``monahan_omuircheartaigh_1980``, "
+        "``callaghan_2008`` or ``stramska_petelski_2003``", unit="1"),
+    number("foam_reflectance", 0.22, "1", 0, 1,
+        "Lambertian reflectance of foam: 0.22 is the mean of whitecaps of all ages in visible light (Koepke 1984), 0.4 "
+        "of fresh ones"),
+    number("surf_foam", 0.0, "1", 0, 1,
+        "With ``foam``, the share that foam covers where the depth limits the height of the waves (``shoaling``); "
+        "something like 0.3 to 1 in surf, for which no law is published"),
     switch("ripple_focusing", True,
         "Whether echoes from the water are enhanced by the mean focusing of ripples that light crosses twice"),
     count("surface_seed", 1, 0, 2**53, "Seed of the waves: the same sea at any resolution and position of the patch"),
@@ -50,6 +59,11 @@ OCEAN_SURFACE = plugin(
     number("water_depth", 1e4, "m", 0, 1e5,
         "Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et al. 1985)", above=True,
         otherwise="deep"),
+    text("shoaling", "auto",
+        "``bottom``: waves have the heights of the TMA spectrum of the local depth of the scene's bottom, at most half "
+        "of it, 0 at the water line, and ``water_depth`` is for dispersion; ``none``: waves do not know the bottom; "
+        "``auto``: ``bottom`` if the significant height would exceed half of the least depth, without ``water_depth``",
+        ("auto", "bottom", "none")),
     number("current_speed", 0.0, "m s-1", 0, 10, "Current that carries the waves"),
     _angle("current_direction_deg", "Direction the current flows towards"),
     number("wake_speed", 0.0, "m s-1", 0, 40, "Speed of a ship whose Kelvin wake is added, 0 for none"),

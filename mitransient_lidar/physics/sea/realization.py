@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, positive
 from mitransient_lidar.physics.sea.wave_spectrum import (
     GRAVITY,
     SLOWEST_WAVENUMBER,
+    CosineSpectrum,
     SeaState,
     WaveSpectrum,
     variances_along,
@@ -73,6 +74,7 @@ def wave_coefficients(
     cells: int,
     seed: int,
     motion: Motion = _STILL,
+    only: int | None = None,
 ) -> npt.NDArray[np.complex128]:
     """Realise a periodic square patch of sea surface as a Gaussian random field; see `heights_of`.
 
@@ -89,6 +91,8 @@ def wave_coefficients(
         equals the finer one without its short waves.
     motion : Motion
         Time, depth and current; equal seeds are the same sea at different times.
+    only : int, optional
+        Number of the one wave system to realise, by default all.
 
     Returns
     -------
@@ -108,6 +112,8 @@ def wave_coefficients(
         advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), motion.depth) * time
     coefficients = np.zeros((iy.size, ix.size), dtype=np.complex128)
     for number, waves in enumerate(spectrum.systems):
+        if only not in (None, number):
+            continue
         square, phase = _noise(seed, number, ix, iy)
         modulus = np.sqrt(np.multiply(square, waves.mode_variances(ix, iy, dk), out=square), out=square)
         if time != 0:
@@ -264,6 +270,9 @@ class PeriodicHeights:
     parts: tuple[Band | HeightGrid, ...]  #: Waves by decreasing period, of which the last may be on a grid.
     cells: int  #: Number of cells per period of the grid that holds the longest waves.
     cell_size: float  #: Spacing of that grid [m].
+    #: Numbers of bands of neighbouring wavenumbers, and waves of each band but that of the shortest wind waves, whose
+    #: sum are the waves of all parts.
+    bands: tuple[tuple[int, Band], ...] = ()
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`."""
@@ -278,6 +287,7 @@ def realise_heights(
     motion: Motion,
     axis: float,
     shortest_wave: float = 0.0,
+    wavenumbers: FloatArray | None = None,
 ) -> tuple[PeriodicHeights, float, tuple[float, float]]:
     """Realise a sea for facets of a given size.
 
@@ -295,6 +305,10 @@ def realise_heights(
         Direction of the slope variances [rad], counter-clockwise from +x.
     shortest_wave
         Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
+    wavenumbers
+        Those of the bands [rad/m], increasing, into which the waves are also divided; by default into none. The share
+        of a band in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is
+        the last band, of its own.
 
     Returns
     -------
@@ -321,6 +335,7 @@ def realise_heights(
     cell = periods[-1] / cells
 
     parts: list[Band | HeightGrid] = []
+    bands: list[tuple[int, Band]] = []
     resolved = np.zeros(2)
     for number, (part, inner) in enumerate(zip(periods, limits, strict=True)):
         is_last = number == len(periods) - 1
@@ -345,9 +360,38 @@ def realise_heights(
         else:
             rows = np.roll(np.arange(count), count // 2)[count // 2 - outer : count // 2 + outer + 1]
             parts.append(Band(coefficients[rows, : outer + 1], part))
+        if wavenumbers is None:
+            continue
+        for system, waves in enumerate(spectrum.systems):
+            if len(spectrum.systems) > 1:
+                coefficients = wave_coefficients(spectrum, part, count, seed + number * 2**54, motion, system)
+                coefficients[is_missing] = 0
+            is_wind = isinstance(waves, CosineSpectrum)
+            bands += _bands_of(coefficients, part, wavenumbers if is_wind else None, len(wavenumbers) if system else 0)
     longest = cells if isinstance(parts[0], HeightGrid) else _LONG_WAVE_CELLS
     spacing = cell if isinstance(parts[0], HeightGrid) else period / _LONG_WAVE_CELLS
-    return PeriodicHeights(tuple(parts), longest, spacing), cell, (float(resolved[0]), float(resolved[1]))
+    return PeriodicHeights(tuple(parts), longest, spacing, tuple(bands)), cell, (float(resolved[0]), float(resolved[1]))
+
+
+def _bands_of(
+    coefficients: npt.NDArray[np.complex128], period: float, wavenumbers: FloatArray | None, whole: int
+) -> list[tuple[int, Band]]:
+    """Return the bands of waves of `wave_coefficients`: by wavenumber but the last one, or all as the band `whole`."""
+    ix, iy, dk = wave_numbers(period, len(coefficients))
+    most = len(ix) - 2
+    if wavenumbers is None:
+        rows = np.arange(-most, most + 1)
+        return [(whole, Band(coefficients[rows, : most + 1], period))]
+    k = dk * np.hypot(iy[:, None], ix)
+    place = np.interp(np.log(np.maximum(k, wavenumbers[0])), np.log(wavenumbers), np.arange(len(wavenumbers)))
+    found = []
+    for number, end in enumerate(wavenumbers[1:]):
+        reach = min(most, int(end / dk))
+        rows = np.arange(-reach, reach + 1)
+        waves = np.maximum(1 - np.abs(place[rows, : reach + 1] - number), 0) * coefficients[rows, : reach + 1]
+        if np.any(waves):
+            found.append((number, Band(waves, period)))
+    return found
 
 
 def even_cells(cell: float, period: float) -> int:

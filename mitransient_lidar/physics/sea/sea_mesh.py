@@ -24,6 +24,7 @@ class SeaMesh:
     vertices: FloatArray  #: Positions [m], shape (vertices, 3).
     faces: npt.NDArray[np.uint32]  #: Indices of the corners, counter-clockwise seen from the air, shape (faces, 3).
     texcoords: FloatArray  #: Coordinates along and across the wind [m], axes of the ripples, shape (vertices, 2).
+    foam: FloatArray | None = None  #: Share of foam of each face [1], shape (faces,); None of a sea without foam.
 
 
 def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int = 1) -> IntArray:
@@ -69,6 +70,7 @@ def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)]),
         np.concatenate([mesh.texcoords for mesh in meshes]),
+        None if meshes[0].foam is None else np.concatenate([mesh.foam for mesh in meshes if mesh.foam is not None]),
     )
 
 

@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,20 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
+from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_on_crests
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
+from mitransient_lidar.physics.sea.shoaling import (
+    BottomDepths,
+    DepthResponse,
+    ShoalingHeights,
+    band_wavenumbers,
+    is_limited,
+    limited_wake,
+)
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import (
     CosineSpectrum,
@@ -60,6 +69,9 @@ _SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 #: Grid lines along x and y of a level sea, over its size.
 _LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
 
+#: Places on each side of a period by which the highest crests are found.
+_CREST_SAMPLES = 512
+
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
 
@@ -70,7 +82,7 @@ class SeaSurface:
     spectrum: str  #: Name of the source of the waves.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
-    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    waves: PeriodicHeights | ShoalingHeights | HeightMap | None  #: Elevations, None for a flat sea.
     cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
     centre: tuple[float, float]  #: Position of the patch [m].
     refined_size: float  #: Side of the patch [m].
@@ -84,11 +96,19 @@ class SeaSurface:
     #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
-    waves_at: Callable[[float], PeriodicHeights] | None = None
+    waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
+    foam: float = 0.0  #: Share of the sea with foam [1].
+    surf_foam: float = 0.0  #: That of surf, where the depth limits the waves [1].
 
     @classmethod
-    def read(cls, read: Read, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
+    def read(
+        cls,
+        read: Read,
+        footprints: Sequence[Footprint] = (),
+        is_placeholder: bool = False,
+        depths: BottomDepths | None = None,
+    ) -> SeaSurface:
         """Build a sea from parameters of the plugin ``ocean_surface``.
 
         Parameters
@@ -99,6 +119,8 @@ class SeaSurface:
             Those of the lasers and receivers above the sea, for its automatic values.
         is_placeholder
             Whether to check the parameters only, and return a sea without waves.
+        depths
+            Depths that waves shall follow (see `followed_depths`), None for deep water.
 
         Raises
         ------
@@ -111,6 +133,7 @@ class SeaSurface:
             math.radians(read(name)) for name in ("wind_direction_deg", "current_direction_deg")
         )
         state = _read_waves(read, spectrum, wind_speed, wind_direction)
+        _check_shoaling(read("shoaling"), spectrum)
         slope_variance, seed, time, current = map(read, ("slope_variance", "surface_seed", "time", "current_speed"))
         wake = _read_wake(read)
         slope = tuple(math.tan(math.radians(read(name))) for name in ("slope_x_deg", "slope_y_deg"))
@@ -120,10 +143,12 @@ class SeaSurface:
         series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
-        waves: PeriodicHeights | HeightMap | None = None
-        waves_at: Callable[[float], PeriodicHeights] | None = None
+        waves: PeriodicHeights | ShoalingHeights | HeightMap | None = None
+        waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
+        if wake is not None and depths is not None:
+            wake = limited_wake(wake, depths)
         if is_placeholder:
             cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
@@ -134,10 +159,15 @@ class SeaSurface:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
+                bands = None if depths is None else band_wavenumbers(state, resolution.shortest_wave)
                 given = state, period, cell, seed
-                axis_and_shortest = wind_direction, resolution.shortest_wave
-                waves, cell, resolved = realise_heights(*given, motion, *axis_and_shortest)
-                waves_at = partial(_waves_at, given, motion, axis_and_shortest)
+                rest = wind_direction, resolution.shortest_wave, bands
+                waves, cell, resolved = realise_heights(*given, motion, *rest)
+                waves_at = partial(_waves_at, given, motion, rest, None)
+                if depths is not None and bands is not None:
+                    response = DepthResponse.of_state(state, bands)
+                    waves_at = partial(_waves_at, given, motion, rest, (response, depths))
+                    waves = ShoalingHeights(waves, response, depths)
             elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
@@ -177,6 +207,8 @@ class SeaSurface:
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
             (slope[0], slope[1]),
+            foam_cover(read("foam"), wind_speed),
+            _read_surf_foam(read),
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -194,13 +226,15 @@ class SeaSurface:
         if not math.isfinite(self.cell_size):
             # No edge is near the centre: rays pass between triangles of a kilometre in a gap of micrometres.
             x, y = (np.array(ends) * self.size + at for ends, at in zip(_LEVEL_LINES, self.centre, strict=True))
-            return triangulate(np.zeros((len(y), len(x))), x - at_x, y - at_y, self.wind_direction)
+            mesh = triangulate(np.zeros((len(y), len(x))), x - at_x, y - at_y, self.wind_direction)
+            return self._with_foam(mesh, x, y)
         cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
         indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
         # Integer cells: the sea does not depend on the position of the patch.
         first = [round(centre / self.cell_size) for centre in self.centre]
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
-        return triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
+        mesh = triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
+        return self._with_foam(mesh, x, y)
 
     def patches(
         self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
@@ -238,13 +272,49 @@ class SeaSurface:
             # On the cells of the sea, as in `mesh`.
             x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
             lines = (x - place[0] + position[0], y - place[1] + position[1])
-            meshes.append(triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction))
+            mesh = triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction)
+            meshes.append(sea._with_foam(mesh, x, y))
         return joined(meshes), positions
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""
         heights = np.zeros((len(y), len(x))) if self.waves is None else self.waves.sample(x, y)
         return heights if self.wake is None else heights + self.wake(x, y)
+
+    @property
+    def has_foam(self) -> bool:
+        """Whether faces may have foam."""
+        return self.foam > 0 or self.surf_foam > 0
+
+    @property
+    def _crested(self) -> PeriodicHeights | HeightMap | None:
+        """Waves whose crests have foam: those of deep water, with the same crests."""
+        return self.waves.waves if isinstance(self.waves, ShoalingHeights) else self.waves
+
+    @cached_property
+    def _all_crests(self) -> FloatArray:
+        """Crests of places on a period or a height map [m], shape (n,)."""
+        waves = self._crested
+        if waves is None:
+            return np.zeros(1)
+        if isinstance(waves, HeightMap):
+            lines = waves.x, waves.y
+        else:
+            ticks = np.unique(np.rint(np.linspace(0, waves.cells, _CREST_SAMPLES, endpoint=False))) * waves.cell_size
+            lines = ticks, ticks
+        return crest_heights(waves.sample, *lines).ravel()
+
+    def _with_foam(self, mesh: SeaMesh, x: FloatArray, y: FloatArray) -> SeaMesh:
+        """Return a mesh on grid lines of the sea [m] with the foam of its faces, the mean of their corners."""
+        if not self.has_foam:
+            return mesh
+        shape, waves = (len(y), len(x)), self._crested
+        crests = np.zeros(shape) if waves is None else crest_heights(waves.sample, x, y)
+        cover = np.full(shape, self.foam)
+        if isinstance(self.waves, ShoalingHeights):
+            cover += (max(self.surf_foam, self.foam) - self.foam) * self.waves.broken(x, y)
+        share = foam_on_crests(crests, self._all_crests, cover)
+        return replace(mesh, foam=share.ravel()[mesh.faces].mean(axis=1))
 
     def heights_about(self, place: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return `heights` under a lidar that is aimed at a place (x, y) [m], inclined by the mean slope.
@@ -280,7 +350,8 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
                 deep = JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction)
             else:
                 deep = PiersonMoskowitzSpectrum(wind_speed, wind_direction)
-            depth = read("water_depth")
+            # Waves that follow the bottom have the water's depth for dispersion alone.
+            depth = DEEP if read("shoaling") == "bottom" else read("water_depth")
             components.append(deep if depth >= DEEP else ShallowSpectrum(deep, depth))
     if swell_height > 0:
         if spectrum in ("flat", "height_map"):
@@ -290,10 +361,42 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
 
 
 def _waves_at(
-    given: tuple[SeaState, float, float, int], motion: Motion, rest: tuple[float, float], time: float
-) -> PeriodicHeights:
-    """Return the waves of `realise_heights`, whose parameters are given, at a time [s]."""
-    return realise_heights(*given, replace(motion, time=time), *rest)[0]
+    given: tuple[SeaState, float, float, int],
+    motion: Motion,
+    rest: tuple[float, float, FloatArray | None],
+    bottom: tuple[DepthResponse, BottomDepths] | None,
+    time: float,
+) -> PeriodicHeights | ShoalingHeights:
+    """Return the waves of `realise_heights`, whose parameters are given, at a time [s], maybe over a bottom."""
+    waves = realise_heights(*given, replace(motion, time=time), *rest)[0]
+    return waves if bottom is None else ShoalingHeights(waves, *bottom)
+
+
+def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | None:
+    """Return the depths of a bottom that the waves of an ``ocean_surface`` follow, None if they need not.
+
+    That is for the parameter ``shoaling``, and for ``auto`` for whether the significant height of deep water would be
+    more than half of the least depth.
+    """
+    shoaling, spectrum = read("shoaling"), read("spectrum")
+    if depths is None or shoaling == "none" or spectrum in ("flat", "height_map"):
+        return None
+    if shoaling == "bottom":
+        return depths
+    if read("water_depth") < DEEP:
+        return None
+    wind = read("wind_speed")
+    state = _read_waves(read, spectrum, wind if wind >= _CALM else 0.0, 0.0)
+    if state is None or not is_limited(state, depths):
+        return None
+    logger.info("the waves follow the depth of the bottom, by %.3g m at least: shoaling", depths.least)
+    return depths
+
+
+def _check_shoaling(shoaling: str, spectrum: str) -> None:
+    """Refuse waves that shall follow the bottom without a spectrum of waves."""
+    if shoaling == "bottom" and spectrum in ("flat", "height_map"):
+        raise UserError(f"shoaling = 'bottom' needs a spectrum of waves, not {spectrum!r}")
 
 
 def _read_series(distribution: str, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
@@ -359,6 +462,14 @@ def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, f
     along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
     across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
     return along, across
+
+
+def _read_surf_foam(read: Read) -> float:
+    """Return the share of surf with foam; none without foam."""
+    surf: float = read("surf_foam")
+    if surf > 0 and read("foam") == "none":
+        raise UserError(f"surf_foam = {surf:g} needs foam: give its cover of the open sea, 0 or more")
+    return surf
 
 
 def _read_wake(read: Read) -> Wake | None:

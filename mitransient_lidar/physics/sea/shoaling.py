@@ -1,0 +1,193 @@
+"""Waves over a bottom whose depth changes from place to place: amplitudes of bands of waves by the local depth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.realization import PeriodicHeights
+from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
+from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum
+
+#: Largest significant height of waves (four standard deviations) over the local depth.
+HEIGHT_PER_DEPTH = 0.5
+
+#: Ratio of the wavenumbers of neighbouring bands, the first over that of the peak, and the last [rad/m].
+_BAND, _FIRST_BAND, _LAST_BAND = math.sqrt(2), 0.25, 2 * math.pi
+
+#: Deficit of an amplitude that counts as none: a micrometre of a wave of one metre.
+_NO_CHANGE = 1e-6
+
+#: Depths of the table of amplitudes: the least one [m], their ratio, and the deepest one times the first wavenumber.
+_LEAST_DEPTH, _DEPTH_RATIO, _DEEPEST = 1e-4, 1.05, 10.0
+
+#: Sharpness of smooth minima: 1 % from the smaller of two values that differ by 1.35, 9 % from equal ones.
+_SHARPNESS = 8.0
+
+#: Wavenumbers of the integral of the elevation variance, and the least of the largest one [rad/m].
+_NODES, _SHORTEST = 600, 100.0
+
+
+@dataclass(frozen=True)
+class BottomDepths:
+    """Depth of the bottom below the mean sea level at places on a sea."""
+
+    least: float  #: Least depth anywhere [m], negative for land.
+    #: Depths [m], shape (len(y), len(x)), negative over land, on grid lines x and y [m].
+    sample: Callable[[FloatArray, FloatArray], FloatArray]
+
+    def seen_from(self, origin: FloatArray) -> BottomDepths:
+        """Return the depths in coordinates in which the origin of these lies at a place (x, y) [m]."""
+        return BottomDepths(self.least, lambda x, y: self.sample(x - origin[0], y - origin[1]))
+
+
+def is_limited(state: SeaState, depths: BottomDepths) -> bool:
+    """Return whether waves as over deep water would be higher than `HEIGHT_PER_DEPTH` allows somewhere."""
+    return 4 * math.sqrt(state.elevation_variance()) > HEIGHT_PER_DEPTH * depths.least
+
+
+def band_wavenumbers(state: SeaState, shortest_wave: float) -> FloatArray:
+    """Return the wavenumbers [rad/m] of the bands of wind waves, half an octave apart, up to a shortest wave [m].
+
+    Waves of a metre and less are one band. A sea of swell alone has one band.
+    """
+    first = state.components[0]
+    if not isinstance(first, CosineSpectrum) or not math.isfinite(first.peak_wavenumber):
+        return np.ones(1)
+    low = _FIRST_BAND * first.peak_wavenumber
+    high = max(min(2 * math.pi / shortest_wave, _LAST_BAND), first.peak_wavenumber)
+    return np.geomspace(low, high, 1 + math.ceil(math.log(high / low) / math.log(_BAND)))
+
+
+@dataclass(frozen=True, eq=False)
+class DepthResponse:
+    """Amplitudes of bands of waves at each depth, relative to those over deep water.
+
+    Notes
+    -----
+    Wind waves of the wavenumber k have the TMA spectrum of the depth d_e (`wind_spectra.ShallowSpectrum`): the
+    amplitude factor (S(k; d_e)/S(k))^(1/2). At constant frequency this is Kitaigorodskii's factor
+    tanh(kd)^2/(1 + 2kd/sinh(2kd)) of the variance. Its form in wavenumbers fits waves that are realised by wavenumber:
+    it keeps the saturated tail, so that depth takes long waves away and leaves the slopes of short ones. Swell keeps
+    its significant height until that is half of d_e.
+
+    The effective depth d_e is the depth d or, if less, the one at which the significant height of all waves is d/2:
+    where waves break, the longest ones are missing, as in a sea of less depth. Both limits are smooth minima
+    (a^-8 + b^-8)^(-1/8). All amplitudes are 0 at d = 0 and over land.
+    """
+
+    depth: FloatArray  #: Increasing depths [m], the first 0, shape (n,).
+    #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
+    amplitude: FloatArray
+    top: int  #: Number of the band of the shortest wind waves.
+    #: Share by which the largest height lessens the effective depth [1], 0 in deep water to 1 at the shore, shape (n,)
+    broken: FloatArray
+
+    @classmethod
+    def of_state(cls, state: SeaState, wavenumbers: FloatArray) -> DepthResponse:
+        """Return the response of waves over deep water, whose wind waves have bands of `band_wavenumbers`."""
+        wind = state.components[0] if isinstance(state.components[0], CosineSpectrum) else None
+        swell = sum(each.elevation_variance() for each in state.components if isinstance(each, SwellSpectrum))
+        deepest = max(_DEEPEST / wavenumbers[0], 100 * math.sqrt(state.elevation_variance()))
+        count = math.ceil(math.log(deepest / _LEAST_DEPTH) / math.log(_DEPTH_RATIO))
+        effective = np.geomspace(_LEAST_DEPTH, deepest, count)
+        variance = np.zeros(count)
+        rows = []
+        if wind is not None:
+            k = np.geomspace(wavenumbers[0] / 2, max(_SHORTEST, 20 * wavenumbers[-1]), _NODES)
+            density = wind.omnidirectional(k) * k * math.log(k[1] / k[0])
+            rows = list(np.transpose([_factor(wind, wavenumbers, depth) for depth in effective]))
+            # As the bands have them, the shorter waves as well.
+            factors = (np.interp(np.log(k), np.log(wavenumbers), row) for row in np.transpose(rows))
+            variance = np.array([float(density @ factor**2) for factor in factors])
+        if swell > 0:
+            share = _smooth_minimum(1.0, HEIGHT_PER_DEPTH * effective / (4 * math.sqrt(swell)))
+            variance, rows = variance + swell * share**2, [*rows, share]
+        # The depth at which waves of an effective depth reach their largest height.
+        reached = np.maximum.accumulate(4 * np.sqrt(variance) / HEIGHT_PER_DEPTH)
+        capped = np.interp(effective, reached, effective, right=np.inf)
+        used = _smooth_minimum(effective, np.maximum(capped, 1e-3 * _LEAST_DEPTH))
+        amplitude = np.array([np.interp(used, effective, row, left=0.0) for row in rows])
+        amplitude[amplitude > 1 - _NO_CHANGE] = 1.0
+        broken = np.insert(1 - used / effective, 0, 1.0)
+        return cls(np.append(0.0, effective), np.insert(amplitude, 0, 0.0, axis=1), len(wavenumbers) - 1, broken)
+
+
+def _factor(wind: CosineSpectrum, k: FloatArray, depth: float) -> FloatArray:
+    """Return the amplitude factor of wind waves of wavenumbers k [rad/m] over a depth [m]."""
+    own = wind.spectrum if isinstance(wind, MatchedSpectrum) else wind
+    deep = own.omnidirectional(k)
+    shallow = ShallowSpectrum(own, depth).omnidirectional(k)
+    return np.sqrt(np.divide(shallow, deep, out=np.zeros_like(deep), where=deep > 0))
+
+
+def _smooth_minimum(one: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
+    """Return the smooth minimum of positive numbers, which may be infinite."""
+    a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    return np.asarray(low * (1 + (low / high) ** _SHARPNESS) ** (-1 / _SHARPNESS))
+
+
+@dataclass(frozen=True, eq=False)
+class ShoalingHeights:
+    """Elevations of waves that know the local depth."""
+
+    waves: PeriodicHeights  #: The waves as over deep water, with their bands.
+    response: DepthResponse
+    depths: BottomDepths
+
+    @property
+    def cells(self) -> int:
+        """Number of cells per period, see `PeriodicHeights`."""
+        return self.waves.cells
+
+    @property
+    def cell_size(self) -> float:
+        """Spacing of the grid of the longest waves [m]."""
+        return self.waves.cell_size
+
+    def broken(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the share of breaking on grid lines x and y [m], shape (len(y), len(x)), 0 over land."""
+        depth = self.depths.sample(x, y)
+        share = np.interp(depth, self.response.depth, self.response.broken)
+        return np.where(depth > 0, share, 0.0)
+
+    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`.
+
+        With amplitudes a of the bands this is a_top times all waves, and (a - a_top) times each band: bands over which
+        the depth has no effect cost no time, and leave the heights as they are.
+        """
+        table, top = self.response.amplitude, self.response.top
+        place = np.interp(self.depths.sample(x, y), self.response.depth, np.arange(table.shape[1]))
+        index = np.minimum(place.astype(np.intp), table.shape[1] - 2)
+        place -= index
+        used = slice(int(index.min()), int(index.max()) + 2)
+
+        def at(row: FloatArray) -> FloatArray:
+            return np.asarray(row[index] + (row[index + 1] - row[index]) * place)
+
+        heights = self.waves.sample(x, y) * at(table[top])
+        for number, band in self.waves.bands:
+            excess = table[number] - table[top]
+            if np.any(excess[used]):
+                heights += band.sample(x, y) * at(excess)
+        return np.asarray(heights)
+
+
+def limited_wake(
+    wake: Callable[[FloatArray, FloatArray], FloatArray], depths: BottomDepths
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Return a wake whose heights stay within a quarter of the local depth, smoothly, and are 0 over land."""
+
+    def limited(x: FloatArray, y: FloatArray) -> FloatArray:
+        bound = np.maximum(0.5 * HEIGHT_PER_DEPTH * depths.sample(x, y), 1e-12)
+        return np.asarray(bound * np.tanh(wake(x, y) / bound))
+
+    return limited
