@@ -61,7 +61,9 @@ def check_scene(probe: Probe) -> None:
     _check_solids(probe)
     _warn_of_axes(scene, view, beam)
     solids = scene.solids
-    out = [said for solid in solids if (said := _out_of_place(solid, view, beam))]
+    # Of several parts of the bottom, such as a shore, some may be elsewhere.
+    single = scene.targets if len(scene.bottoms) > 1 else solids
+    out = [said for solid in single if (said := _out_of_place(solid, view, beam))]
     for said in out[:_MOST_NAMED]:
         logger.warning(said)
     if len(out) > _MOST_NAMED:
