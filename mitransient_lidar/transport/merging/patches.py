@@ -14,6 +14,7 @@ from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index, shape_number
+from mitransient_lidar.transport.paths.refracted_connection import RefractedLaserSampler
 from mitransient_lidar.transport.probe import PROBE_RAYS
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
@@ -194,6 +195,10 @@ class SolidPatches:
             not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
             for solid in solids
         ]
+        # Land and other solids that rise through the sea here shade what is beside them.
+        lowest, _ = self.scene.sea_heights or (np.inf, np.inf)
+        self._has_shades = any(float(solid.bbox().max.z) > lowest for solid in self.uneven)
+        cut[numbers] |= self._has_shades
         self._any_near, self._any_cut = bool(near.any()), bool((near | cut).any())
         self._near, self._cut = (aligned(mi.UInt32, one.astype(np.uint32)) for one in (near, near | cut))
 
@@ -297,15 +302,25 @@ class SolidPatches:
     def _is_hidden(self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, height: mi.Float) -> mi.Bool:
         """Return whether another solid lies before points, in projection, within the height of a level [m].
 
-        Light that such a solid stops is not spread over what it hides.
+        Light that such a solid stops is not spread over what it hides, nor over shades of what rises through the sea.
         """
+        shaded = (axis == 2) & self._is_shaded(si) if self._has_shades else mi.Bool(False)
         if not self._any_near:
-            return mi.Bool(False)
+            return shaded
         inwards = self._inwards(axis, faces)
         ray = mi.Ray3f(si.p - inwards * height, inwards)
         ray.maxt = height - _just_before(si.p)
         before = self.scene.ray_intersect(ray, self._is(self._near, met_shape(si)) & (ray.maxt > 0))
-        return before.is_valid() & ~self.scene.is_surface(before.shape)
+        return shaded | (before.is_valid() & ~self.scene.is_surface(before.shape))
+
+    def _is_shaded(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Return whether a solid stands between points and the laser, which they see through a level sea."""
+        scene, valid = self.scene, si.is_valid()
+        laser = RefractedLaserSampler(scene).direction_from(si.p)
+        above = scene.ray_intersect(scene.spawn_ray(si, laser.in_water), valid)
+        at_sea = above.is_valid() & scene.is_surface(above.shape)
+        in_air = scene.ray_test(scene.spawn_ray(above, laser.in_air), at_sea)
+        return (above.is_valid() & ~at_sea) | in_air
 
     def _is_wet(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Return whether points on solids lie below the sea surface, as all places of light on patches."""
