@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
+
+logger = logging.getLogger(__name__)
 
 #: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
 _STEEPEST_RIPPLE = 0.3
@@ -56,12 +59,11 @@ class Bottom:
     Raises
     ------
     UserError
-        If a parameter lies outside its range, the height map cannot be read, cells are too coarse or too many, or the
-        centre of the bottom lies above the sea.
+        If a parameter lies outside its range, the height map cannot be read, or cells are too coarse or too many.
     """
 
     def __init__(self, read: Read) -> None:
-        self.terrain = _read_terrain(read)
+        self.terrain, self.values_given = _read_terrain(read), read("map_values") is not None
         depth = read("depth", 8.0 if self.terrain is None else 0.0)
         self.depth = depth if self.terrain is not None else positive("depth", depth)
         #: Rise along x and y [m/m].
@@ -106,7 +108,7 @@ class Bottom:
         return min(wanted, default=math.inf)
 
     def _check(self) -> None:
-        """Refuse cells that are too coarse or too many, patches beyond them, and a bottom above the sea."""
+        """Refuse cells that are too coarse or too many, and patches beyond them; warn of a map of land alone."""
         cells = self.refined_size / self.cell_size
         if cells > _MOST_CELLS:
             raise UserError(
@@ -124,12 +126,11 @@ class Bottom:
                     f"patches: number {number} reaches {reach:g} m from ({self.centre[0]:g}, {self.centre[1]:g}), but "
                     f"must lie within the fine square of refined_size = {self.refined_size:g}"
                 )
-        height = float(self.heights(*(np.array([value]) for value in self.centre))[0, 0])
-        if height >= 0:
-            hint = "" if self.terrain is None else ", and map_values be depths or heights, as those of the map are"
-            raise UserError(
-                f"depth = {self.depth:g} puts the bottom at z = {height:.3g} m in its middle, "
-                f"({self.centre[0]:g}, {self.centre[1]:g}): it must lie below the sea there{hint}"
+        if self.terrain is not None and not self.values_given and (lowest := self.terrain.heights.min()) > self.depth:
+            logger.warning(
+                "the map of the seabed is land alone, from %.3g m above the sea on: map_values = depths would put it "
+                "below, and map_values = heights says that it is land",
+                lowest - self.depth,
             )
 
     def lines(self) -> tuple[FloatArray, FloatArray]:
@@ -218,8 +219,9 @@ class Seabed(mi.Mesh):
     The reflectance is a mesh attribute, ``vertex_reflectance``, which a nested BSDF may use through Mitsuba's
     ``mesh_attribute`` texture.
 
-    Where a slope rises through the sea within ``size`` there is a shore, which takes time as light is then also traced
-    in the air; a smaller size leaves it out.
+    Where the bottom rises through the sea it is land, with the same reflectance dry and wet, and the sea ends where it
+    meets the bottom. Dry land of another reflectance is a patch, or another shape. Land within ``size`` takes time, as
+    light is then also traced in the air; a smaller size leaves it out.
 
     .. code-block:: xml
 

@@ -7,7 +7,8 @@ parameters that cause it: each other one is set back to its default while the di
 the light that the reference rarely finds, so that its errors from a few passes are too small now and then.
 
 With ``--solids`` scenes have two or three groups of solids that coincide with the bottom, touch, are repeated,
-textured, partly open or without effect, and are shrunk by leaving solids out.
+textured, partly open or without effect, and are shrunk by leaving solids out. With ``--shores`` the bottom rises
+through the sea in the beam or near it, among up to three rocks.
 """
 
 import mitransient_lidar  # noqa: F401, I001
@@ -89,13 +90,14 @@ def draw(number, narrow=False):
 
 
 def solid_scene(parts):
-    """Return a scene of 6 m of water with parts."""
-    lidar = {"altitude": 100.0, "off_nadir_deg": parts["nadir"]}
+    """Return a scene of 6 m of water, or a shore, with parts."""
+    lidar = {"altitude": 100.0, "off_nadir_deg": parts["nadir"], **parts.get("aim", {})}
+    reflectance = {"depth": -FLOOR, "bsdf": {"type": "diffuse", "reflectance": parts["bottom"]}}
     return {
         "tx": {"type": "lidar_transmitter", **lidar},
         "rx": {"type": "multipixel_receiver", "layout": "1x1", "film": {"type": "time_gated_film"}, **lidar},
-        "bottom": {"type": "seabed", "depth": -FLOOR, "bsdf": {"type": "diffuse", "reflectance": parts["bottom"]}},
-        **{name: part for name, part in parts.items() if name not in ("nadir", "bottom")},
+        "bottom": {"type": "seabed", **reflectance, **parts.get("slopes", {})},
+        **{name: part for name, part in parts.items() if name not in ("nadir", "bottom", "aim", "slopes")},
     }
 
 
@@ -115,6 +117,31 @@ def draw_solids(number):
     sea = {"type": "ocean_surface", "spectrum": spectrum, "interior": {"type": "layered_water", **water}}
     bottom = solids.texture() if rng.random() < 0.3 else {"type": "spectrum", "value": rng.uniform(0.1, 0.5)}
     return "+".join(kinds), {"nadir": round(rng.uniform(0, 25), 1), "bottom": bottom, "sea": sea, **solids.parts}
+
+
+def draw_shore(number):
+    """Return slope and wind, joined, and the parts of a scene of a shore with rocks."""
+    rng = np.random.default_rng([78, number])
+    slope, wind = float(np.exp(rng.uniform(np.log(1), np.log(20)))), round(rng.uniform(1, 8), 1)
+    attenuation, depth = rng.uniform(0.05, 0.8), rng.uniform(0.1, 1.0)
+    scattering = attenuation * rng.uniform(0.2, 0.8)
+    water = {"attenuation": attenuation, "scattering": scattering, "backscattering": 0.03 * scattering}
+    # The water line is a few beams from the aim, or in the beam.
+    away = depth / np.tan(np.radians(slope)) + rng.normal(0, 0.8)
+    axis, sign = str(rng.choice(["x", "y"])), int(rng.choice([-1, 1]))
+    aim = {"aim_x": 0.0, "aim_y": 0.0, f"aim_{axis}": sign * away}
+    solids = RandomSolids(rng)
+    for rock in range(int(rng.integers(0, 4))):
+        size = solids.size(0.15, 0.6)
+        place = (*(solids.place() + np.array([aim["aim_x"], aim["aim_y"]])), rng.uniform(-size, size))
+        solids.add(f"rock{rock}", str(rng.choice(["sphere", "cube"])), place, size, solids.turn())
+    spectrum = "flat" if rng.random() < 0.3 else "elfouhaily"
+    sea = {"type": "ocean_surface", "spectrum": spectrum, "wind_speed": wind, "interior": {"type": "layered_water"}}
+    sea["interior"] |= water
+    parts = {"nadir": round(rng.uniform(0, 45), 1), "bottom": {"type": "spectrum", "value": rng.uniform(0.1, 0.5)}}
+    parts["slopes"] = {"depth": depth, f"slope_{axis}_deg": sign * slope, "size": 200.0}
+    name = f"{slope:.1f} deg, {wind:g} m/s {spectrum}, {len(solids.parts)} rocks"
+    return name, {**parts, "aim": aim, "sea": sea, **solids.parts}
 
 
 class RandomSolids:
@@ -330,12 +357,16 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")
     parser.add_argument("--narrow", action="store_true", help="take views of 0.001 to 1 mrad")
     parser.add_argument("--solids", action="store_true", help="take scenes of many solids")
+    parser.add_argument("--shores", action="store_true", help="take shores with rocks")
     parser.add_argument("--no-shrink", action="store_true", help="leave findings as they are")
     options = parser.parse_args()
     set_variant()
     all_rows, compared, found = [], 0, 0
     for number in range(options.first, options.first + options.count):
-        name, params = draw_solids(number) if options.solids else draw(number, options.narrow)
+        if options.shores or options.solids:
+            name, params = (draw_shore if options.shores else draw_solids)(number)
+        else:
+            name, params = draw(number, options.narrow)
         try:
             rows = compare(name, params)
         except UserError as error:
@@ -355,7 +386,9 @@ def main():
             found += 1
             needed = params if options.no_shrink else shrink(name, params)
             told = (
-                " ".join(needed) if options.solids else " ".join(f"-D {key}={value!r}" for key, value in needed.items())
+                " ".join(needed)
+                if name not in SCENES
+                else " ".join(f"-D {key}={value!r}" for key, value in needed.items())
             )
             print(f"  {name} {told}", flush=True)
     print(summary(compared, found, all_rows))

@@ -31,10 +31,6 @@ class UserError(ValueError):
         super().__init__(text if len(text) <= _LONGEST else f"{text[:_BEGINNING]} ... {text[-_END:]}")
 
 
-class DryBottomError(UserError):
-    """A bottom that rises through the sea where the receiver looks."""
-
-
 class WriteError(UserError):
     """A file that cannot be written, for want of space or permission."""
 

@@ -159,7 +159,7 @@ class FlightRenderer(Renderer):
 
     def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
-        series, later = self._render(inputs, self._passes(until_error=True))
+        series, later, _ = self._render(inputs, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         recorded = record(series, self.plan, inputs)
         echoes = extract(
@@ -203,13 +203,11 @@ class FlightRenderer(Renderer):
             own = rows[columns["group"][rows] == group]
             for part in np.array_split(own, -(-own.size // _BATCH)):
                 inputs = {name: column[part] for name, column in columns.items()}
-                window, began = self._scene_of(inputs).window, time.process_time()
-                series = self._render(inputs, self._passes(until_error=False))[0]
+                self._scene_of(inputs)
+                began = time.process_time()
+                series, _, errors = self._render(inputs, self._passes(until_error=False))
                 took = (time.process_time() - began) / part.size
-                power, stderr = (
-                    series[name].transpose("shot", "pixel", "time").values for name in ("waveform", "waveform_stderr")
-                )
-                error = float(np.median(window.relative_errors(power, stderr)))
+                error = float(np.median(errors))
                 found.append((series, took * max((error / self.plan.target_error) ** 2, 1.0)))
                 if progress is not None:
                     done = sum(one.sizes["shot"] for one, _ in found)
@@ -238,8 +236,11 @@ class FlightRenderer(Renderer):
 
     def _render(
         self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
-    ) -> tuple[xr.Dataset, FloatArray]:
-        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
+    ) -> tuple[xr.Dataset, FloatArray, FloatArray]:
+        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns].
+
+        The last array are the relative errors of the bins that count.
+        """
         from mitransient_lidar.rendering.shots.batches import ReceivedShots
         from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
@@ -265,7 +266,7 @@ class FlightRenderer(Renderer):
         joined = ReceivedShots.joined(rendered)
         attributes = scene.attributes(used=batches.used_values, passes=int(joined.passes.max()))
         series = scene.dataset(joined, attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
-        return series, 1e9 / C0 * (further - further % width)
+        return series, 1e9 / C0 * (further - further % width), joined.errors
 
 
 def scene_of(plan: FlightPlan) -> SceneSource:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.axis_limits import COLUMN_LEVEL
 from mitransient_lidar.physics.lidar.pulse import waveform
 
@@ -198,19 +198,23 @@ class ErrorCorrelation:
 
 @dataclass(frozen=True)
 class ErrorWindow:
-    """Bins whose errors end a render, from the surface echo to the end of the bottom echo.
+    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and those of land.
 
     Parameters
     ----------
     start_ns, end_ns
-        Limits for each pixel [ns], shape (pixels,).
+        Limits for each pixel [ns], shape (pixels,), or of each shot (shots x pixels,); of land where a pixel sees no
+        water.
     time_ns
         Centres of the bins [ns], shape (time,).
+    land_ns
+        Limits of the echo of land beside the water [ns], shape (pixels, 2) likewise; NaN without.
     """
 
     start_ns: FloatArray
     end_ns: FloatArray
     time_ns: FloatArray
+    land_ns: FloatArray
 
     @classmethod
     def of_probe(cls, probe: Probe) -> ErrorWindow:
@@ -222,12 +226,28 @@ class ErrorWindow:
         scene, echoes, time_ns = probe.scene, probe.echoes, probe.scene.axis.centres_ns
         half_pulse = 0.5 * scene.transmitter.pulse.fwhm_ns
         (start, middle), end = echoes.surface_ns.T, echoes.bottom_ns[:, 1] + half_pulse
+        alone = np.isnan(start) & np.isnan(end)
         least = 0.0 if scene.water is None else float(scene.water.column.absorption.min())
         column_ns = -1e9 / C0 * scene.group_index * np.log(COLUMN_LEVEL) / max(least, 1e-9)
         of_water = np.fmin(2 * middle - start + half_pulse + column_ns, time_ns[-1])
-        # Without a surface (a plate in the air), the window begins with the record.
+        # Without a surface, the window begins with the record.
         start = np.where(np.isnan(start), time_ns[0], start)
-        return cls(start, np.where(end <= scene.axis.end_ns, end, of_water), time_ns)
+        end = np.where(end <= scene.axis.end_ns, end, of_water)
+        return cls(start, end, time_ns, np.full((start.size, 2), np.nan)).with_land(scene, echoes.dry_ns, alone)
+
+    def with_land(self, scene: LidarScene, dry_ns: FloatArray, alone: BoolArray) -> ErrorWindow:
+        """Return the window of pixels, or of shots, that see land, some of them alone.
+
+        Its echo comes between two times [ns], shape (n, 2), NaN without one.
+        """
+        half = 0.5 * max(scene.transmitter.pulse.fwhm_ns, scene.axis.bin_width_ns)
+        land, copies = dry_ns + np.array([-half, half]), len(dry_ns) // len(self.start_ns)
+        alone = alone & np.isfinite(land[:, 0])
+        start, end = (
+            np.where(alone, own, np.tile(limit, copies))
+            for own, limit in zip(land.T, (self.start_ns, self.end_ns), strict=True)
+        )
+        return ErrorWindow(start, end, self.time_ns, np.where(alone[:, None], np.nan, land))
 
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
         """Return the relative standard errors of a waveform, infinite where it is 0.
@@ -235,12 +255,13 @@ class ErrorWindow:
         Waveform and standard error have the shape (pixels, time), or of several shots (shots, pixels, time). Pixels
         with less than a thousandth of the energy of the brightest one are excluded.
         """
-        shots = 1 if waveform.ndim == 2 else len(waveform)
         waveform, stderr = (values.reshape(-1, values.shape[-1]) for values in (waveform, stderr))
-        start_ns, end_ns = (np.tile(limit, shots)[:, None] for limit in (self.start_ns, self.end_ns))
+        limits = np.column_stack([self.start_ns, self.end_ns, self.land_ns])
+        start_ns, end_ns, *land_ns = np.tile(limits, (len(waveform) // len(limits), 1)).T[..., None]
         energy = waveform.sum(axis=1)
         lit = energy > 1e-3 * energy.max(initial=0.0)
         inside = (self.time_ns >= start_ns) & (self.time_ns <= end_ns)
+        inside |= (self.time_ns >= land_ns[0]) & (self.time_ns <= land_ns[1])
         chosen = inside & lit[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = stderr[chosen] / waveform[chosen]

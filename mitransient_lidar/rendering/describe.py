@@ -54,6 +54,7 @@ def describe_scene(probe: Probe, window: ErrorWindow, focusing: RippleFocusing |
     surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
     return {
         "beam_outside_surface": probe.echoes.missed_beam,
+        **({"beam_on_land": probe.echoes.on_land} if probe.echoes.on_land else {}),
         **describe_lidar(probe),
         **surface,
         **({} if heights is None else {"surface_heights_m": list(heights)}),

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import DryBottomError, UserError
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.fitted_axis import NEAREST_RANGE, earliest_ns, total_reflection_ns
 from mitransient_lidar.transport.opaque import shape_number
@@ -47,8 +47,7 @@ def check_scene(probe: Probe) -> None:
     ------
     UserError
         If no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the record,
-        nothing in view reflects or scatters light, the record holds no echo, a bottom rises above the sea, or a target
-        lies below the bottom.
+        nothing in view reflects or scatters light, the record holds no echo, or a target lies below the bottom.
     """
     scene, view, beam = probe.scene, probe.view, probe.beam
     if scene.submerged:
@@ -62,7 +61,9 @@ def check_scene(probe: Probe) -> None:
     _check_solids(probe)
     _warn_of_axes(scene, view, beam)
     solids = scene.solids
-    out = [said for solid in solids if (said := _out_of_place(solid, view, beam))]
+    # Of several parts of the bottom, such as a shore, some may be elsewhere.
+    single = scene.targets if len(scene.bottoms) > 1 else solids
+    out = [said for solid in single if (said := _out_of_place(solid, view, beam))]
     for said in out[:_MOST_NAMED]:
         logger.warning(said)
     if len(out) > _MOST_NAMED:
@@ -189,10 +190,11 @@ def _check_reflection(scene: LidarScene, view: Rays) -> None:
 
 
 def _check_solids(probe: Probe) -> None:
-    """Refuse a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
+    """Refuse a target below the bottom; tell of solids in the air, and warn of those above a sea without land."""
     scene, bottoms = probe.scene, probe.scene.bottoms
     lowest = min(bottoms, key=lambda bottom: float(bottom.bbox().min.z), default=None)
     _, highest = scene.sea_heights or (np.inf, np.inf)
+    has_land = any(bottom.bbox().min.z <= highest < bottom.bbox().max.z for bottom in bottoms)
     for solid in scene.solids:
         low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
         if lowest is not None and high < float(lowest.bbox().min.z):
@@ -200,15 +202,10 @@ def _check_solids(probe: Probe) -> None:
                 f"shape {solid.id()!r} lies below the bottom {lowest.id()!r}, up to z = {high:.3g} m: "
                 f"it must lie above {float(lowest.bbox().min.z):.3g} m"
             )
-        if low > highest:
+        if low > highest and not has_land:
             logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
     for solid in probe.echoes.pierced:
-        if any(solid is bottom for bottom in bottoms):
-            raise DryBottomError(
-                f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
-                "receiver looks: a bottom must lie below the waves"
-            )
-        logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())
+        logger.info("shape %r rises through the sea surface: part of it is seen in the air", solid.id())
 
 
 def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:

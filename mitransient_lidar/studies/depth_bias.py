@@ -23,7 +23,7 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
 )
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
-from mitransient_lidar.core.errors import DryBottomError, UserError
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import FloatArray
@@ -202,14 +202,16 @@ def depth_bias(
             }
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
             error = target_error * (1 if wind else _LEVEL)
-            try:
-                rendered = render_shots(
-                    scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
-                )
-            except DryBottomError:
-                _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
-            else:
-                recorded = detect_waveforms(seas.keep(rendered), receiver or instrument, records, seed)
+            rendered = render_shots(
+                scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
+            )
+            seas.keep(rendered)
+            # Troughs may leave a shallow bottom dry.
+            wet = np.isfinite(rendered["true_bottom_depth_below_surface"].values)
+            if not wet.all():
+                _LOG.warning("%d of %d shots find the bottom at %g m dry", np.count_nonzero(~wet), wet.size, depth)
+            if wet.any():
+                recorded = detect_waveforms(rendered.isel(shot=wet), receiver or instrument, records, seed)
                 _check_counts(recorded)
                 cells[place] = _cell(recorded, estimators, former)
                 pixels = [str(name) for name in recorded["pixel"].values]

@@ -59,10 +59,10 @@ def fitted_axis(
         if given is None and (earliest := earliest_ns(scene, transmitter)) is not None:
             given = np.ceil(earliest / film.bin_width_ns) * film.bin_width_ns
     else:
-        first, last, end = _light_above_water(scene, transmitter, film.gates, shifts)
+        first, last, end, higher_ns = _light_above_water(scene, transmitter, film.gates, shifts)
         start = first - lead
         if scene.surfaces:
-            quiet = _quiet_until(scene, transmitter) - _QUIET_BINS * film.bin_width_ns
+            quiet = _quiet_until(scene, transmitter) - higher_ns - _QUIET_BINS * film.bin_width_ns
             start = min(start, max(quiet, start - _LONGEST_NS))
     axis = TimeAxis.covering(start, last + tail, film.bin_width_ns, given, film.bin_count)
     if film.bin_count is None and axis.end_ns > latest:
@@ -73,12 +73,34 @@ def fitted_axis(
 
 def _light_above_water(
     scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None, shifts: Iterable[tuple[float, float]]
-) -> tuple[float, float, str]:
-    """Return the times of the first and the last light [ns], and what the last light comes from."""
+) -> tuple[float, float, str, float]:
+    """Return the times of the first and the last light [ns], what the last light comes from, and the lead of land.
+
+    Land and other solids above the sea return the first light earlier than it by this time [ns].
+    """
     solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
-    found = [_lidar_view(scene, transmitter, shift).limits(solids, gates is not None) for shift in shifts]
+    found = [
+        _lidar_view(scene, transmitter, shift).limits(solids, gates is not None, _is_dry(scene, transmitter, shift))
+        for shift in shifts
+    ]
+    first = min(found, key=lambda each: each.first_ns)
     last = max(found, key=lambda each: each.last_ns)
-    return _with_gates(scene, gates, min(each.first_ns for each in found), last.last_ns, last.end)
+    higher_ns = max(first.surface_ns[0] - first.first_ns, 0.0)
+    return *_with_gates(scene, gates, first.first_ns, last.last_ns, last.end), higher_ns
+
+
+def _is_dry(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> bool:
+    """Return whether all rays of the view, or of the beam, of a displaced lidar [m] meet solids above the sea."""
+    lowest, highest = scene.sea_heights or (0.0, 0.0)
+    if not scene.surfaces or all(float(solid.bbox().max.z) <= highest for solid in scene.solids):
+        return False
+    both = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter)), Rays.of_beam(scene, transmitter)
+    for rays in both:
+        moved = replace(rays, pose=replace(rays.pose, origin=np.add(rays.pose.origin, [*shift, 0.0])))
+        on_land = moved.first.is_valid() & ~moved.on_sea & (moved.first.p.z > opaque(lowest))
+        if dr.all(on_land | ~moved.seen)[0]:
+            return True
+    return False
 
 
 def _with_gates(

@@ -18,7 +18,7 @@ from mitransient_lidar.transport.medium.snell import refract
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
@@ -31,6 +31,9 @@ _REACH_PER_DEPTH = 0.3
 
 #: Number of rays that find echoes, and share of the beam excluded at either end of an echo.
 _ECHO_RAYS, _TAIL = 2**16, 0.05
+
+#: Rays for each pixel of a shot that find land.
+_LAND_RAYS = 256
 
 #: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
 _MOST_PIXELS = 1024
@@ -171,8 +174,12 @@ class Echoes:
     missed_beam
         Share of the beam inside the field of view that passes outside the surface mesh, without what solids in the air
         intercept.
+    dry_ns
+        Earliest and latest arrival of the echo of land and other solids in the air [ns], shape (pixels, 2).
+    on_land
+        Share of the beam inside the field of view that meets them.
     pierced
-        Solids visible in the air that reach below the crests of the sea; bottoms if also visible through the sea.
+        Solids visible in the air that reach below the crests of the sea.
     solids
         Echoes of the solids that rays of beam and view meet, in the air and under water.
     """
@@ -180,6 +187,8 @@ class Echoes:
     surface_ns: FloatArray
     bottom_ns: FloatArray
     missed_beam: float
+    dry_ns: FloatArray
+    on_land: float
     pierced: list[mi.Shape]
     solids: list[SolidEcho]
 
@@ -247,8 +256,11 @@ class Probe:
         in_air = dry & np.array(first.p.z > lowest)
         outside = ~surface & ~in_air if scene.surfaces and not scene.submerged else np.zeros_like(surface)
         missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
+        land = dry & (in_air if scene.surfaces else True) & (not scene.submerged)
+        dry_ns = _quantiles(times, weight * land, pixel, count, (_TAIL, 1 - _TAIL))
+        on_land = float(weight[land].sum() / weight.sum()) if weight.sum() > 0 else 0.0
         numbers = [met_numbers(hit) for hit in (first, below)]
-        pierced, solids, bottoms = [], [], scene.bottoms
+        pierced, solids = [], []
         met_by_any = {*np.unique(numbers).tolist()}
         for shape in scene.solids:
             if (own := shape_number(shape)) not in met_by_any:
@@ -258,12 +270,44 @@ class Probe:
             arrivals = _quantiles(np.where(under_water, later, times), weight * met, 0 * pixel, 1, (None, 1 - _TAIL))
             if np.isfinite(arrivals[0, 0]):
                 solids.append(SolidEcho(shape, *arrivals[0].tolist()))
-            # A receiver may look at the land alone.
-            is_seen = not any(shape is bottom for bottom in bottoms) or np.any(under_water & is_below)
-            if float(shape.bbox().min.z) <= crest and np.any(in_air & is_first) and is_seen:
+            if float(shape.bbox().min.z) <= crest and np.any(in_air & is_first):
                 pierced.append(shape)
-        surface_ns, bottom_ns = (np.broadcast_to(each, (pixels, 2)) for each in (surface_ns, bottom_ns))
-        return Echoes(surface_ns, bottom_ns, missed, pierced, solids)
+        surface_ns, bottom_ns, dry_ns = (np.broadcast_to(each, (pixels, 2)) for each in (surface_ns, bottom_ns, dry_ns))
+        return Echoes(surface_ns, bottom_ns, missed, dry_ns, on_land, pierced, solids)
+
+
+def land_of_shots(scene: LidarScene, shots: int) -> tuple[FloatArray, BoolArray]:
+    """Return when the echo of land and other solids in the air comes in shots, and whether a pixel sees such alone.
+
+    The scene is in parts, as a number of shots meet it.
+
+    Returns
+    -------
+    dry_ns
+        Earliest and latest arrival [ns], shape (shots x pixels, 2); NaN without one.
+    alone
+        Whether all that a pixel sees of the beam are solids in the air, shape (shots x pixels,).
+    """
+    pixels = scene.receiver.pixels
+    count, slots = int(np.clip(_LAND_RAYS * pixels.count, _LAND_RAYS, PROBE_RAYS)), shots * pixels.count
+    lowest, _ = scene.sea_heights or (-np.inf, np.inf)
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * count), shots, count)
+    moved = lanes.pick(scene)
+    pose, u = moved.transmitter_pose, unit_points(count, lanes.number)
+    angles = mi.Point2f(scene.transmitter.sample_tangent(u))
+    rays = Rays(moved, pose, angles, pose.direction(*angles), mi.Bool(True))
+    first, receiver = rays.first, moved.relative(moved.receiver_pose)
+    angle_x, angle_y, ahead = receiver.tangent(first.p)
+    pixel, inside = pixels.pixel_at(angle_x, angle_y, count * u.y - dr.floor(count * u.y))
+    length = moved.relative(pose).distance(first.p) + receiver.distance(first.p)
+    seen = first.is_valid() & (inside > 0) & (ahead > 0)
+    dry = seen & ~rays.on_sea & (first.p.z > opaque(lowest))
+    slot = lanes.shot * pixels.count + pixel
+    dr.eval(length, seen, dry, slot)
+    is_seen, is_dry, slot = (np.broadcast_to(np.array(one), shots * count) for one in (seen, dry, slot))
+    time_ns = (np.array(length, dtype=np.float64) + scene.reference_length) * 1e9 / C0
+    found = _quantiles(time_ns, is_dry.astype(np.float64), slot, slots, (_TAIL, 1 - _TAIL))
+    return found, np.isfinite(found[:, 0]) & (np.bincount(slot, is_seen & ~is_dry, slots) == 0)
 
 
 def _quantiles(

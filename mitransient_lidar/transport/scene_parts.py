@@ -361,14 +361,8 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
 def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Water) -> None:
     """Refuse water layers below all solids, and index layers that begin within the waves."""
     lowest = min((float(solid.bbox().min.z) for solid in solids_of(scene, surfaces)), default=-np.inf)
-    for solid in solids_of(scene, surfaces):
-        if float(solid.bbox().min.z) == lowest >= 0:
-            raise UserError(
-                f"shape {solid.id()!r} at z = {lowest:g} m is the lowest one: a bottom must lie below the mean sea "
-                "level, at a depth greater than 0"
-            )
     deepest = float(water.column.layer_tops[-1])
-    if not water.from_profile and -deepest <= lowest:
+    if not water.from_profile and -deepest <= lowest < 0:
         raise UserError(f"layer_tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")
     trough = min(float(surface.bbox().min.z) for surface in surfaces)
     for boundary in water.index_layers.boundaries[:1]:

@@ -11,7 +11,7 @@ from scipy.stats import t
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import DryBottomError, UserError
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.rendering import accuracy
@@ -167,26 +167,12 @@ def test_standard_error_is_that_of_the_mean():
 
 def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite():
     time_ns = np.arange(5.0)
-    window = accuracy.ErrorWindow(np.array([1.0, 1.0, 1.0]), np.array([3.0, 3.0, 3.0]), time_ns)
+    window = accuracy.ErrorWindow(
+        np.array([1.0, 1.0, 1.0]), np.array([3.0, 3.0, 3.0]), time_ns, np.full((3, 2), np.nan)
+    )
     waveform = np.array([[1, 1, 2, 4, 1], [0, 1, 0, 1, 0], [0, 1e-9, 0, 0, 0]], dtype=float)
     errors = window.relative_errors(waveform, np.ones((3, 5)))
     assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
-
-
-@pytest.mark.slow
-def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
-    """Waves at 6 m/s have half a metre, and this sea a trough in view; a pile of 0.6 m across stands in the beam."""
-    with pytest.raises(DryBottomError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
-        small(params={"wind_speed": 6, "bottom_depth": 0.1, "surface_seed": 2})
-    pile = {"type": "cylinder", "p0": [0, 0, -2.0], "p1": [0, 0, 1.0], "radius": 0.3, "bsdf": {"type": "diffuse"}}
-    scene = {
-        "tx": {"type": "lidar_transmitter"},
-        "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film", "time_start_ns": 1390.0}},
-        "sea": {"type": "ocean_surface", "interior": {"type": "layered_water"}},
-        "pile": pile,
-    }
-    mitransient_lidar.render(scene, integrator=SMALL, passes=2)
-    assert "shape 'pile' rises through the sea surface" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -158,8 +158,10 @@ class LidarView:
     reach: float
     column: float | None
 
-    def limits(self, solids: Sequence[Solid], direct: bool = False) -> AxisLimits:
+    def limits(self, solids: Sequence[Solid], direct: bool = False, dry: bool = False) -> AxisLimits:
         """Find the first and the last arrival of light; of the last, `direct` echoes of surface and solids only.
+
+        Of a `dry` view or beam, all of which meets land, the sea returns no light.
 
         Notes
         -----
@@ -187,15 +189,15 @@ class LidarView:
             if np.exp(-slant * self.decay.cumulative(max(-lowest, 0.0))) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
                 later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
-                later = 0.0 if direct else later
+                later = 0.0 if direct or dry else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
                 below = self.sea.at_height(self.view.pose.origin, seen, min(lowest, 0.0))
                 covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
-        if self.column is not None or not firsts:
+        if (self.column is not None and not dry) or not firsts:
             firsts.append(surface[0])
             lasts.append((surface[1], "after the surface echo"))
-        if self.column is not None and not direct and np.mean(covered) < _COVERED:
+        if self.column is not None and not direct and not dry and np.mean(covered) < _COVERED:
             depth = max(self.decay.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
             text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
             lasts.append((sum(self._latest(-depth)), text))

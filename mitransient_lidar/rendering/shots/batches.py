@@ -6,7 +6,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -26,6 +26,7 @@ from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
@@ -193,6 +194,8 @@ class ReceivedShots:
         perturbations.
     missed
         Number of shots whose passes ended before the error that was requested.
+    errors
+        Relative standard errors of the bins that count (`ErrorWindow`), one row.
     """
 
     whole: tuple[FloatArray, ...]
@@ -201,6 +204,7 @@ class ReceivedShots:
     parts: tuple[FloatArray, ...] = ()
     derivatives: tuple[FloatArray, ...] = ()
     missed: int = 0
+    errors: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def joined(cls, several: Sequence[ReceivedShots]) -> ReceivedShots:
@@ -209,9 +213,9 @@ class ReceivedShots:
             tuple(np.concatenate(arrays) for arrays in zip(*(getattr(one, name) for one in several), strict=True))
             for name in ("whole", "parts", "derivatives")
         )
-        passes = np.concatenate([one.passes for one in several])
+        passes, errors = (np.concatenate([getattr(one, name) for one in several]) for name in ("passes", "errors"))
         lost, missed = (sum(getattr(one, name) for one in several) for name in ("lost", "missed"))
-        return cls(whole, lost, passes, parts, derivatives, missed)
+        return cls(whole, lost, passes, parts, derivatives, missed, errors)
 
 
 class ShotBatches:
@@ -232,7 +236,9 @@ class ShotBatches:
     share
         Share of the paths of a full pass.
     goal
-        Relative standard error of the median bin of a batch that ends its passes, and the bins that count.
+        Relative standard error of the median bin of a batch that ends its passes.
+    window
+        Bins that count, of a shot without land; None where none do.
     companions
         Solids that go with the lidar.
     """
@@ -243,7 +249,8 @@ class ShotBatches:
         aim: tuple[float, float],
         passes: int,
         share: float,
-        goal: tuple[float, ErrorWindow] | None,
+        goal: float | None,
+        window: ErrorWindow | None,
         companions: Sequence[mi.Shape],
     ) -> None:
         lidar = renderer.scene
@@ -251,7 +258,7 @@ class ShotBatches:
         self._renderer, self.passes, self.share = renderer.scaled(share), passes, share
         self._frame_origin = lidar.frame_origin[:2]
         self._aim = np.array(aim) - self._frame_origin
-        self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
+        self._goal, self._window, in_turn = goal, window, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
         waves = [sea for sea in lidar.seas if np.isfinite(sea.sea.cell_size)]
         level = [sea for sea in lidar.seas if np.isinf(sea.sea.cell_size)]
@@ -314,6 +321,7 @@ class ShotBatches:
         light = Light(self._renderer.scene, self._origins > 1)
         try:
             several = self.at(poses)
+            window = self._window_of(several, shots)
             while done < self.passes and needed > 0:
                 if (here := min(self._together, self.passes - done, needed)) != copies:
                     renderer, copies = several(here), here
@@ -329,17 +337,27 @@ class ShotBatches:
                 done += here
                 ends.append(time.perf_counter())
                 if self._goal is not None and done >= _PASSES_FOR_ERROR:
-                    target, window = self._goal
-                    power = light.whole.power
-                    error = float(np.median(window.relative_errors(power.mean, power.stderr)))
-                    needed = 0 if error <= target else math.ceil(done * min((error / target) ** 2 - 1, 1e3))
+                    error = float(np.median(_errors(window, light)))
+                    rest = min((error / self._goal) ** 2 - 1, 1e3)
+                    needed = 0 if error <= self._goal else math.ceil(done * rest)
                 if done >= 2 and 2 * ends[-1] - ends[-2] - ends[0] > self._seconds:
                     break
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
         missed, passes = shots if self._goal is not None and needed > 0 else 0, np.full(shots, done)
-        return ReceivedShots(light.arrays, lost / done, passes, light.parts.arrays, light.perturbed.arrays, missed)
+        errors = _errors(window, light)
+        return ReceivedShots(
+            light.arrays, lost / done, passes, light.parts.arrays, light.perturbed.arrays, missed, errors
+        )
+
+    def _window_of(self, several: Callable[[int], PassRenderer], shots: int) -> ErrorWindow | None:
+        """Return the bins that count in each of some shots, which may see land."""
+        lidar = self._renderer.scene
+        highest, lowest = lidar.empty_heights
+        if self._window is None or highest <= lowest or lidar.submerged:
+            return self._window
+        return self._window.with_land(lidar, *land_of_shots(several(1).scene, shots))
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -350,6 +368,12 @@ class ShotBatches:
     def used_values(self) -> dict[str, float]:
         """Values used for parameters of the integrator that may be automatic."""
         return self._renderer.used_values
+
+
+def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
+    """Return the relative standard errors of the bins that count, none before the second pass."""
+    power = light.whole.power
+    return np.zeros(0) if window is None or power.count < 2 else window.relative_errors(power.mean, power.stderr)
 
 
 def share_for_error(error: float) -> float:

@@ -197,7 +197,8 @@ class _Images:
         # The middle of the fine waves of the scene.
         self._middle = np.array(seas[0].sea.centre if seas else lidar.frame_origin[:2])
         self._time_s = seas[0].time_s if seas else 0.0
-        self._batches = ShotBatches(renderer, (float(self._middle[0]), float(self._middle[1])), 1, share, None, ())
+        aim = float(self._middle[0]), float(self._middle[1])
+        self._batches = ShotBatches(renderer, aim, 1, share, None, None, ())
         self._pixels = lidar.receiver.pixels.count
         self._size = int(np.clip(_SUMS // (self._pixels * sequence.gates), 1, self._batches.size))
         shape = sequence.frames * sequence.gates, self._pixels

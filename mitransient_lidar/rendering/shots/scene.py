@@ -124,8 +124,7 @@ class ShotScene:
         """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
         from mitransient_lidar.rendering.shots.batches import ShotBatches
 
-        goal = None if error is None else (error, self.window)
-        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions)
+        return ShotBatches(self._renderer, self._place, passes, share, error, self.window, self.companions)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""

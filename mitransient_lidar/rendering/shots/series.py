@@ -209,7 +209,7 @@ def render_shots(
                 batch = batches.limited(int(most[part].max()), seconds)
                 seeds = range(first_seed + part.start, first_seed + part.stop)
                 found.append(batch.render(ShotPoses(places[part]), seeds))
-                errors.append(series.window.relative_errors(*found[-1].whole[2:]))
+                errors.append(found[-1].errors)
                 done = part.stop
                 if progress is not None:
                     progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], options))

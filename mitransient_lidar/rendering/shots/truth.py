@@ -152,9 +152,10 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     """Return the coordinates over ``shot`` of shots over a sea of an ``ocean_surface``, with units and descriptions.
 
     Places, slopes and depths as of `shots.series.render_shots`, and in scenes with water its coefficients
-    (`water_means`).
+    (`water_means`). Where the axis meets land or another solid above the sea, the sea and the water are unknown (NaN);
+    so is the bottom below another solid, and that of land is above the sea, at a negative depth.
     """
-    from mitransient_lidar.transport.probe import axis_on_bottom
+    from mitransient_lidar.transport.probe import axis_on_bottom, first_along
 
     places = shots.places
     turns = np.zeros(len(places))
@@ -170,15 +171,22 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     found = -axis_on_bottom(lidar, origins, axes)[:, 2]
     # Rays in single precision are known to a tenth of a millimetre.
     depth = np.round(found, 4)
+    on_land = depth + height < 0
+    if lidar.empty_heights[0] > 0 and np.all(axes[..., 2] < 0) and not lidar.submerged:
+        at_sea = origins - axes * (origins[:, 2:] / axes[..., 2:])
+        on_solid = first_along(lidar, lidar.solids, [origins, at_sea])[:, 2] > height
+        depth = np.where(on_solid & ~on_land, np.nan, depth)
+        on_land |= on_solid
+    of_sea = {"true_slope_along": along, "true_slope_across": across, "true_surface_height": height}
+    of_water = {} if lidar.water is None else water_means(lidar.water, depth)
+    of_sea = {name: np.where(on_land, np.nan, column) for name, column in {**of_sea, **of_water}.items()}
     values = {
         "aim_x": places[:, 0],
         "aim_y": places[:, 1],
-        "true_slope_along": along,
-        "true_slope_across": across,
-        "true_surface_height": height,
+        **{name: of_sea.pop(name) for name in ("true_slope_along", "true_slope_across", "true_surface_height")},
         "true_bottom_depth": depth,
-        "true_bottom_depth_below_surface": depth + height,
-        **({} if lidar.water is None else water_means(lidar.water, depth)),
+        "true_bottom_depth_below_surface": np.where(on_land, np.nan, depth + height),
+        **of_sea,
     }
     return {name: ("shot", column, described(name)) for name, column in values.items()}
 

@@ -31,6 +31,9 @@ _LEAST_THICKNESS = 0.01
 #: Least vertical component of the directions along which points move to the plane of their layer.
 _LEAST_DESCENT = 0.5
 
+#: Least thickness of a cell that a solid cuts over that of a whole one, and in water that is no deeper than one cell.
+_LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
+
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
@@ -328,7 +331,9 @@ class WaterCells:
             low_bits(j, of_sector) | (low_bits(i, of_ring) << of_sector) | (low_bits(k, z) << (of_sector + of_ring))
         )
         tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
-        thickness = dr.maximum(below - above, 0.25 * self.thickness_at(above))
+        # Thinner where the bottom rises to the surface, and the cell is the only one.
+        least = dr.select(is_lowest & (layer == 0), _LEAST_WEDGE, _LEAST_CUT) * self.thickness_at(above)
+        thickness = dr.maximum(below - above, least)
         volume = thickness * stretch * rings.area(sector)
         return Cell(self._start + bucket, tag, volume, volume * there / here)
 

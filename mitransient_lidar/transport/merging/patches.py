@@ -14,6 +14,7 @@ from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index, shape_number
+from mitransient_lidar.transport.paths.refracted_connection import RefractedLaserSampler
 from mitransient_lidar.transport.probe import PROBE_RAYS
 from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
@@ -97,23 +98,30 @@ def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
     return dr.maximum(light / projection, _LEAST_FORESHORTENING)
 
 
+def _just_before(point: mi.Point3f) -> mi.Float:
+    """Return the distance from points at which rays to them end [m]."""
+    return dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(point)))
+
+
 def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) -> list[mi.Shape]:
-    """Return solids with parts above each other in the region of any shot, found with vertical rays."""
+    """Return solids with parts above each other, or in the air, in the region of any shot, found with vertical rays."""
     rays = PROBE_RAYS if shots == 1 else _PROBE_RAYS_OF_SHOTS
     lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * rays), shots, rays)
     scene, (x, y) = lanes.pick(scene.with_parts_of(scene.solids)), region.probe_points(lanes.number)
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
     looking = dr.full(mi.Bool, True, shots * rays)
-    met = []
-    for _ in range(_MOST_LEVELS):
+    lowest, _ = scene.sea_heights or (np.inf, np.inf)
+    met, dry = [], mi.UInt32(0)
+    for level in range(_MOST_LEVELS):
         si = scene.ray_intersect(ray, looking)
         looking &= si.is_valid()
         met.append(dr.select(looking, dr.reinterpret_array(mi.UInt32, met_shape(si)), 0))
+        dry = dr.select(looking & (si.p.z > opaque(lowest)), met[0], 0) if level == 0 else dry
         ray = si.spawn_ray(ray.d)
-    dr.eval(met)
+    dr.eval(met, dry)
     levels = np.sort([np.array(numbers) for numbers in met], axis=0)
-    uneven = {*levels[1:][levels[1:] == levels[:-1]].tolist()}
+    uneven = {*levels[1:][levels[1:] == levels[:-1]].tolist(), *np.unique(np.array(dry)).tolist()}
     return [solid for solid in scene.solids if shape_number(solid) in uneven]
 
 
@@ -187,6 +195,10 @@ class SolidPatches:
             not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
             for solid in solids
         ]
+        # Land and other solids that rise through the sea here shade what is beside them.
+        lowest, _ = self.scene.sea_heights or (np.inf, np.inf)
+        self._has_shades = any(float(solid.bbox().max.z) > lowest for solid in self.uneven)
+        cut[numbers] |= self._has_shades
         self._any_near, self._any_cut = bool(near.any()), bool((near | cut).any())
         self._near, self._cut = (aligned(mi.UInt32, one.astype(np.uint32)) for one in (near, near | cut))
 
@@ -290,15 +302,36 @@ class SolidPatches:
     def _is_hidden(self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, height: mi.Float) -> mi.Bool:
         """Return whether another solid lies before points, in projection, within the height of a level [m].
 
-        Light that such a solid stops is not spread over what it hides.
+        Light that such a solid stops is not spread over what it hides, nor over shades of what rises through the sea.
         """
+        shaded = (axis == 2) & self._is_shaded(si) if self._has_shades else mi.Bool(False)
         if not self._any_near:
-            return mi.Bool(False)
+            return shaded
         inwards = self._inwards(axis, faces)
         ray = mi.Ray3f(si.p - inwards * height, inwards)
-        ray.maxt = height - dr.maximum(_JUST_BEFORE, _JUST_BEFORE_ROUNDING * dr.max(dr.abs(si.p)))
+        ray.maxt = height - _just_before(si.p)
         before = self.scene.ray_intersect(ray, self._is(self._near, met_shape(si)) & (ray.maxt > 0))
-        return before.is_valid() & ~self.scene.is_surface(before.shape)
+        return shaded | (before.is_valid() & ~self.scene.is_surface(before.shape))
+
+    def _is_shaded(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Return whether a solid stands between points and the laser, which they see through a level sea."""
+        scene, valid = self.scene, si.is_valid()
+        laser = RefractedLaserSampler(scene).direction_from(si.p)
+        above = scene.ray_intersect(scene.spawn_ray(si, laser.in_water), valid)
+        at_sea = above.is_valid() & scene.is_surface(above.shape)
+        in_air = scene.ray_test(scene.spawn_ray(above, laser.in_air), at_sea)
+        return (above.is_valid() & ~at_sea) | in_air
+
+    def _is_wet(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Return whether points on solids lie below the sea surface, as all places of light on patches."""
+        lowest, highest = self.scene.sea_heights or (np.inf, np.inf)
+        if self.scene.empty_heights[0] <= lowest:
+            return mi.Bool(True)
+        near = active & si.is_valid() & (si.p.z > opaque(lowest))
+        above = self.scene.ray_intersect(
+            self.scene.spawn_ray(si, mi.Vector3f(0, 0, 1)), near & (si.p.z < opaque(highest))
+        )
+        return ~near | (above.is_valid() & self.scene.is_surface(above.shape))
 
     def _inwards(self, axis: mi.UInt32, faces: mi.Float) -> mi.Vector3f:
         """Return the direction of a projection towards faces, of length 1 along x, y or z."""
@@ -340,10 +373,11 @@ class SolidPatches:
             ray = mi.Ray3f(origin, inwards)
             ray.maxt = patch.height + 2 * margin - dr.abs(w - first)
             si = self.scene.ray_intersect(ray, searching)
-            found = si.is_valid() & (self.locate(si).tag == patch.tag)
-            # Other surfaces may lie before the patch.
+            found = si.is_valid() & (self.locate(si).tag == patch.tag) & self._is_wet(si, searching)
+            # Other surfaces may lie before the patch; the sea lies close to it at the water line.
             fresh = ~si.is_valid()
-            uvw.z = w - patch.faces * (si.t + margin)
+            step = dr.select(self.scene.is_surface(si.shape), _just_before(si.p), margin)
+            uvw.z = w - patch.faces * (si.t + step)
             searching &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
             return samples + dr.select(searching & fresh, mi.Float(1), 0), rng, searching, uvw, fresh
 

@@ -11,7 +11,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.opaque import aligned, opaque, opaque_vector
+from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_vector
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
 from mitransient_lidar.transport.rng import Lanes, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
@@ -98,12 +98,21 @@ class Region:
         # From the mean sea level: below the deepest trough, which lies anywhere, may be below a shallow bottom here.
         ray = mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), opaque_vector(down))
         length, at_sea = dr.zeros(mi.Float, PROBE_RAYS), dr.full(mi.Bool, True, PROBE_RAYS)
+        met = mi.Bool(False)
         for _ in range(_MOST_CROSSINGS):
             si = scene.ray_intersect(ray, at_sea)
             length += dr.select(at_sea, dr.select(si.is_valid(), si.t, dr.inf), 0)
+            met |= at_sea & si.is_valid() & ~scene.is_surface(si.shape)
             at_sea &= si.is_valid() & scene.is_surface(si.shape)
             ray = si.spawn_ray(ray.d)
-        return float(dr.mean(dr.minimum(length, opaque(_longest_way(scene))))[0])
+        length = dr.minimum(length, opaque(_longest_way(scene)))
+        # Without what lies below land.
+        above = scene.ray_intersect(mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), mi.Vector3f(0, 0, 1)))
+        wet = ~above.is_valid() | scene.is_surface(above.shape) | met
+        count = int(dr.count(wet)[0])
+        if count in (0, PROBE_RAYS):
+            return float(dr.mean(length)[0])
+        return float(dr.sum(dr.select(wet, length, 0))[0]) / count
 
     def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
         """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""
@@ -234,6 +243,7 @@ class SurfaceHeights:
         x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
         y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
         assert scene.sea_heights is not None
+        lowest = scene.sea_heights[0]
         top = scene.sea_heights[1] + 1.0
         under_water = False
         if scene.parts:
@@ -245,6 +255,7 @@ class SurfaceHeights:
             if under_water or not solids:
                 scene = scene.with_parts_of(scene.solids if solids else scene.surfaces)
         start = opaque(top)
+        land = [solid for solid in scene.solids if solid.bbox().min.z < lowest < solid.bbox().max.z and solids]
 
         def look_down(
             ray: mi.Ray3f, found: mi.Vector4f, wet: mi.Bool, active: mi.Bool
@@ -253,6 +264,10 @@ class SurfaceHeights:
             active &= si.is_valid()
             at_sea = scene.is_surface(si.shape)
             wanted = wet & ~at_sea if solids else at_sea
+            if land:
+                # Where no solid is below the sea, one that begins in the air is its bed.
+                dry = active & ~wet & is_one_of(si.shape, land) & (found.x == _NO_BED)
+                found.x = dr.select(dry, si.p.z, found.x)
             passes = mi.Bool(False)
             if solids and scene.has_veils:
                 share = si.bsdf().eval_null_transmission(si, active & wanted)[0]

@@ -8,9 +8,6 @@ import xarray as xr
 from kernel_arrays import array
 from rows import each_row
 
-import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
-
 
 def load(**parameters):
     return mi.load_dict({"type": "seabed", **parameters})
@@ -153,7 +150,6 @@ def test_patches_have_their_reflectance_and_area():
             {"patches": "9 0 2 0.1", "refined_size": 20.0},
             r"patches: number 1 reaches 11 m from \(0, 0\), but must lie within",
         ),
-        ({"slope_x_deg": 20.0, "centre_x": 30.0}, "puts the bottom at z = 2.92 m in its middle, .* below the sea"),
     ],
 )
 def test_invalid_parameters_are_named(parameters, message):
@@ -161,17 +157,12 @@ def test_invalid_parameters_are_named(parameters, message):
         load(**parameters)
 
 
-@pytest.mark.slow
-def test_bottom_that_rises_through_the_sea_is_refused_only_where_the_receiver_looks(lidar_scene):
-    def render(depth):
-        seabed = {"type": "seabed", "id": "bottom", "depth": depth, "slope_x_deg": 15.0}
-        scene = lidar_scene(bottom=None, extra={"bottom": seabed})
-        return mitransient_lidar.render(scene, passes=2)
-
-    # At the mean sea level at x = 29.9 m, outside the field of view; then at x = 1.1 m.
-    assert float(render(8.0).impulse_response.sum()) > 0
-    with pytest.raises(UserError, match="rises through the sea surface where the receiver looks: a bottom must lie"):
-        render(0.3)
+def test_map_of_land_alone_is_told_unless_it_says_that_it_is(tmp_path, caplog):
+    np.save(tmp_path / "map.npy", np.array([[2.0, 3.0], [4.0, 5.0]]))
+    for given, told in (({}, 1), ({"map_values": "heights"}, 0), ({"map_values": "depths"}, 0), ({"depth": 3.0}, 0)):
+        caplog.clear()
+        load(filename=str(tmp_path / "map.npy"), map_size=1.0, **given)
+        assert caplog.text.count("is land alone, from 2 m above the sea on") == told
 
 
 def test_maps_with_coordinate_systems_are_read_again_and_again(tmp_path):

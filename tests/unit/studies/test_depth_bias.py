@@ -8,7 +8,7 @@ import xarray as xr
 from rows import each_row
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.errors import DryBottomError, UserError
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies import depth_bias as study
 from mitransient_lidar.studies.tpu import tpu
 
@@ -29,9 +29,9 @@ def rendered(monkeypatch):
 
     def render(scene, given, **options):
         depths.append(given["bottom_depth"])
-        if given["bottom_depth"] == 0.1:
-            raise DryBottomError("shape 'bottom' up to z = -0.1 m rises through the sea surface")
-        return xr.Dataset(coords={"pixel": ["single"]}, attrs={"depth": given["bottom_depth"], **geometry})
+        truth = np.full(3, np.nan if given["bottom_depth"] == 0.1 else given["bottom_depth"])
+        coords = {"pixel": ["single"], "true_bottom_depth_below_surface": ("shot", truth)}
+        return xr.Dataset(coords=coords, attrs={"depth": given["bottom_depth"], **geometry})
 
     def cell(recorded, estimators, corrections):
         found = float(0.2 < recorded.attrs["depth"] < 6)
