@@ -236,7 +236,6 @@ def replaced(old, new):
             replaced('<scene version="3.0.0">', '<scene version="3.0.0"><bsdf type="diffuse" id="receiver"/>'),
             "duplicate",
         ),
-        (replaced('<default name="bottom_depth" value="8"/>', '<default name="bottom_depth" value="0"/>'), "z = 0 m"),
         (lambda text: "", "not well-formed XML"),
         (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
         (
