@@ -54,7 +54,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     passes = {"lidar_merging": 16, "lidar_volpath": 24}[integrator]
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
-    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [])
+    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, None, [])
     lengths = np.array([0.11, 0.07])
     poses = ShotPoses.of_receiver(renderer.scene, stacked(given)).delayed(lengths)
     np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)
@@ -98,7 +98,7 @@ def test_poses_over_a_plume_give_what_single_shots_do():
     given = [looking(*shot) for shot in shots]
     renderer = prepared("ship_wake", params, None)
     share = 2**12 / renderer.paths
-    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [])
+    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, None, [])
     assert batches.size == 1
     poses, axis = ShotPoses.of_receiver(renderer.scene, stacked(given)), renderer.scene.axis
     later = poses.extra_range(renderer.scene) / 0.299792458
@@ -120,7 +120,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
     params = {"wind_speed": 6, "bottom_depth": depth, "bottom_slope_deg": slope}
     renderer = prepared("docs/guide/survey_lidar.xml", params, "lidar_merging")
     places, copies, points = PLACES[:2], 3, 1000
-    batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, [])
+    batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, None, [])
     heights, region = batches.at(ShotPoses(places))(copies).layout.cells.heights, renderer.layout.patches.region
     highest, lowest = renderer.scene.empty_heights
     assert (highest < lowest) == (slope == 0)
