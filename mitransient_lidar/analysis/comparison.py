@@ -10,6 +10,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.results.gate_stack import check_stack
 from mitransient_lidar.results.sum_errors import SumErrors
 
 BoolArray = npt.NDArray[np.bool_]
@@ -72,8 +73,31 @@ class Comparison:
         return self.largest <= self.limit
 
 
+def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return two results with time bins; where one has gates alone, those of both as bins at their middles.
+
+    Raises
+    ------
+    UserError
+        If one has gates alone and the other has none.
+    """
+    results = first, second
+    if all("impulse_response" in one for one in results):
+        return results
+    names = {f"gate_energy{end}": f"impulse_response{end}" for end in ("", "_stderr")}
+    found = []
+    for stack in map(check_stack, results):
+        bins = stack.rename(names).assign_coords(time=stack["gate_start"] + 0.5 * stack["gate_width"])
+        power = {f"waveform{end}": bins[f"impulse_response{end}"] for end in ("", "_stderr")}
+        found.append(bins.assign(power).swap_dims(gate="time").transpose(..., "time"))
+    return found[0], found[1]
+
+
 def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     """Compare the impulse responses of two results with the same pixels and time bins, bin by bin.
+
+    Results of gates alone are compared gate by gate. Errors of a pixel's gates, which may overlap, count in the error
+    of the energy as if they had one sign.
 
     Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
 
@@ -82,7 +106,7 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     UserError
         If pixels or bins differ, or no bin is included.
     """
-    results = first, second
+    results = as_bins(first, second)
     times = [result["time"].values for result in results]
     shapes = [_by_pixel(result, "impulse_response").shape for result in results]
     if shapes[0] != shapes[1] or not np.allclose(times[0], times[1]):
@@ -124,6 +148,8 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     spread = float(np.sqrt(np.nansum(total))) / sums[0]
     if None not in own:
         spread = sums[1] / sums[0] * float(np.linalg.norm(np.array(own, dtype=np.float64)))
+    elif "gate" in results[0].coords:
+        spread = float(np.linalg.norm(np.nansum(np.sqrt(np.nan_to_num(total) * counted), axis=1))) / sums[0]
     return Comparison(z, sidak_limit(int(counted.sum())), sums[1] / sums[0], spread)
 
 

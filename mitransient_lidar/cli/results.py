@@ -114,7 +114,7 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
 
 def _compare(
     first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
-    second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and time bins.")],
+    second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and bins or gates.")],
     output: DrawingOnly = None,
 ) -> None:
     """Compare and draw two results."""
@@ -124,7 +124,8 @@ def _compare(
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
     check_figure(target)
-    datasets = results.dataset_of("FILE", first, "result"), results.dataset_of("OTHER", second, "result")
+    given = (results.dataset_of(name, one, "result", "gates") for name, one in (("FILE", first), ("OTHER", second)))
+    datasets = comparison.as_bins(*given)
     outcome = comparison.compare(*datasets)
     with announced():
         plot_comparison(*datasets, outcome, target)

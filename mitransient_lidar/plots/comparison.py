@@ -42,7 +42,8 @@ def plot_comparison(
     upper.set_yscale("log")
     upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
     upper.set_xlim(drawing.time_limits(first))
-    upper.set_ylabel("received power (W)" if are_few else "received power, all pixels (W)")
+    quantity, unit = ("energy in the gate", "J") if "gate" in first.coords else ("received power", "W")
+    upper.set_ylabel(f"{quantity}{'' if are_few else ', all pixels'} ({unit})")
     upper.legend(frameon=False)
     if are_few:
         for z, colour in zip(outcome.z, palette, strict=True):

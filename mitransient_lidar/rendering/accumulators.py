@@ -23,6 +23,7 @@ from mitransient_lidar.rendering.accuracy import (
 )
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
+from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,12 +38,18 @@ logger = logging.getLogger(__name__)
 #: Memory of a bin [bytes] for the means and errors over the passes, of energy and power, and their computation.
 _BYTES_PER_KEPT_BIN = 96
 #: Memory of a bin when a pass is converted to gates, of a gate that is kept then, and of one that is summed directly.
-_BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE = 8, 64, 18
+_BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER_SMOOTHED_GATE = 8, 64, 18, 24
 #: Memory of a bin of a batch of passes: its sum, and the mean in the result.
 _BYTES_PER_BATCH = 16
 
 #: Pixels from which the error of a gate is estimated.
 _ERROR_PIXELS = 4096
+
+#: Smallest share of the paths in a pass of smoothed images: with fewer, most time is not that of paths.
+_LEAST_SHARE_OF_SMOOTH = 2**-3
+
+#: Noise in the estimated bias over that of the smoothed image, squared, for noise that pixels do not share.
+_NOISE_OF_BIAS = 1 / 6
 
 #: A pixel is lit in a gate with this share of the energy of the gate's brightest pixels (99th percentile).
 _LIT = 0.05
@@ -106,6 +113,8 @@ class PassAccumulator:
     kept
         Whether ``histograms`` are kept, ``gates`` are cut from the histogram of each pass, or ``direct``: accumulated
         in the pass.
+    smooth
+        Standard deviation by which the image of each gate is smoothed [pixels], or None.
     """
 
     def __init__(
@@ -118,8 +127,9 @@ class PassAccumulator:
         differences: Differences | None = None,
         batches: int = 0,
         kept: Literal["histograms", "gates", "direct"] = "histograms",
+        smooth: float | None = None,
     ) -> None:
-        self.scene, self.window, self.train, self._kept = scene, window, train, kept
+        self.scene, self.window, self.train, self._kept, self._smooth = scene, window, train, kept, smooth
         self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
         self._origins, self._parameters = list(origins), list(parameters)
         self._scores = sum(one.perturbation is not None for one in self._parameters)
@@ -160,13 +170,17 @@ class PassAccumulator:
     def add(self, histogram: TransientHistogram, gated: TransientHistogram | None = None) -> None:
         """Add the histogram of a pass, and that of its gates if they were accumulated beside it."""
         pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
+        if self._kept == "direct" and self._smooth:
+            self.gates.add(self._smoothed(histogram.energy().reshape(pixels, -1)))
+            return
         if self._kept == "direct":
             self.gates.add_parts((pixels, histogram.record_length), histogram.energy_of)
             return
         if self._kept == "gates":
             assert self._weights is not None
             # The sums of one pass in 32 bits, those over the passes in 64.
-            self.gates.add((histogram.rounded_energy().reshape(pixels, -1) @ self._weights).astype(np.float64))
+            energy = (histogram.rounded_energy().reshape(pixels, -1) @ self._weights).astype(np.float64)
+            self.gates.add(self._smoothed(energy) if self._smooth else energy)
             return
         perturbed = None
         if self._scores:
@@ -186,6 +200,28 @@ class PassAccumulator:
             self.gates.add(gated.energy().reshape(pixels, classes, -1).sum(axis=1))
         elif self._weights is not None:
             self.gates.add(energy @ self._weights)
+
+    def _smoothed(self, energy: FloatArray) -> FloatArray:
+        """Return energies of shape (pixels, gates) after the smoothing of each gate's image, which keeps their sum."""
+        from scipy.ndimage import gaussian_filter
+
+        grid = self.scene.receiver.pixels.grid
+        assert grid is not None
+        smoothed = gaussian_filter(energy.reshape(*grid, -1), self._smooth, axes=(0, 1))
+        return np.asarray(smoothed.reshape(energy.shape))
+
+    def _smoothing_bias(self) -> FloatArray:
+        """Return the relative bias of each gate by smoothing, rms over its lit pixels, shape (gates,); NaN if unknown.
+
+        A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise
+        is subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
+        """
+        energy, stderr = self.gates.mean, self.gates.stderr
+        change = self._smoothed(energy) - energy
+        lit = energy > _LIT * np.nanpercentile(energy, 99, axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            square = np.sum((change**2 - _NOISE_OF_BIAS * stderr**2) / energy**2, axis=0, where=lit) / lit.sum(axis=0)
+        return np.asarray(np.sqrt(np.maximum(square, 0)))
 
     def require_light(self, passes: int) -> None:
         """Raise UserError if the record of all passes is empty; values that are not finite count as light."""
@@ -263,7 +299,10 @@ class PassAccumulator:
         mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
         if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
             logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
-        return build_gates(mean, stderr, self.train, coords=coords, attributes=attributes)
+        stack = build_gates(mean, stderr, self.train, coords=coords, attributes=attributes)
+        # A coordinate, which all files hold.
+        bias = {"gate_smoothing_bias": ("gate", self._smoothing_bias())} if self._smooth else {}
+        return label(stack.assign_coords(bias))
 
     def _joined(self, of_paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> list[FloatArray]:
         """Return arrays of the parameters with scores and of the others in the order of the parameters."""
@@ -287,17 +326,19 @@ def choose_accumulator(
     parameters: Sequence[Parameter] = (),
     differences: Differences | None = None,
     batches: int = 0,
+    smooth: float | None = None,
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
     Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
     `origins`, and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of
-    passes is kept, too.
+    passes is kept, too. Images of gates are smoothed by a standard deviation [pixels], and then only they are kept.
 
     Raises
     ------
     UserError
-        If a histogram without gates or a single gate exceeds the memory, or gates by depth have no surface.
+        If images without rows, columns or gates would be smoothed, a histogram without gates or a single gate exceeds
+        the memory, or gates by depth have no surface.
     """
     from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
@@ -308,7 +349,9 @@ def choose_accumulator(
     train = placed_gates(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
-    if everything <= limit:
+    if smooth and (train is None or scene.receiver.pixels.grid is None):
+        raise UserError(f"smooth = {smooth:g} pixels needs gates in the film, and a layout of rows and columns")
+    if everything <= limit and not smooth:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
         chosen = PassAccumulator(scene, window, train, origins, parameters, differences, batches)
         chosen.size = everything
@@ -327,11 +370,12 @@ def choose_accumulator(
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; {cure}")
     is_narrow = train.width_ns < scene.axis.bin_width_ns
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
-        logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
-        chosen = PassAccumulator(scene, window, train, kept="gates")
+        if not smooth:
+            logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
+        chosen = PassAccumulator(scene, window, train, kept="gates", smooth=smooth)
         chosen.size = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates
         return chosen
-    each = (per_bin + _BYTES_PER_DIRECT_GATE) * pixels
+    each = (per_bin + _BYTES_PER_DIRECT_GATE + (_BYTES_PER_SMOOTHED_GATE if smooth else 0)) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
         room = f"room for {fitting} of them" if fitting else "less than one gate needs"
@@ -339,10 +383,16 @@ def choose_accumulator(
             f"max_memory = {max_memory:g} GB is {room}: {train.count} gates of {pixels} pixels take "
             f"{1e-9 * each * train.count:.2g} GB, so allow that much, or fewer gates or pixels"
         )
-    logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
-    chosen = PassAccumulator(scene, window, train, kept="direct")
+    if not smooth:
+        logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
+    chosen = PassAccumulator(scene, window, train, kept="direct", smooth=smooth)
     chosen.size = each * train.count
     return chosen
+
+
+def share_of_pass(smooth: float) -> float:
+    """Return the share of the paths in a pass of images smoothed by a number of pixels: about as many are averaged."""
+    return float(np.clip(2.0 ** -np.round(np.log2(4 * np.pi * smooth**2)), _LEAST_SHARE_OF_SMOOTH, 1))
 
 
 def placed_gates(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:

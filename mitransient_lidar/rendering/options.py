@@ -53,6 +53,14 @@ Batches = Annotated[
         *(2, 256),
     ),
 ]
+Smooth = Annotated[
+    float | None,
+    Option(
+        "Smooth the images of gates by a Gaussian of this standard deviation [pixels]: less noise, and a bias, which "
+        "results state; only gates are kept",
+        *(0.2, 20),
+    ),
+]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
 
 #: Options that results keep, and the attributes that hold them.
@@ -79,6 +87,7 @@ class RenderOptions:
     components: Components = None
     derivatives: Derivatives = None
     batches: Batches = None
+    smooth: Smooth = None
     variant: Variant = None
 
     def __post_init__(self) -> None:
@@ -90,4 +99,8 @@ class RenderOptions:
         if self.target_quantile is not None and self.target_error is None and (self.passes or self.max_time):
             raise UserError(
                 f"target_quantile = {self.target_quantile:g} needs a target_error: the error that it must reach"
+            )
+        if self.smooth is not None and (self.components or self.derivatives or self.batches):
+            raise UserError(
+                f"smooth = {self.smooth:g} keeps gates alone: leave out components, derivatives and batches"
             )

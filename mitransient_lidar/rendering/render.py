@@ -11,7 +11,7 @@ from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Se
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
-from mitransient_lidar.rendering.accumulators import choose_accumulator
+from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import (
     DEFAULT_MAX_MEMORY_GB,
@@ -23,6 +23,7 @@ from mitransient_lidar.rendering.options import (
     Passes,
     RenderOptions,
     SignedSeed,
+    Smooth,
     TargetError,
     TargetQuantile,
     Variant,
@@ -61,6 +62,7 @@ def render(
     components: Components = None,
     derivatives: Derivatives = None,
     batches: Batches = None,
+    smooth: Smooth = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,
     **others: Any,
@@ -116,6 +118,11 @@ def render(
     batches
         Number of batches of passes whose waveforms are kept, 2 to 256; none by default. They show how errors of
         different bins are correlated, as a fit to the result needs to state its own errors.
+    smooth
+        Standard deviation of a Gaussian by which the image of each gate is smoothed in each pass, 0.2 to 20 pixels;
+        none by default. Standard errors are those of the smoothed images. Only gates are kept, and passes have fewer
+        paths by default. The coordinate ``gate_smoothing_bias`` estimates what smoothing
+        changes.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. What was active
         before is active afterwards.
@@ -234,12 +241,13 @@ def _render(
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
     accumulator = choose_accumulator(
-        lidar, window, surface, max_memory, origins, parameters, differences, options.batches or 0
+        lidar, window, surface, max_memory, origins, parameters, differences, options.batches or 0, options.smooth
     )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
-    fitted = renderer if share == 1 else renderer.scaled(share)
+    full = renderer.for_smoothing(share_of_pass(options.smooth)) if options.smooth else renderer
+    fitted = full if share == 1 else full.scaled(share)
     if lidar.receiver.is_imager:
         logger.info("%s", describe_cost(fitted, accumulator.size, float(window.start_ns.min())))
 
@@ -248,7 +256,7 @@ def _render(
         gates, beside, first = accumulator.gate_weights, accumulator.gates_beside, None
         if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
-            fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
+            fitted, share, first = fit_to_time(full, goal.max_time, start_ns, seed=seed, gates=gates)
         received = None if beside else first
         received = received or fitted.render_pass(seed, gates=gates, beside=beside)
         accumulator.add(received.histogram, received.gated)
@@ -284,6 +292,7 @@ def _render(
         components=int(components),
         **({"derivatives": [one.name for one in parameters]} if parameters else {}),
         **({"batches": options.batches} if options.batches else {}),
+        **({"smooth_pixels": options.smooth} if options.smooth else {}),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

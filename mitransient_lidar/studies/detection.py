@@ -6,6 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import xarray as xr
 from mitransient_lidar.analysis.detection import images, trials
 from mitransient_lidar.analysis.detection.images import ImageTrial
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
+from mitransient_lidar.analysis.gates.recording import jittered_beside
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
@@ -50,7 +52,7 @@ _LOG = logging.getLogger(__name__)
 _FRAMES, _SHOWN_FRAMES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000), 8
 
 _MOST_ADJOINING = 6  # gates that are tried as one wide gate
-_BYTES_PER_GATE = 32  # memory of the light of a pixel in a gate of a render, with and without the target
+_BYTES_PER_GATE = 48  # memory of the light of a pixel in a gate of a render, with and without the target
 
 
 @checked
@@ -274,8 +276,12 @@ def _image_trial(
     require_memory(
         f"gates of {len(renders)} renders", _BYTES_PER_GATE * len(renders) * size, "take fewer or smaller ones"
     )
-    light = np.moveaxis(np.stack([one["gate_light"].values for one in renders]), 1, 0)
-    return ImageTrial(light, seas, camera, float(shape.open_time(shape.span_ns[1])), lidar.gates.train.pulses, sky)
+    light, train = np.moveaxis(np.stack([one["gate_light"].values for one in renders]), 1, 0), lidar.gates.train
+    jitter = math.hypot(camera.gate_jitter_ns, shape.jitter_ns)
+    longest = max(lidar.transmitter.pulse.fwhm_ns, shape.rise_ns, shape.fall_ns)
+    mean, slope = jittered_beside(light, jitter, shape.jitter_ns, train.step_ns, longest)
+    opened = float(shape.open_time(shape.span_ns[1]))
+    return ImageTrial(mean, seas, replace(camera, gate_jitter_ns=jitter), opened, train.pulses, sky, slope)
 
 
 def _in_images(

@@ -7,6 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.gates import transmission
+from scipy.ndimage import gaussian_filter
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis.gates import cut as gating
@@ -182,3 +184,28 @@ def test_gates_that_cannot_be(lidar_scene, film, gigabytes, words):
 def test_parameters_of_gates_out_of_range(film, words):
     with pytest.raises(Exception, match=words):
         mi.load_dict({"type": "time_gated_film", **GATES, **film})
+
+
+@pytest.mark.slow
+def test_smoothed_images_are_those_of_other_passes_smoothed(lidar_scene):
+    """Against eight renders that are smoothed afterwards, within the errors that smoothed passes state."""
+    scene = gated(lidar_scene, film={"gate_count": 8, "gate_step_ns": 10.0}, rx={"layout": "64x64"})
+    others = [mitransient_lidar.render(scene, passes=2, seed=seed) for seed in range(11, 19)]
+    images = np.array([gaussian_filter(one["gate_energy"].values, 2.0, axes=(0, 1)) for one in others])
+    mean, error = images.mean(axis=0), images.std(axis=0, ddof=1) / np.sqrt(8)
+    for gigabytes in (2.0, 1e-9 * 62 * 64 * 64 * 8 * 1.01):
+        result = render(scene, gigabytes, passes=16, smooth=2.0)
+        assert "waveform" not in result
+        assert result.attrs["smooth_pixels"] == 2.0
+        assert (result["gate_smoothing_bias"] < 0.2).any()
+        # Pixels that share little of their light.
+        lit = (mean > 0.05 * mean.max(axis=(0, 1)))[::8, ::8]
+        own, total = (values[::8, ::8][lit] for values in (result["gate_energy_stderr"].values, mean))
+        z = ((result["gate_energy"].values - mean)[::8, ::8][lit]) / np.hypot(error[::8, ::8][lit], own)
+        assert np.abs(z).max() < largest_z(8, z.size)
+        assert np.sqrt(np.mean(z**2)) < 1.5
+        assert np.median(own / total) < 0.1
+    with pytest.raises(UserError, match=r"smooth = 2 pixels needs gates in the film, and a layout of rows"):
+        render(lidar_scene(), smooth=2.0)
+    with pytest.raises(UserError, match="smooth = 2 keeps gates alone: leave out components"):
+        render(scene, smooth=2.0, batches=4)

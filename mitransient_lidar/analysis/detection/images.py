@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -140,8 +140,15 @@ class ImageTrial:
         Pulses of a frame.
     sky : float
         Power of the daylight on each pixel [W].
+    slope : ndarray, optional
+        Derivative of the light with the time of the gates [J/ns], for the camera's jitter, which is one for all pixels
+        of a gate's frame; without it, the jitter has no effect.
     target_share : float
         Share of the noise with the target in the covariance D that the filters are for, 0 to 1.
+
+    Notes
+    -----
+    The camera's fixed pattern is known to the filters, as of a camera that was calibrated.
     """
 
     light: FloatArray
@@ -150,6 +157,7 @@ class ImageTrial:
     open_ns: float
     pulses: int
     sky: float
+    slope: FloatArray | None = None
     target_share: float = 0.5
 
     def tuned(self, frames: int, pfa: float) -> ImageTrial:
@@ -169,25 +177,37 @@ class ImageTrial:
     def widened(self, count: int, apart: int) -> ImageTrial:
         """Return the trial with gates that are sums of `count` gates, each `apart` steps after the former."""
         last = self.light.shape[-1] - (count - 1) * apart
-        light = sum(self.light[..., number * apart : number * apart + last] for number in range(count))
-        return replace(self, light=np.asarray(light), open_ns=count * self.open_ns)
+
+        def sums(light: FloatArray) -> FloatArray:
+            return sum((light[..., number * apart :][..., :last] for number in range(count)), np.zeros(()))
+
+        slope = None if self.slope is None else sums(self.slope)
+        return replace(self, light=sums(self.light), slope=slope, open_ns=count * self.open_ns)
+
+    @cached_property
+    def _known(self) -> dict[str, Any]:
+        """What the camera's functions need besides the light."""
+        pattern = self.camera.pattern(self.light.shape[3:-1])
+        return {"open_ns": self.open_ns, "background": self.sky, "pulses": self.pulses, "pattern": pattern}
 
     def images(self) -> Iterator[GateImages]:
         """Return what the camera records in each gate."""
-        given = self.open_ns, self.sky, self.pulses
-        for light in np.moveaxis(self.light, -1, 0):
-            energy = np.moveaxis(light.reshape(-1, *light.shape[3:]), 0, -1).astype(np.float64)
-            target, null = np.split(self.camera.expected(energy, *given).mean, 2, axis=-1)
+        camera, known = self.camera, self._known
+        for gate in range(self.light.shape[-1]):
+            energy = _by_render(self.light[..., gate])
+            target, null = np.split(camera.expected(energy, **known).mean, 2, axis=-1)
             vectors = np.concatenate([target - null, null], axis=-1)
-            # Without the target first.
-            mean = np.stack([part.mean(axis=-1) for part in np.split(energy, 2, axis=-1)[::-1]], axis=-1)
-            noise, expected = self.camera.noise(mean, *given), self.camera.expected(mean, *given)
+            mean = _without_and_with(energy)
+            slope = None if self.slope is None else _without_and_with(_by_render(self.slope[..., gate]))
+            noise, expected = camera.noise(mean, slope=slope, **known), camera.expected(mean, **known)
             # Where pixels do not share noise, saturation reduces it.
             own = noise.own if noise.shared.any() else expected.variance
-            noises = [Noise(noise.shared[..., [which]], own[..., [which]]) for which in (0, 1)]
+            parts = noise._replace(own=own)
+            noises = [Noise(*(part[..., [which]] for part in parts)) for which in (0, 1)]
+            expected = expected._replace(variance=expected.variance + noise.shift**2)
             filters = self._filters(vectors, noises)
             weights = filters @ _template(self.light.shape[1], range(self.light.shape[1]))
-            thirds = self.camera.third_cumulant(np.stack([weights, weights], axis=-1), mean, *given)
+            thirds = camera.third_cumulant(np.stack([weights, weights], axis=-1), mean, **known)
             yield GateImages(vectors, filters, noises, thirds, expected)
 
     def _filters(self, vectors: FloatArray, noises: Sequence[Noise]) -> FloatArray:
@@ -197,7 +217,7 @@ class ImageTrial:
         diagonal = mean.own + mean.shared
         inverse = _ratio(np.ones_like(diagonal), diagonal)
         found = vectors * inverse
-        if not mean.shared.any():
+        if not mean.shared.any() and not mean.shift.any():
             return found
         pixels = tuple(range(vectors.ndim - 1))
         rest = vectors - self._correlated(mean, found)
@@ -215,7 +235,8 @@ class ImageTrial:
 
     def _correlated(self, noise: Noise, values: FloatArray) -> FloatArray:
         """Return the covariance of a noise times values, shape (*pixels, vectors)."""
-        found = noise.own * values
+        pixels = tuple(range(values.ndim - 1))
+        found: FloatArray = noise.own * values + noise.shift * np.sum(noise.shift * values, axis=pixels)
         return found + self.camera.spread(noise.shared * self.camera.spread(values)) if noise.shared.any() else found
 
     @cached_property
@@ -238,7 +259,8 @@ class ImageTrial:
         """
         renders = range(self.light.shape[1])
         coefficients, found = self.products.coefficients(frames, renders), []
-        dark = self.camera.expected(np.zeros((1, 1)), self.open_ns, 0.0, self.pulses).mean.item()
+        nothing = np.zeros((*self.light.shape[3:-1], 1))
+        dark = self.camera.expected(nothing, **{**self._known, "background": 0.0}).mean[..., 0]
         for one in self.images():
             values = one.vectors.reshape(*one.vectors.shape[:-1], 2, len(renders), 2).mean(axis=-1)
             difference, background = np.moveaxis(values.mean(axis=-1), -1, 0)
@@ -256,6 +278,16 @@ class ImageTrial:
             }
             found.append(gate)
         return {name: np.stack([gate[name] for gate in found], axis=-1) for name in found[0]}
+
+
+def _by_render(values: FloatArray) -> FloatArray:
+    """Return values of shape (with or without, render, half, *pixels) with all renders on the last axis."""
+    return np.moveaxis(values.reshape(-1, *values.shape[3:]), 0, -1).astype(np.float64)
+
+
+def _without_and_with(values: FloatArray) -> FloatArray:
+    """Return the means over renders of `_by_render` without and with the target, shape (*pixels, 2)."""
+    return np.stack([part.mean(axis=-1) for part in np.split(values, 2, axis=-1)[::-1]], axis=-1)
 
 
 def detected(products: FilterProducts, frames: Sequence[int], pfa: float, pd: float) -> Variables:

@@ -152,17 +152,49 @@ def _jittered(dataset: xr.Dataset, camera: Camera, energy: FloatArray) -> tuple[
             cut_gates(dataset.drop_dims("gate"), replace(train, start_ns=start + shift))["gate_energy"].values
             for shift in (-jitter, jitter)
         )
-    elif energy.shape[-1] > 1 and step <= longest:
-        apart = step
-        # Beyond the ends the energy is taken as a straight line.
-        first, last = (2 * energy[..., [end]] - energy[..., [beside]] for end, beside in ((0, 1), (-1, -2)))
-        before, after = np.concatenate([first, energy[..., :-1]], -1), np.concatenate([energy[..., 1:], last], -1)
     else:
+        return jittered_beside(energy, jitter, float(attributes.get("gate_jitter_ns", 0)), step, longest)
+    return _moments(energy, before, after, apart, jitter, float(attributes.get("gate_jitter_ns", 0)))
+
+
+def jittered_beside(
+    energy: FloatArray, jitter: float, included: float, step: float, longest: float
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return the mean energy of gates over a jitter, and its derivative with their time, from the gates beside each.
+
+    Without gates that follow within the longer of pulse and edges, it is left out with a warning.
+
+    Parameters
+    ----------
+    energy : ndarray
+        Energy in the gates, shape (..., gate) [J].
+    jitter, included : float
+        Standard deviation of the gates' time, and the part of it that the energy has already [ns].
+    step, longest : float
+        Time from gate to gate, and the longest one that tells the energy between them [ns].
+
+    Returns
+    -------
+    mean, slope : ndarray
+        In the shape of the energy, [J] and [J/ns]; no slope without jitter, or where it is left out.
+    """
+    if jitter == 0:
+        return energy, None
+    if energy.shape[-1] == 1 or step > longest:
         text = "the gate jitter of %g ns is left out: it needs waveforms, or gates that follow within %g ns"
         _LOG.warning(text, jitter, longest)
         return energy, None
-    variance = jitter**2 - float(attributes.get("gate_jitter_ns", 0)) ** 2
-    mean = energy + 0.5 * variance / apart**2 * (before + after - 2 * energy)
+    # Beyond the ends the energy is taken as a straight line.
+    first, last = (2 * energy[..., [end]] - energy[..., [beside]] for end, beside in ((0, 1), (-1, -2)))
+    before, after = np.concatenate([first, energy[..., :-1]], -1), np.concatenate([energy[..., 1:], last], -1)
+    return _moments(energy, before, after, step, jitter, included)
+
+
+def _moments(
+    energy: FloatArray, before: FloatArray, after: FloatArray, apart: float, jitter: float, included: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and derivative of the energy with the gates' time, from that of gates `apart` before and after."""
+    mean = energy + 0.5 * (jitter**2 - included**2) / apart**2 * (before + after - 2 * energy)
     return np.maximum(mean, 0), (after - before) / (2 * apart)
 
 

@@ -62,10 +62,14 @@ _ALIKE = Pattern(np.ones(1), np.zeros(1), np.ones(1))
 
 
 class Noise(NamedTuple):
-    """Parts of the noise: the covariance of pixels is B diag(shared) B + diag(own), with B of `Camera.spread`."""
+    """Parts of the noise: the covariance of pixels is B diag(shared) B + diag(own) + shift shift^T.
+
+    B is that of `Camera.spread`.
+    """
 
     shared: FloatArray  #: Variance of the events of a pixel that the intensifier spreads over its neighbours [DN^2].
     own: FloatArray  #: Variance of a pixel that others do not share [DN^2].
+    shift: FloatArray  #: Change of the mean by a frame's gate that opens one deviation of its jitter later [DN].
 
 
 @dataclass(frozen=True)
@@ -188,10 +192,7 @@ class Camera(Plan):
         events = self.events(energy, open_ns, background, pulses, pattern)
         mean, variance, third = self._charge(events, pulses, pattern)
         if slope is not None:
-            steep = self._signal_events(np.asarray(slope, np.float64), pattern) * self.gate_jitter_ns
-            if self.kind == "counting":
-                steep = steep * np.exp(-events / self._exposures(pulses))
-            variance = variance + (self.gain * self.spread(steep)) ** 2 / pulses
+            variance = variance + self._shift(slope, events, pulses, pattern) ** 2
         if self.kind == "counting":  # whose codes are counts, without rounding
             most = self._exposures(pulses)
             clipped = _clipped(mean, variance, third, self.top_dn if most > self.top_dn else np.inf, np.inf)
@@ -207,34 +208,54 @@ class Camera(Plan):
         return Expected(offset + clipped.mean / scale, clipped.variance / scale**2 + rest, clipped.saturation)
 
     def noise(
-        self, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1, pattern: Pattern = _ALIKE
+        self,
+        energy: Values,
+        open_ns: Values,
+        background: Values = 0.0,
+        pulses: int = 1,
+        pattern: Pattern = _ALIKE,
+        slope: Values | None = None,
     ) -> Noise:
-        """Return the parts of the noise without saturation and jitter; parameters are those of `events`."""
+        """Return the parts of the noise without saturation; parameters are those of `expected`."""
         events = self.events(energy, open_ns, background, pulses, pattern)
         variance = self._charge(events, pulses, pattern)[1] + self.read_noise**2
         shared = np.zeros_like(events)
         if self.intensifier_mtf < 1:
             shared = (self.gain**2 * self.excess_noise - self.gain) * events
             variance = variance - self.spread(shared, 2)
-        scale = self.electrons_per_dn**2
-        return Noise(shared / scale, variance / scale + (0 if self.kind == "counting" else 1 / 12))
+        scale = self.electrons_per_dn
+        shift = np.zeros_like(events) if slope is None else self._shift(slope, events, pulses, pattern) / scale
+        return Noise(shared / scale**2, variance / scale**2 + (0 if self.kind == "counting" else 1 / 12), shift)
+
+    def _shift(self, slope: Values, events: FloatArray, pulses: int, pattern: Pattern) -> FloatArray:
+        """Return the change of the mean charge with the time of a frame's gate, for one deviation [electrons]."""
+        steep = self._signal_events(np.asarray(slope, np.float64), pattern) * self.gate_jitter_ns / np.sqrt(pulses)
+        if self.kind == "counting":
+            steep = steep * np.exp(-events / self._exposures(pulses))
+        return self.gain * self.spread(steep)
 
     def third_cumulant(
-        self, weights: FloatArray, energy: Values, open_ns: Values, background: Values = 0.0, pulses: int = 1
+        self,
+        weights: FloatArray,
+        energy: Values,
+        open_ns: Values,
+        background: Values = 0.0,
+        pulses: int = 1,
+        pattern: Pattern = _ALIKE,
     ) -> FloatArray:
         """Return the third cumulant of the sum of the pixels times weights [1/DN] in each gate, without saturation.
 
         The weights have the shape of `energy`; the other parameters are those of `events`.
         """
-        events = self.events(energy, open_ns, background, pulses)
+        events = self.events(energy, open_ns, background, pulses, pattern)
         scaled, pixels = weights / self.electrons_per_dn, tuple(range(events.ndim - 1))
         if self.intensifier_mtf == 1:
-            return np.asarray(np.sum(self._charge(events, pulses, _ALIKE)[2] * scaled**3, axis=pixels))
+            return np.asarray(np.sum(self._charge(events, pulses, pattern)[2] * scaled**3, axis=pixels))
         # The electrons of an event, whose number is gamma-distributed, meet the weights of the pixels at random.
         once, twice, thrice = (self.spread(scaled**power) for power in (1, 2, 3))
         noise = self.excess_noise - 1 / self.gain
         triples = self.gain**3 * noise * (2 * noise - 1) * once**3 + 3 * self.gain**2 * noise * once * twice
-        found = events * (triples + self.gain * thrice) + self._dark(_ALIKE) * scaled**3
+        found = events * (triples + self.gain * thrice) + self._dark(pattern) * scaled**3
         return np.asarray(np.sum(found, axis=pixels))
 
     def spread(self, values: Values, power: int = 1) -> FloatArray:

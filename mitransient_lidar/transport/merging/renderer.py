@@ -94,6 +94,12 @@ class MergingRenderer(PassRenderer):
         paths, photons = (max(round(share * count), 1) for count in (self.paths, self.photons))
         return changed(self, paths=paths, photons=photons)
 
+    def for_smoothing(self, share: float) -> MergingRenderer:
+        """Return a renderer for smoothed images; the light, which many pixels share, keeps more of its paths."""
+        return changed(
+            self, paths=max(round(share * self.paths), 1), photons=max(round(np.cbrt(share) * self.photons), 1)
+        )
+
     def for_differences(self) -> MergingRenderer:
         """Return a renderer with wider cells, between which less light moves."""
         return changed(self, layout=self.layout.coarse())

@@ -112,6 +112,10 @@ class PassRenderer(ABC):
         """Return a renderer of passes with a share of the paths."""
         return changed(self, paths=max(round(share * self.paths), 1))
 
+    def for_smoothing(self, share: float) -> PassRenderer:
+        """Return a renderer of images that are smoothed over pixels, with a share of the receiver's paths."""
+        return self.scaled(share)
+
     def for_differences(self) -> PassRenderer:
         """Return a renderer on which differences of scenes have less noise, by default this one."""
         return self

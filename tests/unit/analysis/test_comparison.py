@@ -8,7 +8,9 @@ from significance import FALSE_ALARM, largest_z
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis import comparison
+from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.sum_errors import with_correlation
 
@@ -115,3 +117,23 @@ def test_command_draws_and_answers(tmp_path):
     wrong = run("compare", tmp_path / "a.nc", tmp_path / "b.nc", "-o", tmp_path / "d.txt")
     assert wrong.exit_code == 2
     assert not (tmp_path / "d.txt").exists()
+
+
+def test_gates_alone_are_compared(tmp_path):
+    """The same pixels and gates of other passes agree, and 3 % more light does not; with bins beside, too."""
+
+    def gates(seed, factor=1.0):
+        bins = result(seed, 64, factor, 0.02)
+        train = GateTrain.measured(GateShape.edges(10.0), 5.0, 10.0, 9, 1)
+        return cut_gates(bins, train), bins
+
+    (first, bins), (second, _), (brighter, _) = gates(1), gates(2), gates(3, 1.03)
+    assert comparison.compare(first, second).agrees
+    assert comparison.compare(first, brighter).energy_ratio == pytest.approx(1.03, abs=0.005)
+    assert not comparison.compare(first.merge(bins, combine_attrs="override"), brighter).agrees
+    for name, one in (("a", first), ("b", second), ("c", brighter)):
+        results.save(one, tmp_path / f"{name}.nc")
+    assert "agree: 18 bins" in run("compare", tmp_path / "a.nc", tmp_path / "b.nc").stdout
+    assert run("compare", tmp_path / "a.nc", tmp_path / "c.nc").exit_code == 1
+    with pytest.raises(UserError, match="no variable gate_energy"):
+        comparison.compare(first, bins)

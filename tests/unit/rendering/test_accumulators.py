@@ -4,7 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import significance
 import xarray as xr
+from scipy.ndimage import gaussian_filter
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -89,3 +91,26 @@ def test_an_empty_record_is_an_error_and_dark_pixels_are_not(kept):
                 accumulator.require_light(8)
         else:
             accumulator.require_light(8)
+
+
+def test_the_bias_of_smoothing_is_estimated_in_spite_of_noise():
+    """A spot of 8 pixels and one of 16, with noise of 20 % in each pixel and pass: smoothing widens them."""
+    grid, smooth, passes = (96, 96), 1.5, 9
+    place = np.hypot(*np.mgrid[-48:48, -48:48])
+    image = np.stack([np.exp(-0.5 * (place / width) ** 2) for width in (8, 16)], axis=-1).reshape(-1, 2)
+    scene = SimpleNamespace(receiver=SimpleNamespace(pixels=SimpleNamespace(grid=grid, count=96 * 96)))
+    accumulator = PassAccumulator(scene, None, kept="direct", smooth=smooth)
+    random = np.random.default_rng(5 + significance.seed_shift)
+    for _ in range(passes):
+        noisy = image * random.normal(1, 0.2, image.shape)
+        accumulator.add(SimpleNamespace(record_length=2, energy=lambda noisy=noisy: noisy))
+    smoothed = gaussian_filter(image.reshape(*grid, 2), smooth, axes=(0, 1)).reshape(image.shape)
+    lit = smoothed > 0.05
+    true = np.sqrt([np.mean(((smoothed - image)[lit[:, k], k] / smoothed[lit[:, k], k]) ** 2) for k in (0, 1)])
+    assert true[0] > 3 * true[1]
+    # The next order in (1.5 / 8)^2; the noise of the estimate is ten times less.
+    np.testing.assert_allclose(accumulator._smoothing_bias(), true, rtol=0.12)
+    # Smoothing keeps all light, and the noise falls by 2 sqrt(pi) sigma.
+    assert accumulator.gates.mean.sum() == pytest.approx(image.sum(), rel=1e-2)
+    ratio = np.sqrt(np.mean((accumulator.gates.stderr[lit] / smoothed[lit]) ** 2) * passes) / 0.2
+    assert ratio * 2 * np.sqrt(np.pi) * smooth == pytest.approx(1, rel=0.1)

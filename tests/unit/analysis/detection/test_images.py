@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import significance
 from scipy.special import ndtr, ndtri
 from scipy.stats import norm, skew
 from significance import largest_z
 
 from mitransient_lidar.analysis.detection.images import ImageTrial, detected, single_gates
+from mitransient_lidar.analysis.gates.recording import jittered_beside
 from mitransient_lidar.physics.receiver.camera import Camera
 
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # [J]
@@ -82,6 +84,36 @@ def test_predicted_probabilities_are_the_rates_of_drawn_images(kind, seas):
     for rate, chance in zip(found, (pfa, float(expected.detection(pfa))), strict=True):
         assert abs(rate - chance) < 0.003 + largest_z(count) * np.sqrt(chance * (1 - chance) / count), (rate, chance)
     assert 0.3 < expected.detection(pfa) < 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_jitter_and_fixed_pattern_are_in_the_prediction(kind):
+    """Frames whose gates open 0.4 ns early or late, and pixels that differ by 20 %, with the same filters.
+
+    The filter that knows of the jitter avoids it; behind one that does not, frames deviate more than it states.
+    """
+    camera, level = CAMERAS[kind]
+    more = {} if kind == "counting" else {"offset_spread_dn": 5.0}
+    camera = replace(camera, gate_jitter_ns=6.0, response_spread=0.2, hot_pixels=0.02, hot_factor=20.0, **more)
+    mean, slope = jittered_beside(light(3 * level, 3, echo=0.06, shadow=0.08), 6.0, 6.0, 2.0, 8.0)
+    own, count, pfa = ImageTrial(mean, False, camera, 5.0, PULSES, 0.0, slope), 2000, 0.05
+    expected, maps = own.products.statistic(1), own.maps(1)
+    known = {"background": 0.0, "pulses": PULSES, "pattern": camera.pattern((SIZE, SIZE))}
+    deviations, rates = [], []
+    for which in (1, 0):
+        given = mean[which, 0, 0], 5.0, count, (which, 5 + significance.seed_shift)
+        drawn = camera.sample(*given, slope=slope[which, 0, 0], **known).signal
+        blind = replace(own, slope=None).maps(1)["filter_weight"]
+        values = [np.tensordot(drawn - maps["background"], one, 3) for one in (maps["filter_weight"], blind)]
+        rates.append(np.mean(values[0] > expected.threshold(pfa)))
+        deviations.append([one.std(ddof=1) for one in values])
+    stated = np.array([expected.null_sd, expected.target_sd])
+    error = largest_z(count, 4) / np.sqrt(2 * count)
+    np.testing.assert_allclose(np.array(deviations)[:, 0] / stated, 1, atol=error)
+    assert deviations[0][1] > (1 + error) * replace(own, slope=None).products.statistic(1).null_sd
+    for rate, chance in zip(rates, (pfa, float(expected.detection(pfa))), strict=True):
+        assert abs(rate - chance) < 0.003 + largest_z(count) * np.sqrt(chance * (1 - chance) / count), (rate, chance)
 
 
 def test_deflection_in_closed_form_grows_with_the_root_of_the_frames():
