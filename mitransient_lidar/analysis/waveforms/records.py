@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
+from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
-from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE
+from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -28,8 +30,12 @@ from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
 _LATEST = 3.0  # widths of an echo by which the surface may be late
-_LOWEST = -3.0  # point of a sea without the attribute surface_heights_m [m]
+_UNKNOWN_SEA = -3.0, 3.0  # lowest and highest point of a sea without the attribute surface_heights_m [m]
 _UNKNOWN = 10.0  # noise of samples that are not stored, over the threshold of blocks
+_LAND = 30.0  # height of an echo before the sea's, in typical deviations of samples or heights of single events
+_TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
+_BLUR = 1.0  # largest standard deviation of an echo's blur, in echo widths
+_CLEAREST = 1e-3  # backscattering coefficient of the clearest sea water at 532 nm, that of its molecules [1/m]
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
@@ -63,8 +69,11 @@ class Waveforms:
         Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
     event_height
         Height that single events of the detector reach, shape (pixels,).
-    lowest_m
-        Lowest point of the sea [m], negative; that of a rough sea where it is not known.
+    lowest_m, highest_m
+        Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
+    sensitivity, column_gain
+        Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
+        backscattering coefficient [W m], 0 and NaN where they are not known.
     shared
         Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
     """
@@ -89,6 +98,9 @@ class Waveforms:
     lines: LinesOfSight
     event_height: FloatArray
     lowest_m: float
+    highest_m: float
+    sensitivity: FloatArray
+    column_gain: float
     shared: BlockCorrelation | None = None
 
     @property
@@ -139,7 +151,9 @@ class Waveforms:
         if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
             quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
-        quiet = time < quiet_until
+        events = _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels)
+        whole = name == "signal" and not in_blocks
+        quiet = time < (_before_land(samples, time, quiet_until, events, width) if whole else quiet_until)
         baseline = np.zeros(pixels)
         if in_blocks:
             baseline, _ = _block_levels(dataset, pixels)
@@ -174,10 +188,23 @@ class Waveforms:
             quiet_until,
             geometry,
             _lines_of_sight(dataset, dims[:-1]),
-            _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels),
-            float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _LOWEST))[0]),
+            events,
+            *(float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _UNKNOWN_SEA))[end]) for end in (0, -1)),
+            _sensitivity(dataset, name, pixels),
+            column_gain(dataset.attrs),
             shared,
         )
+
+    @property
+    def tail_ns(self) -> float:
+        """Time from the peak of a surface echo to where its tail has ended and the column begins [ns]."""
+        width, template = self.echo_fwhm_ns, self.template
+        return max(1.75 * width, template.tail_ns(_TAIL) + width - template.fwhm_ns)
+
+    @cached_property
+    def blurred_pulse(self) -> BlurredPulse:
+        """The ideal echo, blurred as by slopes."""
+        return BlurredPulse.of(self.template, _BLUR * self.echo_fwhm_ns)
 
     @property
     def brightest(self) -> float:
@@ -198,6 +225,19 @@ class Waveforms:
         margin = _LATEST * (self.echo_fwhm_ns + lines.surface_spread) + self.template.peak_ns + self.onset.brightest_ns
         dark = lines.beam_share < LEAST_SHARE * self.brightest
         return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
+
+    def surface_level(self, rows: slice) -> SurfaceLevel:
+        """Return the arrival of the mean sea level in some of the waveforms, with the waves about it."""
+        lines = self.lines_of(rows)
+        per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+        waves = (self.highest_m - self.lowest_m) / HEIGHTS
+        return SurfaceLevel(lines.surface_time, np.hypot(math.hypot(waves, LEVEL) * per_metre, lines.surface_spread))
+
+    def least_column(self, rows: slice) -> FloatArray:
+        """Return the signal of the column of the clearest water at the surface, 0 where it is not known."""
+        share = np.nan_to_num(self.lines_of(rows).beam_share)
+        pixel = np.arange(rows.start, rows.stop) % self.sensitivity.size
+        return np.asarray(share * self.sensitivity[pixel] * _CLEAREST * np.nan_to_num(self.column_gain))
 
     def events(self, rows: slice) -> FloatArray:
         """Return the heights that single events of the detector reach, shape (waveforms,)."""
@@ -230,6 +270,29 @@ def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:
     if "event_height" not in dataset or dataset["event_height"].size != pixels:
         return np.zeros(pixels)
     return np.nan_to_num(dataset["event_height"].values.reshape(-1).astype(np.float64))
+
+
+def _sensitivity(dataset: xr.Dataset, name: str, pixels: int) -> FloatArray:
+    """Return the signal per power of steady light, shape (pixels,); 0 where it is not known."""
+    if name == "waveform":
+        return np.ones(pixels)
+    if "receiver_sensitivity" not in dataset or dataset["receiver_sensitivity"].size != pixels:
+        return np.zeros(pixels)
+    return np.asarray(dataset["receiver_sensitivity"].values.reshape(-1), dtype=np.float64)
+
+
+def _before_land(
+    samples: npt.NDArray[Any], time: FloatArray, quiet_until: float, events: FloatArray, width: float
+) -> float:
+    """Return the end of the part of records that is without echoes of land, too [ns]."""
+    quiet = time < quiet_until
+    if np.count_nonzero(quiet) < _FEWEST_QUIET:
+        return quiet_until
+    rest = np.abs(samples[:, quiet] - np.nanmedian(samples[:, quiet]))
+    least = max(float(np.nanmedian(rest)), float(np.nanmean(rest)) / _LAND, float(events.max(initial=0.0)))
+    above = np.flatnonzero((rest > _LAND * least).any(axis=0))
+    before = time[above[0]] - 2 * width if above.size and least > 0 else quiet_until
+    return before if np.count_nonzero(time < before) >= _FEWEST_QUIET else quiet_until
 
 
 def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
