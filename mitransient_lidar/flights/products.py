@@ -157,7 +157,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     index = float(attributes["refractive_index"])
     down, of_group = -flown.values("axis_z"), np.cos(np.radians(angle))
     ratio = xr.DataArray(cos_in_water(-down, index) / cos_in_water(of_group, index), dims="shot")
-    ratio = xr.where(echoes["class"].isin([*IN_AIR]), xr.DataArray(down / of_group, dims="shot"), ratio)
+    ratio = ratio.where(~echoes["class"].isin([*IN_AIR]), xr.DataArray(down / of_group, dims="shot"))
     for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
         echoes[name] = (echoes[name] * ratio).transpose(*echoes[name].dims)
     return echoes

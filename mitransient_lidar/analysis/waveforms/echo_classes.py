@@ -234,7 +234,7 @@ def _decided(one: Decision, records: Records, shape: EchoShape, width: float) ->
 
 def _following(found: DetectedEchoes, last: int) -> IntArray:
     """Return the first bin of an echo behind the first one, `last` without any, shape (n,)."""
-    return np.where(found.bins[1:] > found.surface, found.bins[1:], last).min(axis=0)
+    return np.asarray(np.where(found.bins[1:] > found.surface, found.bins[1:], last).min(axis=0))
 
 
 def _is_weak(records: Records, bins: IntArray) -> BoolArray:

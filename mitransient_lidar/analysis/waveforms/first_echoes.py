@@ -18,6 +18,7 @@ from mitransient_lidar.core.validation import FloatArray
 SEPARATE = 1.8
 
 _DELAYS = 32  # delays of a bottom that are tried
+_SHORTEST_NS = 0.05  # delay of a bottom that is fitted [ns]
 _FARTHEST = 4.0  # standard deviations of the surface from its level to the longest delay
 _BEFORE, _BEHIND = 2.0, 3.0  # samples before the earliest surface and behind the peak, in echo widths
 _COLUMN_NS = 10.0  # of the column behind a surface that count [ns]
@@ -29,9 +30,10 @@ _LEAST_COLUMN = 1e-5  # of a column of unknown water, relative to the peak
 _LEVELS, _CLEAR = 64, 3.0  # tried levels of a column, and standard errors from which on its fit alone counts
 _SIGNIFICANT = 5.0  # standard errors of the height of a surface that is told apart
 _LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
-# Light that a bottom sends back to itself by total reflection at the surface: sine squared of the critical angle's
-# complement in water, directions that are summed, and the prior of the bottom's reflectance: mean, error, largest.
-_TOTAL, _DIRECTIONS, _REFLECTANCE = 0.56, 6, (0.2, 0.15, 0.6)
+# Light that a bottom sends back to itself by total reflection at the surface: times between which it counts, over those
+# of the depth, and their steps; and the prior of the bottom's reflectance: mean, error, largest.
+_AGAIN, _STEPS, _REFLECTANCE = (1.34, 12.0), 12, (0.2, 0.15, 0.6)
+_OF_FOCUSING, _FAINT = 0.3, 0.05  # error of a column by waves, relative to it, and where it counts, relative to the peak
 _FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the largest
 
 
@@ -57,10 +59,10 @@ class FirstEchoes:
 
     def part(self, rows: BoolArray) -> FirstEchoes:
         """Return those of some of the records."""
-        echoes = (
+        bottom, surface = (
             Echoes(**{name: value[rows] for name, value in vars(one).items()}) for one in (self.bottom, self.surface)
         )
-        return FirstEchoes(self.chance[:, rows], *echoes, self.surface_ns[rows], self.surface_stderr[rows])
+        return FirstEchoes(self.chance[:, rows], bottom, surface, self.surface_ns[rows], self.surface_stderr[rows])
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ def first_echoes(
     fit = _chosen(tried, best)
     free = fits.bottom(fit.values[:, 0], np.take_along_axis(delays, best[np.newaxis], axis=0)[0], start=fit.values)
     delay, error = free.values[:, 6], _error(free, 6)
-    distinct = free.good & (free.values[:, 3] > _SIGNIFICANT * _error(free, 3)) & (delay > 0) & (error > 0)
+    distinct = free.good & (free.values[:, 3] > _SIGNIFICANT * _error(free, 3)) & (delay > _SHORTEST_NS) & (error > 0)
     own_ns = arrival + free.values[:, 0]
     of_free = prior + _log_normal(own_ns - delay, level.time_ns, spread) - 0.5 * free.cost - _occam(free)
     of_free += np.log(np.sqrt(2 * np.pi) * np.where(distinct, error, 1.0))
@@ -230,7 +232,10 @@ class _Fits:
         span = -(float(longest.max()) / width + _BEFORE), _BEHIND + _COLUMN_NS / width
         data = Windows.of(records, bins, width, 0.0, span, shape)
         peak = data.peak()
-        error = np.hypot(_OF_SAMPLE * np.maximum(data.power, 0), _OF_PEAK * peak[:, np.newaxis])
+        # Focusing of a single shot differs from the mean.
+        faint = (data.power < _FAINT * peak[:, np.newaxis]) & (priors.onset.times.size > 1)
+        share = np.where(faint, _OF_FOCUSING, _OF_SAMPLE)
+        error = np.hypot(share * np.maximum(data.power, 0), _OF_PEAK * peak[:, np.newaxis])
         return cls(replace(data, noise=np.hypot(data.noise, error)), peak, pulse, longest, priors)
 
     def bottom(
@@ -241,10 +246,11 @@ class _Fits:
         half, blur = 0.5 * self.peak, np.full(time.shape, _FIRST_BLUR * self.pulse.variances[-1])
         mean, deviation, largest = _REFLECTANCE
         first = np.stack([time, blur, half, half * surface, 0.01 * half * surface, 0 * half + mean * surface], axis=1)
-        # Cosines squared of evenly distributed light beyond the critical angle.
-        further = 1 / np.sqrt(_TOTAL * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS)
         if start is not None:
             first = np.column_stack([start, delay])
+        edges = np.geomspace(*_AGAIN, _STEPS + 1)
+        density = -np.diff(edges**-2.0) / np.diff(edges)
+        rises = np.diff(density, prepend=0.0, append=0.0)
 
         def model(p: FloatArray, u: FloatArray, apart: FloatArray) -> tuple[FloatArray, FloatArray]:
             time, blur, height, top, column, again = (p[:, i : i + 1] for i in range(6))
@@ -260,11 +266,12 @@ class _Fits:
             by_delay = top * begins[1] + column * (fall * begins[0] / area + falls * inside)
             by_time = -height * slope - by_delay + column * fall * ends[0] / area
             second, falling, stretched = (np.zeros_like(echo) for _ in range(3))
-            for factor in further:
-                later = pulse.plain(u - time - factor * apart)
-                second += _TOTAL / _DIRECTIONS * later[0]
-                falling += _TOTAL / _DIRECTIONS * later[1]
-                stretched += _TOTAL / _DIRECTIONS * factor * later[1]
+            per_delay = 1 / np.maximum(apart, _SHORTEST_NS)
+            for edge, rise in zip(edges, rises, strict=True):
+                power, _, passed = pulse.plain(u - time - edge * apart)
+                second += rise * per_delay * passed
+                falling += rise * per_delay * power
+                stretched += rise * per_delay * (edge * power + passed * per_delay)
             by_time -= height * again * falling
             by_delay -= height * again * stretched
             parts = [by_time, height * by_blur, echo + again * second, begins[0], lit, height * second]
@@ -306,7 +313,7 @@ class _Fits:
         lowest[:, 0], highest[:, 0] = -self.longest - width, self.longest + width
         highest[:, 1] = self.pulse.variances[-1]
         if size > 6:
-            highest[:, 6] = self.longest
+            lowest[:, 6], highest[:, 6] = _SHORTEST_NS, self.longest
         unit = np.full(start.shape, width)
         unit[:, 1] = highest[:, 1]
         unit[:, 5:6] = 1.0
@@ -350,7 +357,7 @@ def _log_column(fit: WindowFits, least: FloatArray, peak: FloatArray) -> FloatAr
     # Where no level is within the error of a distinct one, the integral of its normal distribution.
     clear = (found > _CLEAR * error) & (found > low)
     sharp = np.log(np.sqrt(2 * np.pi) * error / np.where(clear, found, 1.0) / decades)
-    return np.where(clear, sharp, coarse)
+    return np.asarray(np.where(clear, sharp, coarse), dtype=np.float64)
 
 
 def _mean(weight: FloatArray, times: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:

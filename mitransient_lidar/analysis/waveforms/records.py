@@ -151,6 +151,7 @@ class Waveforms:
         if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
             quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
+        sea = np.atleast_1d(dataset.attrs.get("surface_heights_m", _UNKNOWN_SEA))
         events = _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels)
         whole = name == "signal" and not in_blocks
         quiet = time < (_before_land(samples, time, quiet_until, events, width) if whole else quiet_until)
@@ -189,7 +190,8 @@ class Waveforms:
             geometry,
             _lines_of_sight(dataset, dims[:-1]),
             events,
-            *(float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _UNKNOWN_SEA))[end]) for end in (0, -1)),
+            float(sea[0]),
+            float(sea[-1]),
             _sensitivity(dataset, name, pixels),
             column_gain(dataset.attrs),
             shared,
