@@ -34,7 +34,10 @@ _APART = 1.2  # least separation of two echoes of which the first one stands abo
 _WEAK, _FAR_APART = 15.0, 8.0  # height of a weak first echo over the noise, and farthest others behind it, in widths
 _SEA, _SURE = 1, 0.6  # place of the surface among the probabilities of first echoes, and its least one without a column
 _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and its farthest distance in echo widths
-_RETURNS = 2.0, 4.0  # delays of light that meets the bottom twice, over those of the bottom
+_RETURNS, _BRIGHTEST = (
+    (2.2, 3.2),
+    0.5,
+)  # its delays over those of the bottom, and its largest height times delay over width
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
 
@@ -135,7 +138,14 @@ def decide(
 
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
-    `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them.
+    `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
+    column needs a probability of 60 %.
+
+    Of 150 drawn records each (VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to five times
+    the bottom's echo, reflectances 0.05 to 0.4), all land from 0.2 to 4 m is land, and 99 % of the bottoms from 0.3 to
+    4 m are found, none as land; the root mean square of error over stated error of their depths is 0.85
+    (`tests/unit/analysis/waveforms/test_echo_classes.py`). Within 0.1 m of the level, land and water without an echo of
+    the surface are told apart by the level alone, with probabilities of about one half.
 
     Parameters
     ----------
@@ -180,11 +190,14 @@ def decide(
     )
     if over.size:
         found, above = _with_objects(found, over, search(over, records.time_of(found.surface[over]) + SEPARATE * width))
-    found = _without_second_return(records, found, _SECOND * apart)
+    at = np.rint((level.time_ns + waveforms.echo_shape.peak_ns - records.time_ns[0]) / records.bin_ns).astype(np.intp)
+    found = _without_second_return(records, found, at, apart)
     following = _following(found, last)
     distance = (following - found.surface) / apart
     near = (distance < SEPARATE) | ((distance < _FAR_APART) & _is_weak(records, found.surface))
-    near |= (distance < _SECOND) & _is_weak_behind(records, found.surface, following)
+    # A first echo below the surface's level may be the bottom, and the second one its light that met it twice.
+    second = (distance < _SECOND) | (deviation() > _FAR)
+    near |= second & (following < last) & _is_weak_behind(records, found.surface, following)
     tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)))
     at_level = np.abs(deviation()[tested]) < _FAR
     beyond = waveforms.tail_ns + _FAR_APART * width
@@ -243,27 +256,31 @@ def _is_weak(records: Records, bins: IntArray) -> BoolArray:
     return np.asarray(records.power[rows, at] < _WEAK * np.broadcast_to(records.noise, records.power.shape)[rows, at])
 
 
-def _is_weak_behind(records: Records, first: IntArray, second: IntArray) -> BoolArray:
-    """Return which second peaks are so weak that they may be light which has met the bottom twice."""
+def _is_weak_behind(
+    records: Records, first: IntArray, second: IntArray, most: FloatArray | float = _TWICE
+) -> BoolArray:
+    """Return which second peaks are so weak that they may be light which has met the bottom of the first one twice."""
     rows, last = np.arange(len(first)), records.time_ns.size - 1
     before, behind = (records.power[rows, np.clip(at, 0, last)] for at in (first, second))
-    return np.asarray(behind < _TWICE * before)
+    return np.asarray(behind < most * before)
 
 
-def _without_second_return(records: Records, found: DetectedEchoes, most: float) -> DetectedEchoes:
-    """Return echoes without bottoms that are the light of a target at most so many bins below the surface, met twice.
+def _without_second_return(records: Records, found: DetectedEchoes, level: IntArray, apart: float) -> DetectedEchoes:
+    """Return echoes without bottoms that are the light of a target which the surface has reflected, and so met twice.
 
-    Light that is totally reflected at the surface arrives from 2.34 times the depth on, and most of it before 4 times.
+    Light that is totally reflected arrives from 2.34 times the depth on, where it is brightest: per pulse width w and
+    delay d at most 0.8 rho w/d of the bottom's echo. Without an echo the surface is in the bins `level`.
     """
-    if len(found.bins) != 3:
-        return found
-    surface, target, bottom = found.bins
-    delay = target - surface
-    twice = (target >= 0) & (surface >= 0) & (bottom >= 0) & (delay < most) & _is_weak_behind(records, target, bottom)
-    twice &= (bottom - surface > _RETURNS[0] * delay) & (bottom - surface < _RETURNS[1] * delay)
     bins, flags = found.bins.copy(), found.flags.copy()
-    bins[2], flags[2] = np.where(twice, (target, flags[1]), (bottom, flags[2]))
-    bins[1], flags[1] = np.where(twice, -1, target), np.where(twice, int(EchoFlag.NO_ECHO), flags[1])
+    surface = np.where(bins[0] >= 0, bins[0], level)
+    for target in range(1, len(bins) - 1):
+        delay = bins[target] - surface
+        most = np.minimum(_TWICE, _BRIGHTEST * apart / np.maximum(delay, 1))
+        twice = (bins[target] >= 0) & (bins[-1] >= 0) & _is_weak_behind(records, bins[target], bins[-1], most)
+        twice &= (bins[-1] - surface > _RETURNS[0] * delay) & (bins[-1] - surface < _RETURNS[1] * delay)
+        for mine, none in ((bins, -1), (flags, int(EchoFlag.NO_ECHO))):
+            mine[-1] = np.where(twice, mine[target], mine[-1])
+            mine[target] = np.where(twice, none, mine[target])
     return DetectedEchoes(bins, flags)
 
 

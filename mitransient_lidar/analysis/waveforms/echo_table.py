@@ -116,10 +116,11 @@ def extract(
     xarray.Dataset
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
         ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
-        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
-        `echo_detection.EchoFlag`. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
+        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, ``class``, an
+        `echo_classes.EchoClass`, and ``flags``, sums of `echo_detection.EchoFlag`. Land is the echo ``bottom``, objects
+        above the water are targets, both timed in air, with negative depths. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
         ``_stderr`` and ``_method_error``, which ``depth_m_method_error`` includes. Over the dimensions of the waveforms
-        alone: ``attenuation`` [1/m] along the path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
+        alone: ``class_probability``, ``attenuation`` [1/m] along the path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
         ``_end_ns``; with `layers`, over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``,
         ``layer_attenuation_above`` and ``_below``.
 
@@ -330,6 +331,8 @@ def _with_depths(
             # The height of a clipped echo is not known.
             weak &= (table["flags"][:, number] & int(EchoFlag.SATURATED)) == 0
             faint |= weak[:, 0]
+            # The height of a bottom that merges with its surface is not known well, but its time is.
+            weak[:, 2:] &= np.isnan(table["near_ns"])[:, np.newaxis]
             table["flags"][:, number, 2:] |= np.where(weak[:, 2:], int(EchoFlag.POOR_FIT), 0)
         found = surface_times(
             measured.reshape(shots, -1),

@@ -33,7 +33,10 @@ _LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
 # Light that a bottom sends back to itself by total reflection at the surface: times between which it counts, over those
 # of the depth, and their steps; and the prior of the bottom's reflectance: mean, error, largest.
 _AGAIN, _STEPS, _REFLECTANCE = (1.34, 12.0), 12, (0.2, 0.15, 0.6)
-_OF_FOCUSING, _FAINT = 0.3, 0.05  # error of a column by waves, relative to it, and where it counts, relative to the peak
+_OF_FOCUSING, _FAINT = (
+    0.3,
+    0.05,
+)  # error of a column by waves, relative to it, and where it counts, relative to the peak
 _FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the largest
 
 
