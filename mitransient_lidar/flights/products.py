@@ -196,6 +196,7 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot])
     points["line"] = ("point", flown.values("line")[shot])
     points = points.assign(_quality(points, echoes)).assign(_of_light(flown, points, echoes))
+    points.attrs["merged_below_m"] = float(attributes["merged_below_m"])
     return label(points.assign(_truth(flown, plan, points)), "points")
 
 
@@ -311,6 +312,8 @@ def _describe_pulses(points: xr.Dataset) -> list[str]:
         }
         listed = ", ".join(f"{text} {count}" for text, count in found.items())
         lines.append(f"{len(np.unique(number[own]))} waveforms over {name}: {listed or 'none'}")
+    if "merged_below_m" in points.attrs:
+        lines.append(f"surface and bottom merge in water of less than {points.attrs['merged_below_m']:.2f} m")
     return lines
 
 

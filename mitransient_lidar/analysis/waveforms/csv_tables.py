@@ -42,7 +42,8 @@ def echo_frame(table: xr.Dataset) -> pd.DataFrame:
     """Return a table of `echo_table.extract` with one row per waveform, estimator and echo.
 
     The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
-    quantities of the echo, its ``class`` and ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
+    quantities of the echo, its ``class`` and ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and
+    ``attenuation``.
     """
     dims = [str(dim) for dim in table["time_ns"].dims]
     known = [
@@ -95,6 +96,10 @@ def describe_echoes(found: xr.Dataset) -> list[str]:
 def _columns(found: xr.Dataset) -> list[str]:
     """Return lines on attenuations, and the changes in the columns if tested for."""
     listed = []
+    if "merged_below_m" in found.attrs:
+        listed.append(
+            f"surface and bottom merge where the water is less than {found.attrs['merged_below_m']:.2f} m deep"
+        )
     values = found["attenuation"].values.ravel()
     if np.isfinite(values).any():
         text = f"attenuation of the column (1/m): median {np.nanmedian(values):.4f}"

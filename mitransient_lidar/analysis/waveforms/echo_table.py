@@ -15,6 +15,7 @@ from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_p
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE, DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection, EchoClass, decide
 from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, Echoes, EchoFlag, Records, has_echo
+from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, SurfaceLevel, surface_times
@@ -118,9 +119,10 @@ def extract(
         ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
         ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, ``class``, an
         `echo_classes.EchoClass`, and ``flags``, sums of `echo_detection.EchoFlag`. Land is the echo ``bottom``, objects
-        above the water are targets, both timed in air, with negative depths. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
-        ``_stderr`` and ``_method_error``, which ``depth_m_method_error`` includes. Over the dimensions of the waveforms
-        alone: ``class_probability``, ``attenuation`` [1/m] along the path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
+        above the water are targets, both timed in air, with negative depths. Without ``echo``: ``surface_time_ns``, the
+        arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which ``depth_m_method_error``
+        includes. Over the dimensions of the waveforms alone: ``class_probability``, ``attenuation`` [1/m] along the
+        path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
         ``_end_ns``; with `layers`, over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``,
         ``layer_attenuation_above`` and ``_below``.
 
@@ -428,6 +430,7 @@ def _label(
         "echo_fwhm_ns": waveforms.echo_fwhm_ns,
         "echo_threshold": settings.threshold,
         "echo_contrast": settings.contrast,
+        "merged_below_m": SEPARATE * waveforms.echo_fwhm_ns * waveforms.geometry.depth_per_ns,
     }
     energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
     kind = "mean" if settings.depth_from == "mean" else ""
