@@ -333,8 +333,6 @@ def _with_depths(
             # The height of a clipped echo is not known.
             weak &= (table["flags"][:, number] & int(EchoFlag.SATURATED)) == 0
             faint |= weak[:, 0]
-            # The height of a bottom that merges with its surface is not known well, but its time is.
-            weak[:, 2:] &= np.isnan(table["near_ns"])[:, np.newaxis]
             table["flags"][:, number, 2:] |= np.where(weak[:, 2:], int(EchoFlag.POOR_FIT), 0)
         found = surface_times(
             measured.reshape(shots, -1),

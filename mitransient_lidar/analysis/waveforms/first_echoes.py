@@ -196,6 +196,8 @@ def first_echoes(
     top, top_error = _mean(weight, surface_ns, noise)
     area = pulse.area_ns
     bottom = _echo(_chosen([land, fit], np.where(dry, 0, 1)), area, shape, 0, time, time_error)
+    # The height of an echo that may include a surface is that of both, whose error is that of one.
+    bottom = replace(bottom, amplitude_stderr=_error(land, 2))
     own = _echo(land, area, shape, 0, land_ns, _error(land, 0))
     distinct_bottom = _echo(free, area, shape, 0, own_ns, _error(free, 0))
     bottom = _where(distinct, distinct_bottom, _where(dry, own, bottom))

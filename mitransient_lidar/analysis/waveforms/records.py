@@ -153,8 +153,9 @@ class Waveforms:
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
         sea = np.atleast_1d(dataset.attrs.get("surface_heights_m", _UNKNOWN_SEA))
         events = _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels)
-        whole = name == "signal" and not in_blocks
-        quiet = time < (_before_land(samples, time, quiet_until, events, width) if whole else quiet_until)
+        quiet, calm = time < quiet_until, samples
+        if name == "signal" and not in_blocks:
+            quiet, calm = _without_land(samples, time, quiet_until, events, width)
         baseline = np.zeros(pixels)
         if in_blocks:
             baseline, _ = _block_levels(dataset, pixels)
@@ -163,9 +164,9 @@ class Waveforms:
                 raise UserError(
                     f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
                 )
-            baseline = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
+            baseline = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
         run = max(int(template.fwhm_ns / step), 1)
-        deviation, shared = _noise(dataset, name, samples, baseline, quiet, noise, run), None
+        deviation, shared = _noise(dataset, name, samples, calm, baseline, quiet, noise, run), None
         if name == "waveform" and noise is None and "waveform_stderr" in dataset:
             deviation, shared = _noise_of_render(dataset, deviation, run)
         if in_blocks:
@@ -283,18 +284,24 @@ def _sensitivity(dataset: xr.Dataset, name: str, pixels: int) -> FloatArray:
     return np.asarray(dataset["receiver_sensitivity"].values.reshape(-1), dtype=np.float64)
 
 
-def _before_land(
+def _without_land(
     samples: npt.NDArray[Any], time: FloatArray, quiet_until: float, events: FloatArray, width: float
-) -> float:
-    """Return the end of the part of records that is without echoes of land, too [ns]."""
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[Any]]:
+    """Return the bins before the sea and the samples of shots that are quiet there; else the bins before any land."""
     quiet = time < quiet_until
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
-        return quiet_until
+        return quiet, samples
     rest = np.abs(samples[:, quiet] - np.nanmedian(samples[:, quiet]))
     least = max(float(np.nanmedian(rest)), float(np.nanmean(rest)) / _LAND, float(events.max(initial=0.0)))
-    above = np.flatnonzero((rest > _LAND * least).any(axis=0))
-    before = time[above[0]] - 2 * width if above.size and least > 0 else quiet_until
-    return before if np.count_nonzero(time < before) >= _FEWEST_QUIET else quiet_until
+    above = rest > _LAND * least
+    if not above.any() or least <= 0:
+        return quiet, samples
+    of_shot = samples.reshape(-1, events.size, samples.shape[1])
+    calm = ~above.any(axis=1).reshape(-1, events.size).any(axis=1)
+    if calm.any():
+        return quiet, of_shot[calm].reshape(-1, samples.shape[1])
+    before = time < time[np.flatnonzero(above.any(axis=0))[0]] - 2 * width
+    return (before if np.count_nonzero(before) >= _FEWEST_QUIET else quiet), samples
 
 
 def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
@@ -356,6 +363,7 @@ def _noise(
     dataset: xr.Dataset,
     name: str,
     samples: npt.NDArray[Any],
+    calm: npt.NDArray[Any],
     baseline: FloatArray,
     quiet: npt.NDArray[np.bool_],
     noise: float | npt.ArrayLike | None,
@@ -370,7 +378,7 @@ def _noise(
         return given.reshape(-1, 1) + np.zeros((pixels, 1)) if given.size <= pixels else given.reshape(pixels, count)
     if name == "waveform" and "waveform_stderr" in dataset:
         return np.asarray(dataset["waveform_stderr"].values.reshape(-1, count), dtype=np.float64)
-    by_receiver = _receiver_noise(dataset, samples, baseline, quiet, run)
+    by_receiver = _receiver_noise(dataset, samples, calm, baseline, quiet, run)
     if "signal_mean_stderr" not in dataset:
         return by_receiver
     # Structures within the error of a render are no echoes, though they are in all records of a shot. That of a peak is
@@ -393,7 +401,12 @@ def _noise_of_render(
 
 
 def _receiver_noise(
-    dataset: xr.Dataset, samples: npt.NDArray[Any], baseline: FloatArray, quiet: npt.NDArray[np.bool_], run: int
+    dataset: xr.Dataset,
+    samples: npt.NDArray[Any],
+    calm: npt.NDArray[Any],
+    baseline: FloatArray,
+    quiet: npt.NDArray[np.bool_],
+    run: int,
 ) -> FloatArray:
     """Return the noise of the receiver's signal for means of `run` samples."""
     pixels, count = baseline.size, samples.shape[1]
@@ -406,7 +419,7 @@ def _receiver_noise(
         return np.asarray(stated * _inflation(known, run))
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
-    rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
+    rest = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
     spread = np.sqrt(np.mean(rest**2, axis=(0, 2)))[:, np.newaxis]
     if "signal_deviation" not in dataset:
         return np.asarray(spread * _inflation(rest, run))
