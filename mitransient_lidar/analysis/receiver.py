@@ -6,6 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Any, NamedTuple, TypeVar, Union
 
 import numpy as np
@@ -44,6 +45,7 @@ _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
+_FAINT_W, _STEADY_BINS = 1e-9, 256  # light of which the sensitivity is measured [W], and its bins
 _BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when its record is written
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
@@ -345,6 +347,12 @@ def _record_channel(
         shifted = receiver.expected(power + 10**-density * error, width, background).mean - expected.mean
         shifted = np.repeat(np.abs(shifted), number, axis=0) if series else np.abs(shifted)
         values["signal_mean_stderr"] = (dims, shifted)
+    # Before the logarithm and the digitiser, as of light that is too weak for limits.
+    linear = replace(receiver, logarithm=None, digitiser=None)
+    steady = np.array([0.0, *[_FAINT_W] * _STEADY_BINS])
+    answer = linear.expected(steady, width).mean - linear.expected(0 * steady, width).mean
+    sensitivity = float(10**-density * answer.max() / _FAINT_W)
+    values["receiver_sensitivity"] = (pixels, np.full([dataset.sizes[dim] for dim in pixels], sensitivity))
     heights = receiver.event_height(power, width, background)
     values["event_height"] = (pixels, heights.max(axis=0) if series else heights)
     labels = dataset["shot"].values if series and number == 1 else np.arange(len(signal))

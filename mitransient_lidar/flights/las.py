@@ -51,8 +51,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
         - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.times.TIME_SYSTEMS`, is
           ``flight`` by default. Those since 1980 become adjusted standard GPS times;
-        - ``kind``: class, 0 to 255: 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found. The last is
-          flagged as synthetic, since no echo is there;
+        - ``kind``: class, 0 to 255: 1 an object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged
+          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
         - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
@@ -61,7 +61,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``line``: number of the flight line, 0 to 65535;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
         - ``quality``: sum of `products.Quality`, 0 to 255; ``withheld``: whether maps should leave the point out;
-        - ``depth``, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m]; NaN if unknown.
+        - ``depth``, negative on land, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m],
+          and, if there are any, ``pseudo_reflectance``, ``optical_depth`` and ``class_probability``; NaN if unknown.
     crs : str, optional
         Projected coordinate system in metres, such as 'EPSG:32633' or 'EPSG:32633+5773'; otherwise the scene's frame.
 
@@ -161,10 +162,12 @@ def _notes(first: xr.Dataset) -> str:
     return (
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
         f"GPS time: {TIME_NOTES[_time_system(first)]}. "
-        "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
+        "Class 1 object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged object, "
+        "45 no bottom found (flagged synthetic: "
         "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
-        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections. "
+        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections, "
+        "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable. "
         "Points of saturated echoes and poor fits are withheld. "
         "Depths and uncertainties (1 sigma) are NaN where unknown."
     )
@@ -226,7 +229,9 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
     if np.any(np.abs(angle) > 180):
         raise UserError(f"scan_angle_deg = {angle[np.argmax(np.abs(angle))]:g} must lie between -180 and 180")
     scaled = np.nan_to_num(points["intensity"].values / full_scale, nan=0.0)
-    extra = {item.name: points[item.name].values for item in EXTRA_BYTES if item.dtype == "f4"}
+    unknown = np.full(kind.shape, np.nan)
+    names = [item.name for item in EXTRA_BYTES if item.dtype == "f4"]
+    extra = {name: points[name].values if name in points else unknown for name in names}
     return {
         **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
         "gps_time": finite_array("gps_time", points["gps_time"].values)

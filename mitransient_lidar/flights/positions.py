@@ -9,10 +9,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range
+from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray, finite_array, in_range
 from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths, Timing
 from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -24,8 +25,11 @@ _ORTHONORMAL = 1e-6  # largest error of lengths and products of the directions o
 _SMALLEST_DESCENT = 1e-3  # least vertical component of a line of sight that meets the sea
 
 
-#: Classes of the echoes of `echo_table.extract` that are points, in the order of their arrival.
+#: Echoes of `echo_table.extract` that are points, and their classes in the water.
 ECHOES = {"surface": PointClass.SURFACE, "target": PointClass.OBJECT, "bottom": PointClass.BOTTOM}
+
+#: Classes of points that are timed in air and not of the sea.
+IN_AIR = {EchoClass.LAND: PointClass.GROUND, EchoClass.ABOVE: PointClass.UNCLASSIFIED}
 
 _OF_ECHOES = ("depth_m", "depth_m_stderr", "depth_m_method_error", "time_ns_stderr", "amplitude", "flags")
 _OF_SURFACES = ("surface_time_ns", "surface_time_ns_stderr", "surface_time_ns_method_error")
@@ -80,8 +84,9 @@ def positions(
         [m] below the local surface, ``intensity`` (amplitude, in the unit of the echoes), the standard deviations
         ``x_uncertainty``, ``y_uncertainty``, ``vertical_uncertainty`` (of z), ``horizontal_uncertainty`` (root of the
         sum of the variances of x and y) and ``depth_uncertainty`` [m], ``shot``, ``pixel``, ``return_number``,
-        ``number_of_returns``, ``flags`` and, with `time_s`, ``gps_time`` [s]. A waveform without an echo has one point
-        of the class 45, where its line of sight meets the sea, with NaN as depth and intensity.
+        ``number_of_returns``, ``flags``, ``echo`` (its place in `ECHOES`, -1 without an echo) and, with `time_s`,
+        ``gps_time`` [s]. Land and objects above the water are timed in air: their depth is negative. A waveform without
+        an echo has one point of the class 45, where its line of sight meets the sea, with NaN as depth and intensity.
 
     Raises
     ------
@@ -123,9 +128,11 @@ def positions(
     rotations = errors.rotations(forward, table.shape[0])
 
     shot, pixel, echo = table.points()
-    timing = table.timing(shot, pixel, echo)
+    kind = table.kinds(shot, pixel, echo)
+    dry = np.isin(kind, [*IN_AIR.values()])
+    timing = table.timing(shot, pixel, echo, dry, -direction[shot, pixel, 2])
     paths = RefractedPaths.trace(
-        *(pulses.origin[shot, 0], direction[shot, pixel], timing, (echo > 0, echo < 0)),
+        *(pulses.origin[shot, 0], direction[shot, pixel], timing, ((echo > 0) & ~dry, echo < 0)),
         *(indices, surface, times[shot]),
     )
     sides = np.stack(
@@ -140,7 +147,7 @@ def positions(
         "x": x,
         "y": y,
         "z": z,
-        "kind": np.array([*ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8),
+        "kind": kind.astype(np.uint8),
         # The surface from which depths count, estimated from all pixels of the shot; its own echo may be later.
         "depth": np.where(echo == 0, 0.0, table.value("depth_m", shot, pixel, echo)),
         "intensity": table.value("amplitude", shot, pixel, echo),
@@ -154,6 +161,7 @@ def positions(
         "return_number": number,
         "number_of_returns": count,
         "flags": table.values["flags"][shot, pixel, np.maximum(echo, 0)].astype(np.int64),
+        "echo": echo.astype(np.int8),
     }
     if time_s is not None:
         values["gps_time"] = times[shot]
@@ -226,29 +234,51 @@ class _Table:
         chosen = echoes.sel(echo=list(ECHOES))
         values = {name: chosen[name].transpose("shot", *pixels, "echo").values for name in _OF_ECHOES}
         values |= {name: chosen[name].transpose("shot", *pixels).values for name in _OF_SURFACES}
+        for name in {"class", "time_ns"} & set(chosen):
+            values[name] = chosen[name].transpose("shot", *pixels, "echo").values
         shots = echoes.sizes["shot"]
         shape = shots, values["surface_time_ns"].size // max(shots, 1)
-        last = {name: (len(ECHOES),) if name in _OF_ECHOES else () for name in values}
+        last = {name: () if name in _OF_SURFACES else (len(ECHOES),) for name in values}
         return cls({name: value.reshape(*shape, *last[name]) for name, value in values.items()}, shape)
 
     def points(self) -> tuple[IntArray, IntArray, IntArray]:
         """Return shot, pixel and echo of all points, in order; the echo of a waveform without one is -1."""
         found = has_echo(self.values["flags"].astype(np.int64)) & np.isfinite(self.values["depth_m"])
         found &= np.isfinite(self.values["surface_time_ns"])[..., None]
+        if "class" in self.values:
+            found |= np.isin(self.values["class"], [*IN_AIR]) & np.isfinite(self.values["time_ns"])
         silent = ~found.any(axis=-1, keepdims=True)
         shot, pixel, echo = np.nonzero(np.concatenate([silent, found], axis=-1))
+        if "time_ns" in self.values:
+            # Objects above the water arrive before its surface.
+            order = np.lexsort((np.nan_to_num(self.values["time_ns"][shot, pixel, echo - 1]), pixel, shot))
+            shot, pixel, echo = shot[order], pixel[order], echo[order]
         return shot, pixel, echo - 1
+
+    def kinds(self, shot: IntArray, pixel: IntArray, echo: IntArray) -> IntArray:
+        """Return the `PointClass` of points."""
+        kind = np.array([*ECHOES.values(), PointClass.NO_ECHO])[echo]
+        for of_echo, of_point in IN_AIR.items() if "class" in self.values else ():
+            own = (echo >= 0) & (self.values["class"][shot, pixel, echo] == of_echo)
+            kind = np.where(own, of_point, kind)
+        return kind
 
     def value(self, name: str, shot: IntArray, pixel: IntArray, echo: IntArray) -> FloatArray:
         """Return a quantity of points, NaN without an echo."""
         return np.where(echo >= 0, self.values[name][shot, pixel, echo], np.nan)
 
-    def timing(self, shot: IntArray, pixel: IntArray, echo: IntArray) -> Timing:
-        """Return what the times of points mean; errors that are not known count as 0."""
+    def timing(self, shot: IntArray, pixel: IntArray, echo: IntArray, dry: BoolArray, cosine: FloatArray) -> Timing:
+        """Return what the times of points mean; errors that are not known count as 0.
+
+        Of points that are `dry`, the range is their own; the cosine is that of their line of sight from the vertical.
+        """
         surface = [_PER_NS * self.values[name][shot, pixel] for name in _OF_SURFACES]
         noise = _PER_NS * self.values["time_ns_stderr"][shot, pixel, echo]
         depth, method = (self.values[name][shot, pixel, echo] for name in ("depth_m", "depth_m_method_error"))
-        wet = echo > 0
+        wet = (echo > 0) & ~dry
+        if dry.any():
+            own = _PER_NS * self.values["time_ns"][shot, pixel, echo], noise, method / cosine
+            surface = [np.where(dry, *pair) for pair in zip(own, surface, strict=True)]
         behind = [np.where(wet, np.nan_to_num(one), 0.0) for one in (noise, depth, method)]
         return Timing(surface[0], *map(np.nan_to_num, surface[1:]), *behind)
 

@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
@@ -23,11 +24,12 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.positions import ECHOES, fit_surface, numbered_returns, positions
+from mitransient_lidar.flights.positions import ECHOES, IN_AIR, fit_surface, numbered_returns, positions
 from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
+from mitransient_lidar.results.geometry import lidar_system
 from mitransient_lidar.results.variables import PointClass, flagged, label
 
 #: Pulses of a chunk of a file.
@@ -35,6 +37,12 @@ _CHUNK = 4096
 
 #: Counts of the range of all samples.
 _COUNTS = 65000
+
+#: Probability of a class below which it is uncertain.
+_CERTAIN = 0.9
+
+#: Rows of the printed table that are left out without points.
+_IF_ANY = ("land", "above the water", "bottom, merged", "withheld")
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")
@@ -47,6 +55,9 @@ class Quality(IntFlag):
     POOR_FIT = 2  # too few usable samples, a fit that has not converged, or one with a doubtful amplitude
     CORRECTED = 4  # its depth is corrected by a table
     BEYOND_TABLE = 8  # its angle from nadir or its depth is outside the table
+    MERGED = 16  # a bottom and its surface are less than 1.8 echo widths apart
+    ABOVE_WATER = 32  # an object that stands above the water, such as a pier
+    UNCERTAIN = 64  # its class has a probability below 90 %
 
 
 @dataclass(frozen=True)
@@ -144,9 +155,11 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
         echoes["beyond_table"] = beyond | (uncorrected < depths[0])
     # Depths were measured along the line of sight of the group's lidar.
     index = float(attributes["refractive_index"])
-    ratio = cos_in_water(flown.values("axis_z"), index) / cos_in_water(np.cos(np.radians(angle)), index)
+    down, of_group = -flown.values("axis_z"), np.cos(np.radians(angle))
+    ratio = xr.DataArray(cos_in_water(-down, index) / cos_in_water(of_group, index), dims="shot")
+    ratio = ratio.where(~echoes["class"].isin([*IN_AIR]), xr.DataArray(down / of_group, dims="shot"))
     for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
-        echoes[name] = echoes[name] * xr.DataArray(ratio, dims="shot")
+        echoes[name] = (echoes[name] * ratio).transpose(*echoes[name].dims)
     return echoes
 
 
@@ -157,7 +170,8 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     -------
     xarray.Dataset
         Points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
-        ``withheld``, whether the echo is saturated or its fit poor; and the truth: ``true_z`` [m], the mean
+        ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
+        ``class_probability``; and the truth: ``true_z`` [m], the mean
         height of the surface in the beam or, for points below it, that of the highest solid at x and y;
         ``true_target``, whether that solid is a target; and of the pulse ``true_surface_height``,
         ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
@@ -181,37 +195,70 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot])
     points["line"] = ("point", flown.values("line")[shot])
-    points = points.assign(_quality(points, echoes))
+    points = points.assign(_quality(points, echoes)).assign(_of_light(flown, points, echoes))
+    points.attrs["merged_below_m"] = float(attributes["merged_below_m"])
     return label(points.assign(_truth(flown, plan, points)), "points")
 
 
 def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
     """Return the quality of points, and whether they are withheld from maps."""
     place = points["shot"].values, points["pixel"].values
-    flags = points["flags"].values
+    flags, kind = points["flags"].values, points["kind"].values
+    silent = kind == PointClass.NO_ECHO
 
     def of_echo(name: str) -> npt.NDArray[Any]:
         values = echoes[name].transpose("shot", "pixel", "echo").sel(echo=list(ECHOES)).values
-        found = np.zeros(flags.shape, dtype=values.dtype)
-        for number, kind in enumerate(ECHOES.values()):
-            own = points["kind"].values == kind
-            found[own] = values[..., number][place][own]
-        return found
+        return np.where(silent, np.zeros((), values.dtype), values[(*place, points["echo"].values)])
 
-    silent = points["kind"].values == PointClass.NO_ECHO
     clipped = (flags & int(EchoFlag.SATURATED)) > 0
     of_surface = echoes["flags"].sel(echo="surface").transpose("shot", "pixel").values[place]
     poor = ((flags & int(EchoFlag.POOR_FIT)) > 0) & ~silent
     quality = np.where(clipped | ((of_surface & int(EchoFlag.SATURATED)) > 0), int(Quality.SATURATED), 0)
     quality |= np.where(poor, int(Quality.POOR_FIT), 0)
+    quality |= np.where(kind == PointClass.UNCLASSIFIED, int(Quality.ABOVE_WATER), 0)
+    if "class" in echoes:
+        quality |= np.where(of_echo("class") == EchoClass.MERGED, int(Quality.MERGED), 0)
+        chance = echoes["class_probability"].transpose("shot", "pixel").values[place]
+        quality |= np.where(~silent & (chance < _CERTAIN), int(Quality.UNCERTAIN), 0)
     if "beyond_table" in echoes:
-        behind = ~silent & (points["kind"].values != PointClass.SURFACE)
+        behind = (kind == PointClass.BOTTOM) | (kind == PointClass.OBJECT)
         corrected = behind & np.isfinite(of_echo("depth_correction_m"))
         quality |= np.where(corrected, int(Quality.CORRECTED), 0)
         quality |= np.where(behind & of_echo("beyond_table"), int(Quality.BEYOND_TABLE), 0)
     return {
         "quality": ("point", quality.astype(np.uint8), flagged(Quality)),
         "withheld": ("point", ~silent & (clipped | poor)),
+    }
+
+
+def _of_light(flown: Flown, points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
+    """Return what the light of points says: reflectance, optical depth of the column above them, and probability.
+
+    The pseudo-reflectance is that of the lidar equation of a Lambertian plane across the beam in air, at the distance
+    of the point along the path: pi R^2 E / (E_0 eta A), with the energy E of the echo on the detector.
+    """
+    attributes, kind = flown.attributes, points["kind"].values
+    place = points["shot"].values, points["pixel"].values
+    silent = kind == PointClass.NO_ECHO
+    energy, depth, attenuation, chance = (
+        echoes[name].sel(echo=list(ECHOES)).transpose("shot", "pixel", "echo").values[(*place, points["echo"].values)]
+        if "echo" in echoes[name].dims
+        else echoes[name].transpose("shot", "pixel").values[place]
+        for name in ("energy", "depth_m", "attenuation", "class_probability")
+    )
+    index = float(attributes["refractive_index"])
+    path = depth / cos_in_water(flown.values("axis_z")[place[0]], index)
+    wet = (kind == PointClass.BOTTOM) | (kind == PointClass.OBJECT)
+    apart = np.stack([points[name].values for name in "xyz"], axis=1) - flown.poses.origin[place[0]]
+    system = lidar_system(attributes)
+    share = np.nan_to_num(flown.coordinate("beam_share"), nan=1.0)[place[1]]
+    sensitivity = flown.values("sensitivity")[place]
+    sent = share * system.energy * system.aperture_area * np.where(sensitivity > 0, sensitivity, np.nan)
+    reflectance = np.pi * np.sum(apart**2, axis=1) * energy / sent
+    return {
+        "pseudo_reflectance": ("point", np.where(silent, np.nan, reflectance)),
+        "optical_depth": ("point", np.where(wet, attenuation * path, np.nan)),
+        "class_probability": ("point", np.where(silent, np.nan, chance)),
     }
 
 
@@ -223,14 +270,20 @@ def describe_points(points: xr.Dataset) -> list[str]:
     target = points["true_target"].values.astype(bool)
     kind = points["kind"].values
     withheld = points["withheld"].values.astype(bool)
+    good = ~withheld
+    merged = (points["quality"].values & int(Quality.MERGED)) > 0
     classes = {
-        "water surface": (kind == PointClass.SURFACE) & ~withheld,
-        "bottom": (kind == PointClass.BOTTOM) & ~target & ~withheld,
-        "bottom, above a target": (kind == PointClass.BOTTOM) & target & ~withheld,
-        "object": (kind == PointClass.OBJECT) & ~withheld,
-        **({"withheld": withheld} if withheld.any() else {}),
+        "land": (kind == PointClass.GROUND) & good,
+        "above the water": (kind == PointClass.UNCLASSIFIED) & good,
+        "water surface": (kind == PointClass.SURFACE) & good,
+        "bottom": (kind == PointClass.BOTTOM) & ~target & ~merged & good,
+        "bottom, merged": (kind == PointClass.BOTTOM) & ~target & merged & good,
+        "bottom, above a target": (kind == PointClass.BOTTOM) & target & good,
+        "object": (kind == PointClass.OBJECT) & good,
+        "withheld": withheld,
         "no echo": kind == PointClass.NO_ECHO,
     }
+    classes = {name: chosen for name, chosen in classes.items() if name not in _IF_ANY or chosen.any()}
     rows: list[list[Any]] = []
     for name, chosen in classes.items():
         own = chosen & np.isfinite(error)
@@ -240,7 +293,28 @@ def describe_points(points: xr.Dataset) -> list[str]:
             numbers = (values.mean(), values.std(), np.sqrt(np.mean(values**2)), np.median(stated[own]))
             rows[-1] += [100 * number for number in numbers]
             rows[-1] += [np.sqrt(np.mean((values / stated[own]) ** 2)), np.mean(np.abs(values) > 0.5)]
-    return table_lines([*columns, ("z", ">7.2f"), ("> 0.5 m", ">9.2%")], rows)
+    return table_lines([*columns, ("z", ">7.2f"), ("> 0.5 m", ">9.2%")], rows) + _describe_pulses(points)
+
+
+def _describe_pulses(points: xr.Dataset) -> list[str]:
+    """Return lines on what the waveforms over land are, if any, and how many over water have a bottom."""
+    kind, height = points["kind"].values, -points["true_bottom_depth"].values
+    waveform, first = np.unique(np.stack([points["shot"], points["pixel"]]), axis=1, return_index=True)
+    del waveform
+    dry = height > 0
+    if not dry.any():
+        return []
+    number = np.cumsum(np.isin(np.arange(len(kind)), first)) - 1
+    lines = []
+    for name, own in (("land", dry), ("water", ~dry)):
+        found = {
+            one.text: len(np.unique(number[own & (kind == one)])) for one in PointClass if np.any(own & (kind == one))
+        }
+        listed = ", ".join(f"{text} {count}" for text, count in found.items())
+        lines.append(f"{len(np.unique(number[own]))} waveforms over {name}: {listed or 'none'}")
+    if "merged_below_m" in points.attrs:
+        lines.append(f"surface and bottom merge in water of less than {points.attrs['merged_below_m']:.2f} m")
+    return lines
 
 
 @alone
@@ -326,10 +400,10 @@ def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
     shot, pixel, kind = (points[name].values for name in ("shot", "pixel", "kind"))
     names = [str(name) for name in flown.coordinate("echo")]
     arrival = np.array(surface[shot, pixel])
-    for name, code in ECHOES.items():
-        own = kind == code
-        found = time[shot[own], pixel[own], names.index(name)]
-        arrival[own] = np.where(np.isfinite(found), found, arrival[own])
+    echo = points["echo"].values
+    places = np.array([names.index(name) for name in ECHOES])
+    found = time[shot, pixel, places[echo]]
+    arrival = np.where((echo >= 0) & np.isfinite(found), found, arrival)
     start = flown.values("sample_start_ns")[shot] + 0.5 * width
     wet = (kind == PointClass.BOTTOM) | (kind == PointClass.OBJECT)
     within = np.nan_to_num(arrival - start, nan=0.0)

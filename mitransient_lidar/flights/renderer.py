@@ -148,8 +148,8 @@ class FlightRenderer(Renderer):
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
         arrays, echoes = self._stacked(inputs, turned=False)
-        names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
-        found = {name: Array.of(echoes[name]) for name in names}
+        names = ("pixel", "angle_x", "angle_y", "sight_x", "sight_y", "beam_share")
+        found = {name: Array.of(echoes[name]) for name in names if name in echoes.coords}
         samples = arrays["signal"].values.shape[-1]
         width = float(echoes.attrs["bin_width_ns"])
         found["time"] = Array(("time",), (np.arange(samples) + 0.5) * width, described("time", "flight"))
@@ -172,12 +172,18 @@ class FlightRenderer(Renderer):
             "sample_start_ns": Array((), start, described("sample_start_ns")),
             "time_offset_ns": Array((), later, described("time_offset_ns")),
             "gain": _per_pixel(recorded.attrs["gain"], len(later), pixels),
+            "sensitivity": Array(
+                ("pixel",),
+                np.tile(recorded["receiver_sensitivity"].values, (len(later), 1)),
+                described("receiver_sensitivity"),
+            ),
         }
         for name, values in series.coords.items():
             if str(name).startswith("true_"):
                 found[str(name)] = _single(values)
         for name, values in echoes.data_vars.items():
-            dtype = np.int16 if name == "flags" else np.float64 if str(name).endswith("time_ns") else np.float32
+            of_time = np.float64 if str(name).endswith("time_ns") else np.float32
+            dtype = np.int16 if name in ("flags", "class") else of_time
             found[f"echo_{name}"] = _single(values, dtype)
         return found, echoes
 

@@ -16,16 +16,21 @@ from mitransient_lidar.results.variables import PointClass
 
 #: Colour of the points of a class.
 _CLASSES = {
+    PointClass.GROUND: "#d8a038",
+    PointClass.UNCLASSIFIED: "#9467bd",
     PointClass.SURFACE: "#1f77b4",
     PointClass.BOTTOM: "#8c564b",
     PointClass.OBJECT: "#d62728",
     PointClass.NO_ECHO: "#999999",
 }
 
+#: Classes of what is solid.
+_SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
+
 #: Half of the width of the strip of a profile [m], and most waveforms in it.
 _STRIP, _MOST_WAVEFORMS = 1.5, 2000
 
-#: Heights in a profile above the sea and below the deepest point [m], and most columns of cells of its picture.
+#: Heights in a profile above sea and land and below the deepest point [m], and most columns of cells of its picture.
 _ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
 
 #: Range of a nanosecond between pulse and echo in the air [m].
@@ -62,16 +67,21 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
     track, side, heights, errors = figure.subplots(2, 2).ravel()
     _draw_track(track, flown, points)
     _draw_side(side, points)
-    wet = points.isel(point=np.isin(points["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT)))
+    wet = points.isel(point=np.isin(points["kind"].values, _SOLID))
     error = wet["z"].values - wet["true_z"].values
     limit = float(np.nanquantile(np.abs(error), 0.98)) if error.size else 1.0
     deepest, highest = np.quantile(wet["z"].values, [0.002, 0.99]) if error.size else (-1.0, 0.0)
     for ax, values, label, style in (
-        (heights, wet["z"].values, "height of the bottom (m)", {"cmap": "viridis", "vmin": deepest, "vmax": highest}),
+        (
+            heights,
+            wet["z"].values,
+            "height of bottom and land (m)",
+            {"cmap": "viridis", "vmin": deepest, "vmax": highest},
+        ),
         (errors, error, "error of the height (m)", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
     ):
         drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
-        _set_map(ax, "Bottom" if ax is heights else "Errors of heights")
+        _set_map(ax, "Bottom and land" if ax is heights else "Errors of heights")
         figure.colorbar(drawn, ax=ax, label=label)
     drawing.save(figure, paths[0])
     figure = drawing.new_figure(paths[1], 10, 5)
@@ -125,17 +135,18 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     """Draw the waveforms and points of a strip along x or y, through points above targets or else most points."""
     along, across, middle = _fullest_strip(points)
     strip = points.isel(point=np.abs(points[across].values - middle) < _STRIP)
-    wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
+    wet = np.isin(strip["kind"].values, _SOLID)
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
+    top = float(np.max(strip["z"].values[wet], initial=0.0)) + _ABOVE
     seen = np.unique(strip["shot"].values)
     first, last = np.quantile(strip[along].values, [0.0, 1.0])
     width = float(flown.store.attributes["bin_width_ns"])
     group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))
     # Cells with a few pulses and samples each, so that they fill the picture.
-    rows = (depth + _ABOVE) / (2 * _PER_NS * width / group)
+    rows = (depth + top) / (2 * _PER_NS * width / group)
     shape = int(np.clip(len(seen) / 3, 10, _COLUMNS)), max(int(rows), 10)
-    cells = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
+    cells = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, top, shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
     origin, axis = flown.poses.origin, flown.poses.axis
@@ -155,7 +166,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     shown = np.where(np.isfinite(image), image, np.nan)
     drawn = ax.pcolormesh(*cells, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
     ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
-    for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "bottom or object")):
+    for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "land, bottom or object")):
         ax.plot(strip[along].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
     order = np.argsort(strip[along].values[wet])
     truth = (strip[name].values[wet][order] for name in (along, "true_z"))

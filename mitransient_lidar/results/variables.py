@@ -28,8 +28,10 @@ _DOWN = ("gate_depth", "depth")
 
 
 class PointClass(IntEnum):
-    """Class of a point, by the codes of LAS 1.4 for bathymetry."""
+    """Class of a point, by the codes of LAS 1.4 and of its profile for bathymetry; 1 is an object above the water."""
 
+    UNCLASSIFIED = 1
+    GROUND = 2
     BOTTOM = 40
     SURFACE = 41
     OBJECT = 43
@@ -38,7 +40,8 @@ class PointClass(IntEnum):
     @property
     def text(self) -> str:
         """Name of the class in tables and legends."""
-        return {"SURFACE": "water surface"}.get(self.name, self.name.lower().replace("_", " "))
+        names = {"SURFACE": "water surface", "UNCLASSIFIED": "above the water", "GROUND": "land"}
+        return names.get(self.name, self.name.lower().replace("_", " "))
 
 
 def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, Any]:

@@ -99,13 +99,14 @@ def column_fit(
 
 def column_echoes(records: Records, column: ColumnFit, start: FloatArray, end: FloatArray, delay: FloatArray) -> Echoes:
     """Return the columns between two times as echoes, with their level at a delay [ns] from the fits' reference."""
-    known = np.isfinite(column.level)
     inside = (records.time_ns >= start[:, np.newaxis]) & (records.time_ns <= end[:, np.newaxis])
     power, noise = np.where(inside, records.power, 0), np.where(inside, records.noise, 0)
     total = np.sum(power, axis=1)
-    safe = np.where(known & (total > 0), total, 1.0)
+    safe = np.where(total > 0, total, 1.0)
     seconds = records.bin_ns * 1e-9
     time = np.sum(power * records.time_ns, axis=1) / safe
+    # Noise alone may have a level, but its centroid is anywhere.
+    known = np.isfinite(column.level) & (total > 0) & (time >= start) & (time <= end)
     time_error = error_of_sums(noise * (records.time_ns - time[:, np.newaxis]), None, records.shared) / safe
     level = column.level * np.exp(-column.decay * delay)
     relative = column.level_stderr / column.level

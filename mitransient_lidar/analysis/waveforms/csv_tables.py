@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.tables.written import aligned_lines, write_csv
 
@@ -41,7 +42,8 @@ def echo_frame(table: xr.Dataset) -> pd.DataFrame:
     """Return a table of `echo_table.extract` with one row per waveform, estimator and echo.
 
     The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
-    quantities of the echo, ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
+    quantities of the echo, its ``class`` and ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and
+    ``attenuation``.
     """
     dims = [str(dim) for dim in table["time_ns"].dims]
     known = [
@@ -52,12 +54,15 @@ def echo_frame(table: xr.Dataset) -> pd.DataFrame:
     numbers.insert(numbers.index("depth_m_stderr") + 1, "depth_m_method_error")
     attenuation = [name for name in ("attenuation", "attenuation_stderr") if name in table]
     surface = [name for name in ("surface_time_ns",) if name in table]
-    frame = table[[*extra, *numbers, "flags", *attenuation, *surface]].to_dataframe(dims).reset_index()
+    known_as = [name for name in ("class",) if name in table]
+    frame = table[[*extra, *numbers, *known_as, "flags", *attenuation, *surface]].to_dataframe(dims).reset_index()
     has_surface = np.isfinite(frame.get("surface_time_ns", math.nan * frame["flags"]))
     reasons = map(unknown_depth, frame["echo"], frame["flags"], has_surface)
     frame["unknown_depth"] = np.where(frame["depth_m"].isna(), [*reasons], "")
     frame["flags"] = frame["flags"].map(flag_names)
-    return frame[[*dims, *extra, *numbers, "flags", "unknown_depth", *attenuation]]
+    for name in known_as:
+        frame[name] = frame[name].map(lambda one: str(EchoClass(one).name).lower())
+    return frame[[*dims, *extra, *numbers, *known_as, "flags", "unknown_depth", *attenuation]]
 
 
 def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
@@ -76,10 +81,12 @@ def describe_echoes(found: xr.Dataset) -> list[str]:
     unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
     heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
     heads |= {name: f"{name} ({of})" if of else name for name, of in unit.items()}
-    rows = [[*labels, *(heads[name] for name in NUMBERS), "flags", "depth unknown"]]
+    rows = [[*labels, *(heads[name] for name in NUMBERS), "class", "flags", "depth unknown"]]
     for cells in frame[:_MOST_LINES].to_dict("records"):
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in NUMBERS]
-        rows.append([*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"]])
+        rows.append(
+            [*(str(cells[name]) for name in labels), *numbers, cells["class"], cells["flags"], cells["unknown_depth"]]
+        )
     listed = aligned_lines(rows, right=range(len(labels), len(labels) + len(NUMBERS)))
     if len(frame) > _MOST_LINES:
         listed.append(f"{len(frame) - _MOST_LINES} more lines: write them all with --csv OUT.")
@@ -89,6 +96,10 @@ def describe_echoes(found: xr.Dataset) -> list[str]:
 def _columns(found: xr.Dataset) -> list[str]:
     """Return lines on attenuations, and the changes in the columns if tested for."""
     listed = []
+    if "merged_below_m" in found.attrs:
+        listed.append(
+            f"surface and bottom merge where the water is less than {found.attrs['merged_below_m']:.2f} m deep"
+        )
     values = found["attenuation"].values.ravel()
     if np.isfinite(values).any():
         text = f"attenuation of the column (1/m): median {np.nanmedian(values):.4f}"

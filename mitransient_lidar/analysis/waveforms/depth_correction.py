@@ -12,6 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import rendered_bin_ns, rounding_ns
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_echo
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
@@ -194,6 +195,9 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
         rounding = found["depth_per_ns"] * rounding_ns(found["surface_spread"], rendered_bin_ns(found.attrs))
         # A pixel without light of the surface has the time of another one.
         error = (error**2 + rounding.max("pixel") ** 2).transpose(*correction.dims) ** 0.5
+    if "class" in found:
+        # In air there is nothing to correct, and joint fits of surface and bottom have no such bias.
+        correction = correction.where(~found["class"].isin([EchoClass.LAND, EchoClass.ABOVE, EchoClass.MERGED]))
     behind = xr.DataArray([False, False, True, True], dims="echo") & correction.notnull()
     stated = {
         "depth_m": found["depth_m"] - correction.fillna(0),

@@ -33,7 +33,8 @@ _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
 TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 # Slope of waves averaged over a beam of 2 m, relative to the standard deviation of all slopes; its power of the width.
 _MEAN_SLOPE, _OF_WIDTH, _WIDTH = 0.4, -0.25, 2.0
-_HEIGHTS = 8.0  # standard deviations from the lowest to the highest point of a sea
+#: Standard deviations from the lowest to the highest point of a sea.
+HEIGHTS = 8.0
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,9 @@ class DepthErrors:
         width = 1e-3 * geometry.slant_range * min((one for one in widths if one is not None), default=0.0)
         lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
         slope, variance = mean_slope(attributes, width), _slope_variance(attributes)
-        height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
+        height = (highest - lowest) / HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
-        gain = _column_gain(attributes)
+        gain = column_gain(attributes)
         bin_ns = rendered_bin_ns(attributes)
         return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
@@ -102,6 +103,10 @@ class DepthErrors:
         overlap = np.where(faint, _OF_LOST_PULSE, _OF_PULSE) * self.pulse_ns
         spread = self.lines.surface_spread
         return np.asarray(np.hypot(np.hypot(share * spread, overlap), rounding_ns(spread, self.bin_ns)))
+
+    def of_land(self) -> FloatArray:
+        """Return the errors of the times of land [ns], shape (n,)."""
+        return np.hypot(_OF_PULSE * self.pulse_ns, rounding_ns(self.lines.surface_spread, self.bin_ns))
 
     def of_echoes(
         self,
@@ -230,7 +235,7 @@ def _slope_variance(attributes: Attributes) -> float:
     return TYPICAL_SLOPE_VARIANCE if variance is None else variance
 
 
-def _column_gain(attributes: Attributes) -> float:
+def column_gain(attributes: Attributes) -> float:
     """Return the power of the column at the surface per backscattering coefficient [W m], NaN if it is unknown.
 
     The phase function at 180 degrees is taken as bb/(2 pi b).

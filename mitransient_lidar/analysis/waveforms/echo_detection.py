@@ -24,6 +24,7 @@ _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one
 _FOCUSED = 0.5  # smallest target below waves above the column, relative to it
 _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
+_EARLY = 3.0  # thresholds, or heights of single events, above which an echo counts before the sea's
 _GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 _BEHIND_EDGE, _STAYS = (0.8, 1.2), 0.15  # reaches behind an edge, and the share of its rise that is left there
@@ -114,6 +115,10 @@ class Records:
         noise = 1e3 * np.max(np.abs(self.power), axis=1, keepdims=True)
         return replace(self, noise=np.where(unusable, noise, self.noise))
 
+    def part(self, rows: IntArray) -> Records:
+        """Return some of the waveforms."""
+        return replace(self, power=self.power[rows], noise=self.noise[rows])
+
     def time_of(self, bins: IntArray) -> FloatArray:
         """Return the centres of bins [ns]; of bins outside the record, that of the nearest one inside."""
         return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
@@ -149,56 +154,6 @@ def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: BlockCorr
     if places is None:
         return np.sqrt(np.maximum(shared.covariance(scaled[:, np.newaxis])[:, 0, 0], 0))
     return np.sqrt(np.maximum(shared.variances(scaled, places), 0))
-
-
-def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:
-    """Return how many bins are clipped about echoes, 0 of those without a saturated sample within an echo width.
-
-    Parameters
-    ----------
-    saturated
-        Whether samples are saturated, shape (n, time).
-    bins
-        Bins of the peaks, -1 without an echo, shape (echo, n).
-    width
-        Echo width in bins, by which runs of saturated samples may be apart to count as one.
-    """
-    count, index = saturated.shape[1], np.arange(saturated.shape[1])
-    if not saturated.any():
-        return np.zeros(bins.shape)
-    before = np.maximum.accumulate(np.where(saturated, index, -1), axis=1)
-    after = np.minimum.accumulate(np.where(saturated, index, count)[:, ::-1], axis=1)[:, ::-1]
-    # Samples between two saturated ones that are near each other are in one run.
-    inside = saturated | ((before >= 0) & (after < count) & (after - before <= width))
-    first = np.maximum.accumulate(np.where(inside, -1, index), axis=1) + 1
-    last = np.minimum.accumulate(np.where(inside, count, index)[:, ::-1], axis=1)[:, ::-1] - 1
-    half, lines = int(np.ceil(width)), np.arange(len(saturated))
-    low, top = np.clip(bins - half, 0, count - 1), np.clip(bins + half, 0, count - 1)
-    left, right = after[lines, low], before[lines, top]
-    found = (bins >= 0) & (left <= right)
-    ends = last[lines, np.maximum(right, 0)] - first[lines, np.minimum(left, count - 1)] + 1
-    return np.where(found, ends, 0).astype(np.float64)
-
-
-def longest_run(saturated: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the first and last bin of the longest run of saturated samples, shape (n, time); 1 and 0 without any."""
-    index = np.arange(saturated.shape[1])
-    run = index - np.maximum.accumulate(np.where(saturated, -1, index), axis=1)
-    last = run.argmax(axis=1)
-    return last - run.max(axis=1) + 1, last
-
-
-def may_be_second_return(
-    time_ns: FloatArray, half_ns: FloatArray, clipped_ns: FloatArray, width_ns: float
-) -> BoolArray:
-    """Return which echoes may be light that a bottom within a clipped time has returned twice.
-
-    Times of echoes, and halves of their delays behind the mean surface, are of the shape (n, estimator, echo), first
-    and last clipped times (n, 2). Half delays below two echo widths are within the surface's own echo.
-    """
-    start, end = clipped_ns.T[..., np.newaxis, np.newaxis]
-    clipped = (start <= time_ns - half_ns) & (time_ns - half_ns <= end) & (half_ns > 2 * width_ns)
-    return np.asarray(clipped & (np.arange(time_ns.shape[-1]) > 1))
 
 
 @dataclass(frozen=True)
@@ -283,6 +238,7 @@ def find_echoes(
     contrast: float = 0.05,
     earliest_ns: float = -np.inf,
     latest_ns: npt.ArrayLike = np.inf,
+    after_ns: npt.ArrayLike = -np.inf,
     event_height: npt.ArrayLike = 0.0,
     waves: bool = False,
     targets: int | None = None,
@@ -312,10 +268,12 @@ def find_echoes(
     contrast : float
         Smallest excess of a peak behind the surface over the column, relative to the signal, 0 to 1.
     earliest_ns : float
-        Earliest time of the surface echo [ns].
+        Earliest time of the surface echo [ns]; before it only echoes above three thresholds count, which are land.
     latest_ns : array_like, shape () or (n,)
         Latest time of the surface echo [ns]. Where the first peak is later, there is none, and the peak is a target or
         the bottom.
+    after_ns : array_like, shape () or (n,)
+        Time from which on echoes count [ns].
     event_height : array_like, shape () or (n,)
         Height that single events of the detector reach. Lower peaks count only where there is no higher one.
     waves : bool
@@ -337,7 +295,14 @@ def find_echoes(
     power, noise = smooth(records, _SMOOTHING * width)
     count = power.shape[1]
     bins = np.arange(count)
-    surface = _first_peak(power, noise, threshold, records.time_ns >= earliest_ns)
+    early = records.time_ns < earliest_ns
+    events = np.broadcast_to(np.asarray(event_height, dtype=np.float64), len(power))[:, np.newaxis]
+    surface = _first_peak(
+        power,
+        np.where(early, _EARLY * np.maximum(noise, events / threshold), noise),
+        threshold,
+        records.time_ns >= np.asarray(after_ns)[..., np.newaxis],
+    )
     # Without a surface echo, the others are behind its latest time.
     latest = np.searchsorted(records.time_ns, np.broadcast_to(np.asarray(latest_ns), surface.shape), side="right") - 1
     late = surface > latest

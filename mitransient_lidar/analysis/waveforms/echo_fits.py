@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +78,7 @@ def gaussian_surface(
     begin = column or ColumnOnset()
     # The brightest depth may be the peak, later than the surface; that of a single shot may be twice as deep.
     early = begin.brightest_ns
-    data = _Data.of(records, bins, width, decay, (-2 - 2 * early / width, 2), shape)
+    data = Windows.of(records, bins, width, decay, (-2 - 2 * early / width, 2), shape)
     data = replace(data, earliest=-1.2 * width - 2 * early)
     # A column over waves that begins at the earliest time that a fit may find began before it.
     limit = data.earliest + _CLOSE * width if early > 0 else -np.inf
@@ -115,17 +116,17 @@ def gaussian_surface(
 
     exists = has_echo(flags)
     if not reflects:
-        only = _fit(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan))
+        only = fit_windows(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan))
         return _echoes(records, bins, only.later(limit), flags, shape)
-    fit = _fit(model, start, data, peak, exists)
-    tried: list[_Fit] = []
+    fit = fit_windows(model, start, data, peak, exists)
+    tried: list[WindowFits] = []
     if early > 0:
         # A column that is brightest below the surface has the shape of a late echo.
-        tried.append(_fit(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan)))
+        tried.append(fit_windows(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan)))
         faint = np.where(tried[0].good[:, np.newaxis], tried[0].values, faint)
         second = faint.copy()
         second[:, 2] = _FAINT * peak
-        other = _fit(model, second, data, peak, exists)
+        other = fit_windows(model, second, data, peak, exists)
         fit = fit.replaced(other.good & ~(fit.good & (fit.cost <= other.cost)), other)
     error = np.sqrt(fit.covariance[:, 2, 2])
     weak = exists & ~(fit.good & (fit.values[:, 2] > _CLEAR * error))
@@ -136,7 +137,7 @@ def gaussian_surface(
             continue
         if not weak.any():
             return _echoes(records, bins, fit.later(limit), flags, shape)
-        tried.append(_fit(model, faint, data, peak, weak, np.where(weak, share * peak, np.nan)))
+        tried.append(fit_windows(model, faint, data, peak, weak, np.where(weak, share * peak, np.nan)))
         faint = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, faint)
         weak &= ~some | (tried[0].cost <= fit.cost + _SIGNIFICANT)
     return _echoes(records, bins, fit.replaced(weak, _mean(tried)).later(limit), flags, shape)
@@ -161,7 +162,7 @@ def gaussian_echo(
     the echoes before and behind it in the bins `around`, each of shape (n,) and -1 without one. The other arguments are
     those of `gaussian_surface`.
     """
-    data = _Data.of(records, bins, width, decay, (-2, 1.5), shape)
+    data = Windows.of(records, bins, width, decay, (-2, 1.5), shape)
     if after is not None:
         first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
         data = replace(data, usable=data.usable & (data.u - shape.peak_ns >= first[:, np.newaxis]))
@@ -197,11 +198,11 @@ def gaussian_echo(
         jacobian = np.stack([by_time + k * column, by_s, echo, fall * (1 - passed), fall * passed], axis=1)
         return height * echo + column, jacobian
 
-    return _echoes(records, bins, _fit(model, start, data, peak, has_echo(flags)), flags, shape)
+    return _echoes(records, bins, fit_windows(model, start, data, peak, has_echo(flags)), flags, shape)
 
 
 @dataclass(frozen=True)
-class _Data:
+class Windows:
     """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1).
 
     Times count from the arrival of an ideal echo whose peak is in the bin of the peak; `earliest` is the first one that
@@ -227,7 +228,7 @@ class _Data:
         decay: npt.ArrayLike,
         span: tuple[float, float],
         shape: EchoShape,
-    ) -> _Data:
+    ) -> Windows:
         """Return the samples in a span of echo widths about the peaks, and at least four bins on both sides."""
         rate = np.broadcast_to(np.asarray(decay, dtype=np.float64), bins.shape)[:, np.newaxis]
         low, high = (end * width / records.bin_ns for end in span)
@@ -237,7 +238,7 @@ class _Data:
         u = np.asarray(lags * records.bin_ns + shape.peak_ns, dtype=np.float64)
         return cls(u, power, noise, inside, rate, width, shape, -1.2 * width)
 
-    def about_rise(self, level: FloatArray) -> tuple[_Data, FloatArray]:
+    def about_rise(self, level: FloatArray) -> tuple[Windows, FloatArray]:
         """Return the samples with the uncertainty of the focusing, and the times of the rises of columns with a level.
 
         Samples later than a width behind the rise are uncertain, unless their peak is far above the column. The time of
@@ -253,6 +254,15 @@ class _Data:
         noise = np.hypot(self.noise, share * np.maximum(self.power, 0))
         return replace(self, noise=noise), np.where(rises, first - self.shape.peak_ns, np.nan)
 
+    def limits(self, scale: FloatArray, size: int) -> Limits:
+        """Return the limits of echoes of a scale, shape (n,), with so many parameters."""
+        lowest, highest = np.full(size, -np.inf), np.full(size, np.inf)
+        lowest[:3] = self.earliest, self.shape.least_sigma, 0
+        highest[:2] = 1.2 * self.width, self.shape.sigma_of(3 * self.width)
+        unit = np.full((len(scale), size), self.width)
+        unit[:, 2:] = scale[:, np.newaxis]
+        return Limits(lowest, highest, unit)
+
     def peak(self) -> FloatArray:
         """Return the largest sample within half an echo width, shape (n,)."""
         near = np.abs(self.u - self.shape.peak_ns) < 0.5 * self.width
@@ -260,7 +270,7 @@ class _Data:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class WindowFits:
     """Parameters (n, p), their covariance (n, p, p), squared residuals and convergence of the fits (n,)."""
 
     values: FloatArray
@@ -268,13 +278,13 @@ class _Fit:
     cost: FloatArray
     good: BoolArray
 
-    def later(self, limit: float) -> _Fit:
+    def later(self, limit: float) -> WindowFits:
         """Return the fits, of which only those count that are later than a time from the peak."""
         return replace(self, good=self.good & (self.values[:, 0] > limit))
 
-    def replaced(self, where: BoolArray, fit: _Fit) -> _Fit:
+    def replaced(self, where: BoolArray, fit: WindowFits) -> WindowFits:
         """Return this fit with another one in some rows."""
-        return _Fit(
+        return WindowFits(
             np.where(where[:, np.newaxis], fit.values, self.values),
             np.where(where[:, np.newaxis, np.newaxis], fit.covariance, self.covariance),
             np.where(where, fit.cost, self.cost),
@@ -282,7 +292,7 @@ class _Fit:
         )
 
 
-def _mean(tried: list[_Fit]) -> _Fit:
+def _mean(tried: list[WindowFits]) -> WindowFits:
     """Return the mean of fits at the heights `_HEIGHTS`, each weighted with its likelihood."""
     cost = np.stack([np.where(fit.good, fit.cost, np.inf) for fit in tried])
     good = np.isfinite(cost).any(axis=0)
@@ -299,17 +309,32 @@ def _mean(tried: list[_Fit]) -> _Fit:
     apart = values - mean
     within = np.stack([np.where(fit.good[:, np.newaxis, np.newaxis], fit.covariance, 0) for fit in tried])
     covariance = np.einsum("jn,jnpq->npq", weight, within + apart[..., :, np.newaxis] * apart[..., np.newaxis, :])
-    return _Fit(mean, covariance, cost.min(axis=0), good)
+    return WindowFits(mean, covariance, cost.min(axis=0), good)
 
 
-def _fit(
-    model: Model, start: FloatArray, data: _Data, scale: FloatArray, wanted: BoolArray, held: FloatArray | None = None
-) -> _Fit:
+class Limits(NamedTuple):
+    """Least and largest values of the parameters of fits, and their units; shape (p,) or (n, p) each."""
+
+    lowest: FloatArray
+    highest: FloatArray
+    unit: FloatArray
+
+
+def fit_windows(
+    model: Model,
+    start: FloatArray,
+    data: Windows,
+    scale: FloatArray,
+    wanted: BoolArray,
+    held: FloatArray | None = None,
+    limits: Limits | None = None,
+) -> WindowFits:
     """Fit a model to many windows at once by damped least squares (Levenberg and Marquardt).
 
-    Heights that are not NaN in `held`, shape (n,), are fixed.
+    Heights, the third parameters, that are not NaN in `held`, shape (n,), are fixed. Without limits the parameters are
+    those of echoes: time, standard deviation, and heights in units of `scale`.
     """
-    u, power, usable, rate, width = data.u, data.power, data.usable, data.rate, data.width
+    u, power, usable, rate = data.u, data.power, data.usable, data.rate
     count, size = start.shape
     held = np.full(count, np.nan) if held is None else held
     fixed = np.isfinite(held)
@@ -323,13 +348,8 @@ def _fit(
     # Fits with fixed heights, which are only compared, need less accuracy.
     enough = np.where(fixed, 1e-3, 1e-4)
     weights = np.where(usable, 1 / data.noise, 0.0)
-    unit = np.ones((count, size))
-    unit[:, :2] = width
-    unit[:, 2:] = scale[:, np.newaxis]
-    lowest, highest = np.full(size, -np.inf), np.full(size, np.inf)
-    lowest[:3] = data.earliest, data.shape.least_sigma, 0
-    highest[:2] = 1.2 * width, data.shape.sigma_of(3 * width)
-    values[:, :2] = np.clip(values[:, :2], lowest[:2], highest[:2])
+    lowest, highest, unit = (np.broadcast_to(one, start.shape) for one in limits or data.limits(scale, size))
+    values[:, :2] = np.clip(values[:, :2], lowest[:, :2], highest[:, :2])
     active = np.flatnonzero(wanted)
     cost = np.full(count, np.inf)
     found, jacobian = model(values[active], u, rate[active])
@@ -348,7 +368,8 @@ def _fit(
             active
         ]
         # A parameter at a limit stays there while the residuals push it outwards.
-        stuck = ((x <= lowest) & (right < 0)) | ((x >= highest) & (right > 0))
+        low, high = lowest[active], highest[active]
+        stuck = ((x <= low) & (right < 0)) | ((x >= high) & (right > 0))
         right[stuck] = 0
         normal = np.where(stuck[:, :, np.newaxis] | stuck[:, np.newaxis, :], 0, normal)
         diagonal = np.einsum("nii->ni", normal)
@@ -357,7 +378,7 @@ def _fit(
         damped = normal + ridge[:, :, np.newaxis] * np.eye(size)
         step = np.linalg.solve(damped, right[..., np.newaxis])[..., 0]
         trial = x + np.clip(step, -1, 1) * unit[active]
-        trial = np.clip(trial, lowest, highest)
+        trial = np.clip(trial, low, high)
         trial[:, 2] = np.where(fixed[active], held[active], trial[:, 2])
         tried, changed = model(trial, u, k)
         after = values.copy()
@@ -386,7 +407,7 @@ def _fit(
         inverse = np.linalg.inv(normal + 1e-13 * trace * np.eye(size))
         covariance[good] = inverse * unit[good][:, :, np.newaxis] * unit[good][:, np.newaxis, :]
     good &= fixed | (values[:, 2] > 0)
-    return _Fit(values, covariance, cost, good)
+    return WindowFits(values, covariance, cost, good)
 
 
 @dataclass(frozen=True)
@@ -411,7 +432,7 @@ class _Prior:
         return np.asarray((self.weight[rows] * (values[rows, self.index] - self.mean[rows])) ** 2)
 
 
-def _echoes(records: Records, bins: IntArray, fit: _Fit, flags: IntArray, shape: EchoShape) -> Echoes:
+def _echoes(records: Records, bins: IntArray, fit: WindowFits, flags: IntArray, shape: EchoShape) -> Echoes:
     """Return the echoes of fits whose first parameters are time, sigma and height."""
     time, s, height = fit.values[:, 0], fit.values[:, 1], fit.values[:, 2]
     variance = np.einsum("nii->ni", fit.covariance)

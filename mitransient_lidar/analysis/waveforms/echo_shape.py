@@ -17,6 +17,7 @@ _CLOSE = 0.01  # largest deviation of Gaussians from a template, relative to its
 _WIDTHS = (0.9, 0.75, 0.6, 0.45, 0.35, 0.25, 0.18, 0.12)  # tried widths of the Gaussians of a sum, over the template's
 _APART = 0.8  # distance of the Gaussians of a sum, in their standard deviations
 _LEAST_HEIGHT = 1e-4  # of the Gaussians of a sum, relative to the peak
+_BLURS, _BEYOND = 24, 4.0  # blurs of a table of pulses, and the reach of a Gaussian in its standard deviations
 
 
 @dataclass(frozen=True)
@@ -173,3 +174,69 @@ class EchoShape:
     def _extra(fwhm_ns: float, own: float) -> float:
         """Return the variance [ns^2] by which an echo is wider than another one."""
         return (fwhm_ns**2 - own**2) / FWHM_PER_SIGMA**2
+
+
+@dataclass(frozen=True)
+class BlurredPulse:
+    """A template that is blurred by Gaussians, and its integral over time, from tables.
+
+    Attributes
+    ----------
+    start_ns, step_ns
+        First time of the tables and their step [ns].
+    variances
+        Variances of the Gaussians [ns^2], ascending from 0, denser near it.
+    power, slope, integral
+        Shape with the area of the template, its derivative by time [1/ns] and its integral [ns]; shape (variances, n).
+    """
+
+    start_ns: float
+    step_ns: float
+    variances: FloatArray
+    power: FloatArray
+    slope: FloatArray
+    integral: FloatArray
+
+    @classmethod
+    def of(cls, template: Template, most_ns: float) -> BlurredPulse:
+        """Return a template blurred by Gaussians of standard deviations up to one [ns]."""
+        from scipy.ndimage import gaussian_filter1d
+
+        step = float(template.time_ns[1] - template.time_ns[0])
+        beyond = int(np.ceil(_BEYOND * most_ns / step))
+        power = np.pad(template.power, beyond)
+        sigmas = most_ns * np.linspace(0, 1, _BLURS)
+        wider = [gaussian_filter1d(power, one / step, truncate=_BEYOND) for one in sigmas[1:]]
+        blurred, variances = np.stack([power, *wider]), sigmas**2
+        start = float(template.time_ns[0]) - beyond * step
+        slope = np.gradient(blurred, step, axis=1)
+        return cls(start, step, variances, blurred, slope, np.cumsum(blurred, axis=1) * step)
+
+    @property
+    def area_ns(self) -> float:
+        """Integral of the shape [ns]."""
+        return float(self.integral[0, -1])
+
+    def plain(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return shape, derivative and integral of the template at times [ns]."""
+        at = self.start_ns + self.step_ns * np.arange(self.power.shape[1])
+        power, slope = (np.interp(time_ns, at, one[0], left=0, right=0) for one in (self.power, self.slope))
+        return power, slope, np.interp(time_ns, at + 0.5 * self.step_ns, self.integral[0], left=0)
+
+    def blurred(self, time_ns: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return shape, its derivative by time [1/ns] and by the variance [1/ns^2], at variances, shape (n, 1)."""
+        row = np.clip(np.searchsorted(self.variances, variance, side="right") - 1, 0, _BLURS - 2)
+        between = (variance - self.variances[row]) / (self.variances[row + 1] - self.variances[row])
+        place = (time_ns - self.start_ns) / self.step_ns
+        inside = (place >= 0) & (place < self.power.shape[1] - 1)
+        left = np.where(inside, place, 0).astype(np.intp)
+        right = np.where(inside, place - left, 0.0)
+        corner = row * self.power.shape[1] + left
+        below = corner + self.power.shape[1]
+        near, far = (
+            [flat[at] * (1 - right) + flat[at + 1] * right for flat in (self.power.ravel(), self.slope.ravel())]
+            for at in (corner, below)
+        )
+        power, slope = (np.where(inside, a + between * (b - a), 0.0) for a, b in zip(near, far, strict=True))
+        by_variance = np.where(inside, (far[0] - near[0]) / (self.variances[row + 1] - self.variances[row]), 0.0)
+        return power, slope, by_variance

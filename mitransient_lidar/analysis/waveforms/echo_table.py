@@ -13,19 +13,12 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms import deconvolution, echo_estimators, echo_fits
 from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_echoes, column_fit
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE, DepthErrors
-from mitransient_lidar.analysis.waveforms.echo_detection import (
-    BEHIND_EDGE,
-    DetectedEchoes,
-    Echoes,
-    EchoFlag,
-    Records,
-    find_echoes,
-    longest_run,
-    may_be_second_return,
-    saturated_spans,
-)
+from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection, EchoClass, decide
+from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, Echoes, EchoFlag, Records, has_echo
+from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
+from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans
+from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, SurfaceLevel, surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
@@ -40,14 +33,14 @@ ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deco
 ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
-_TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
 _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
-_OF_ECHOES = (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES), "flags")
+_OF_ECHOES = (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES), "flags", "class")
 _PER_WAVEFORM = (
+    "class_probability",
     *("attenuation", "attenuation_stderr", "attenuation_chi2", "column_start_ns", "column_end_ns"),
     *("layer_depth_m", "layer_p_value", "layer_step", "layer_attenuation_above", "layer_attenuation_below"),
 )
@@ -75,6 +68,7 @@ def extract(
     saturation_level: float | None = None,
     layers: Annotated[int, Option("Number of changes in the column to test for", 0, 8)] = 0,
     depth_from: Literal["echo", "mean"] = "echo",
+    level: SurfaceLevel | None = None,
     iterations: int = 50,
     block: int = 2048,
     targets: int | None = None,
@@ -108,6 +102,9 @@ def extract(
         Smallest saturated sample, as recorded, in addition to the variable ``saturated``.
     depth_from : {'echo', 'mean'}
         Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
+    level : SurfaceLevel, optional
+        Arrival of the surface in each waveform as known without it, for land and very shallow water; by default that of
+        the mean sea level, with an error of 0.15 m and the waves.
     iterations : int
         Iterations of the deconvolution, 1 to 10 000.
     block : int
@@ -120,10 +117,12 @@ def extract(
     xarray.Dataset
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
         ``echo`` (surface, column, target, target_2, ..., bottom; the strongest target first): ``time_ns``, ``depth_m``,
-        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of
-        `echo_detection.EchoFlag`. Without ``echo``: ``surface_time_ns``, the arrival of the surface in the pixel, with
-        ``_stderr`` and ``_method_error``, which ``depth_m_method_error`` includes. Over the dimensions of the waveforms
-        alone: ``attenuation`` [1/m] along the path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
+        ``amplitude``, ``energy`` and ``width_ns`` with ``_stderr``, ``depth_m_method_error``, ``class``, an
+        `echo_classes.EchoClass`, and ``flags``, sums of `echo_detection.EchoFlag`. Land is the echo ``bottom``, objects
+        above the water are targets, both timed in air, with negative depths. Without ``echo``: ``surface_time_ns``, the
+        arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which ``depth_m_method_error``
+        includes. Over the dimensions of the waveforms alone: ``class_probability``, ``attenuation`` [1/m] along the
+        path, its ``_stderr``, ``attenuation_chi2``, ``column_start_ns`` and
         ``_end_ns``; with `layers`, over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``,
         ``layer_attenuation_above`` and ``_below``.
 
@@ -209,7 +208,7 @@ def extract(
     layers, block = integer("layers", layers, 0, 8), integer("block", block, 1, 10**9)
     waveforms = Waveforms.from_dataset(dataset, pulse, noise, echo_fwhm_ns, saturation_level)
     wanted = None if targets is None else integer("targets", targets, 1, 100)
-    settings = _Settings(names, threshold, contrast, layers, depth_from, iterations, wanted)
+    settings = _Settings(names, threshold, contrast, layers, depth_from, level, iterations, wanted)
     starts = range(0, waveforms.count, block)
     parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
     count = wanted or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
@@ -226,6 +225,7 @@ class _Settings:
     contrast: float
     layers: int
     depth_from: str
+    level: SurfaceLevel | None
     iterations: int
     targets: int | None
 
@@ -240,7 +240,7 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
     missing = targets + len(ECHOES) - 1 - part["flags"].shape[-1]
     filled = dict(part)
     for name in _OF_ECHOES if missing > 0 else ():
-        value = int(EchoFlag.NO_ECHO) if name == "flags" else np.nan
+        value = {"flags": int(EchoFlag.NO_ECHO), "class": int(EchoClass.NONE)}.get(name, np.nan)
         filled[name] = np.insert(part[name], [part[name].shape[-1] - 1] * missing, value, axis=-1)
     return filled
 
@@ -248,23 +248,18 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
     records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
-    found = find_echoes(
+    decision = decide(
+        waveforms,
+        rows,
         records,
-        width,
-        threshold=settings.threshold,
-        contrast=settings.contrast,
-        earliest_ns=waveforms.quiet_until_ns,
-        latest_ns=waveforms.latest_surface(rows),
-        event_height=waveforms.events(rows),
-        waves=waveforms.focusing is not None,
-        targets=settings.targets,
-        tail=waveforms.template.share_behind(BEHIND_EDGE * width),
+        waveforms.surface_level(rows) if settings.level is None else settings.level.part(rows),
+        _TYPICAL_DECAY,
+        Detection(settings.threshold, settings.contrast, settings.targets),
     )
+    found = decision.found
     time, surface = records.time_ns, found.surface
-    # The column begins where the tail of the surface echo has ended.
-    tail = max(1.75 * width, waveforms.template.tail_ns(_TAIL) + width - waveforms.template.fwhm_ns)
-    start = np.where(surface >= 0, time[surface] + tail, np.nan)
-    later = np.where(found.bins[1:] >= 0, found.bins[1:], time.size).min(axis=0)
+    start = np.where(surface >= 0, time[surface] + waveforms.tail_ns, np.nan)
+    later = np.where(found.bins[1:] > surface, found.bins[1:], time.size).min(axis=0)
     following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
@@ -283,6 +278,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     for estimator in settings.estimators:
         usable = clear if estimator == "gaussian" else records
         echoes = _estimate(estimator, waveforms, usable, found, column, sharp, settings)
+        echoes = decision.fitted(echoes) if estimator == "gaussian" else echoes
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
         quantities.append([echoes[0], column_echoes(records, column, start, end, surface_ns - reference), *echoes[1:]])
@@ -295,6 +291,9 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     for echo, span in zip((0, *range(2, len(spans) + 1)), spans[:, :, np.newaxis], strict=True):
         error = table["time_ns_stderr"][..., echo]
         error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
+    table["class"] = np.insert(decision.classes(width), 1, np.where(np.isfinite(column.level), EchoClass.COLUMN, 0), 1)
+    table["class_probability"] = decision.probability
+    table["near_ns"], table["near_stderr"] = decision.surfaces()
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
     table["clipped_ns"] = time[np.stack(longest_run(saturated), axis=1)]
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
@@ -358,6 +357,10 @@ def _with_depths(
         time[absent, number, 0] = error[absent, number, 0] = np.nan
         by_light[:, number] = found.method_ns.ravel()
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
+    # Where surface and bottom are not apart, what their joint fit has of the surface.
+    near, near_error = (table.pop(name)[:, np.newaxis] for name in ("near_ns", "near_stderr"))
+    near_error = np.hypot(near_error, errors.of_surface(np.isfinite(near[:, 0]))[:, np.newaxis])
+    zero, zero_error = (np.where(np.isfinite(near), *pair) for pair in ((near, zero), (near_error, zero_error)))
     half = 0.5 * (time - lines.surface_time[:, np.newaxis, np.newaxis])
     second = may_be_second_return(time, half, table.pop("clipped_ns"), waveforms.echo_fwhm_ns)
     table["flags"] |= np.where(second, int(EchoFlag.SATURATED), 0)
@@ -371,12 +374,18 @@ def _with_depths(
     else:
         delay, spread = 2 * half, np.hypot(error, np.hypot(trigger, clock))
         layer_zero = lines.surface_time
-    table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
+    classes = np.where(has_echo(table["flags"]), table["class"][:, np.newaxis], int(EchoClass.NONE))
+    table["class"] = classes
+    in_air = (classes == EchoClass.LAND) | (classes == EchoClass.ABOVE)
+    per_ns = (IN_AIR * np.cos(lines.off_nadir))[:, np.newaxis, np.newaxis]
+    for name, one in (("depth_m", delay), ("depth_m_stderr", spread)):
+        table[name] = np.where(in_air, per_ns * one, lines.depth_of_delay(one))
     from_mean = settings.depth_from == "mean"
     level = np.where(waveforms.unit == "W", table["amplitude"][:, 0, ECHOES.index("column")], np.nan)
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
+    by_water = np.where(in_air, per_ns * errors.of_land()[:, np.newaxis, np.newaxis], by_water)
     of_surface = (table["flags"] & int(EchoFlag.COLUMN_ONSET) > 0) | ((np.arange(time.shape[-1]) > 0) != from_mean)
     method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
     table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)
@@ -390,7 +399,6 @@ def _label(
 ) -> xr.Dataset:
     """Return the table with its dimensions, units and provenance."""
     dims, shape = waveforms.dims[:-1], waveforms.shape[:-1]
-    energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
 
     def of_echoes(values: npt.NDArray[Any], **described: Any) -> tuple[Any, ...]:
         inner = ("estimator", "echo") if several else ("echo",)
@@ -402,6 +410,7 @@ def _label(
         values = table["surface_time_ns" + suffix]
         inner, sizes = ("estimator",) * several, values.shape[1 : 1 + several]
         data["surface_time_ns" + suffix] = (*dims, *inner), values.reshape(*shape, *sizes)
+    data["class"] = of_echoes(table["class"].astype(np.int64), **flagged(EchoClass))
     data["flags"] = of_echoes(table["flags"].astype(np.int64), **flagged(EchoFlag))
     for name in _PER_WAVEFORM:
         if name in table:
@@ -419,6 +428,7 @@ def _label(
         "echo_fwhm_ns": waveforms.echo_fwhm_ns,
         "echo_threshold": settings.threshold,
         "echo_contrast": settings.contrast,
+        "merged_below_m": SEPARATE * waveforms.echo_fwhm_ns * waveforms.geometry.depth_per_ns,
     }
     energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
     kind = "mean" if settings.depth_from == "mean" else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
+from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
-from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE
+from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -28,8 +30,12 @@ from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
 _LATEST = 3.0  # widths of an echo by which the surface may be late
-_LOWEST = -3.0  # point of a sea without the attribute surface_heights_m [m]
+_UNKNOWN_SEA = -3.0, 3.0  # lowest and highest point of a sea without the attribute surface_heights_m [m]
 _UNKNOWN = 10.0  # noise of samples that are not stored, over the threshold of blocks
+_LAND = 30.0  # height of an echo before the sea's, in typical deviations of samples or heights of single events
+_TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
+_BLUR = 1.0  # largest standard deviation of an echo's blur, in echo widths
+_CLEAREST = 1e-3  # backscattering coefficient of the clearest sea water at 532 nm, that of its molecules [1/m]
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
@@ -63,8 +69,11 @@ class Waveforms:
         Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
     event_height
         Height that single events of the detector reach, shape (pixels,).
-    lowest_m
-        Lowest point of the sea [m], negative; that of a rough sea where it is not known.
+    lowest_m, highest_m
+        Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
+    sensitivity, column_gain
+        Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
+        backscattering coefficient [W m], 0 and NaN where they are not known.
     shared
         Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
     """
@@ -89,6 +98,9 @@ class Waveforms:
     lines: LinesOfSight
     event_height: FloatArray
     lowest_m: float
+    highest_m: float
+    sensitivity: FloatArray
+    column_gain: float
     shared: BlockCorrelation | None = None
 
     @property
@@ -139,7 +151,11 @@ class Waveforms:
         if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
             quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
-        quiet = time < quiet_until
+        sea = np.atleast_1d(dataset.attrs.get("surface_heights_m", _UNKNOWN_SEA))
+        events = _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels)
+        quiet, calm = time < quiet_until, samples
+        if name == "signal" and not in_blocks:
+            quiet, calm = _without_land(samples, time, quiet_until, events, width)
         baseline = np.zeros(pixels)
         if in_blocks:
             baseline, _ = _block_levels(dataset, pixels)
@@ -148,9 +164,9 @@ class Waveforms:
                 raise UserError(
                     f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
                 )
-            baseline = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
+            baseline = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
         run = max(int(template.fwhm_ns / step), 1)
-        deviation, shared = _noise(dataset, name, samples, baseline, quiet, noise, run), None
+        deviation, shared = _noise(dataset, name, samples, calm, baseline, quiet, noise, run), None
         if name == "waveform" and noise is None and "waveform_stderr" in dataset:
             deviation, shared = _noise_of_render(dataset, deviation, run)
         if in_blocks:
@@ -174,10 +190,24 @@ class Waveforms:
             quiet_until,
             geometry,
             _lines_of_sight(dataset, dims[:-1]),
-            _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels),
-            float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _LOWEST))[0]),
+            events,
+            float(sea[0]),
+            float(sea[-1]),
+            _sensitivity(dataset, name, pixels),
+            column_gain(dataset.attrs),
             shared,
         )
+
+    @property
+    def tail_ns(self) -> float:
+        """Time from the peak of a surface echo to where its tail has ended and the column begins [ns]."""
+        width, template = self.echo_fwhm_ns, self.template
+        return max(1.75 * width, template.tail_ns(_TAIL) + width - template.fwhm_ns)
+
+    @cached_property
+    def blurred_pulse(self) -> BlurredPulse:
+        """The ideal echo, blurred as by slopes."""
+        return BlurredPulse.of(self.template, _BLUR * self.echo_fwhm_ns)
 
     @property
     def brightest(self) -> float:
@@ -198,6 +228,19 @@ class Waveforms:
         margin = _LATEST * (self.echo_fwhm_ns + lines.surface_spread) + self.template.peak_ns + self.onset.brightest_ns
         dark = lines.beam_share < LEAST_SHARE * self.brightest
         return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
+
+    def surface_level(self, rows: slice) -> SurfaceLevel:
+        """Return the arrival of the mean sea level in some of the waveforms, with the waves about it."""
+        lines = self.lines_of(rows)
+        per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+        waves = (self.highest_m - self.lowest_m) / HEIGHTS
+        return SurfaceLevel(lines.surface_time, np.hypot(math.hypot(waves, LEVEL) * per_metre, lines.surface_spread))
+
+    def least_column(self, rows: slice) -> FloatArray:
+        """Return the signal of the column of the clearest water at the surface, 0 where it is not known."""
+        share = np.nan_to_num(self.lines_of(rows).beam_share)
+        pixel = np.arange(rows.start, rows.stop) % self.sensitivity.size
+        return np.asarray(share * self.sensitivity[pixel] * _CLEAREST * np.nan_to_num(self.column_gain))
 
     def events(self, rows: slice) -> FloatArray:
         """Return the heights that single events of the detector reach, shape (waveforms,)."""
@@ -230,6 +273,35 @@ def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:
     if "event_height" not in dataset or dataset["event_height"].size != pixels:
         return np.zeros(pixels)
     return np.nan_to_num(dataset["event_height"].values.reshape(-1).astype(np.float64))
+
+
+def _sensitivity(dataset: xr.Dataset, name: str, pixels: int) -> FloatArray:
+    """Return the signal per power of steady light, shape (pixels,); 0 where it is not known."""
+    if name == "waveform":
+        return np.ones(pixels)
+    if "receiver_sensitivity" not in dataset or dataset["receiver_sensitivity"].size != pixels:
+        return np.zeros(pixels)
+    return np.asarray(dataset["receiver_sensitivity"].values.reshape(-1), dtype=np.float64)
+
+
+def _without_land(
+    samples: npt.NDArray[Any], time: FloatArray, quiet_until: float, events: FloatArray, width: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[Any]]:
+    """Return the bins before the sea and the samples of shots that are quiet there; else the bins before any land."""
+    quiet = time < quiet_until
+    if np.count_nonzero(quiet) < _FEWEST_QUIET:
+        return quiet, samples
+    rest = np.abs(samples[:, quiet] - np.nanmedian(samples[:, quiet]))
+    least = max(float(np.nanmedian(rest)), float(np.nanmean(rest)) / _LAND, float(events.max(initial=0.0)))
+    above = rest > _LAND * least
+    if not above.any() or least <= 0:
+        return quiet, samples
+    of_shot = samples.reshape(-1, events.size, samples.shape[1])
+    calm = ~above.any(axis=1).reshape(-1, events.size).any(axis=1)
+    if calm.any():
+        return quiet, of_shot[calm].reshape(-1, samples.shape[1])
+    before = time < time[np.flatnonzero(above.any(axis=0))[0]] - 2 * width
+    return (before if np.count_nonzero(before) >= _FEWEST_QUIET else quiet), samples
 
 
 def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
@@ -291,6 +363,7 @@ def _noise(
     dataset: xr.Dataset,
     name: str,
     samples: npt.NDArray[Any],
+    calm: npt.NDArray[Any],
     baseline: FloatArray,
     quiet: npt.NDArray[np.bool_],
     noise: float | npt.ArrayLike | None,
@@ -305,7 +378,7 @@ def _noise(
         return given.reshape(-1, 1) + np.zeros((pixels, 1)) if given.size <= pixels else given.reshape(pixels, count)
     if name == "waveform" and "waveform_stderr" in dataset:
         return np.asarray(dataset["waveform_stderr"].values.reshape(-1, count), dtype=np.float64)
-    by_receiver = _receiver_noise(dataset, samples, baseline, quiet, run)
+    by_receiver = _receiver_noise(dataset, samples, calm, baseline, quiet, run)
     if "signal_mean_stderr" not in dataset:
         return by_receiver
     # Structures within the error of a render are no echoes, though they are in all records of a shot. That of a peak is
@@ -328,7 +401,12 @@ def _noise_of_render(
 
 
 def _receiver_noise(
-    dataset: xr.Dataset, samples: npt.NDArray[Any], baseline: FloatArray, quiet: npt.NDArray[np.bool_], run: int
+    dataset: xr.Dataset,
+    samples: npt.NDArray[Any],
+    calm: npt.NDArray[Any],
+    baseline: FloatArray,
+    quiet: npt.NDArray[np.bool_],
+    run: int,
 ) -> FloatArray:
     """Return the noise of the receiver's signal for means of `run` samples."""
     pixels, count = baseline.size, samples.shape[1]
@@ -341,7 +419,7 @@ def _receiver_noise(
         return np.asarray(stated * _inflation(known, run))
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
-    rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
+    rest = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
     spread = np.sqrt(np.mean(rest**2, axis=(0, 2)))[:, np.newaxis]
     if "signal_deviation" not in dataset:
         return np.asarray(spread * _inflation(rest, run))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import LinesOfSight
@@ -16,9 +16,21 @@ LEAST_SHARE = 1e-3
 #: Angle from nadir [rad] beyond which no facet sends light back: a slope of 7 deviations at 20 m/s (Cox and Munk).
 GRAZING = np.radians(60.0)
 _LIMIT = 4.0  # standard deviations by which an echo may deviate from the other pixels' surface
-_LEVEL = 0.15  # error of the mean sea level [m]
+#: Error of the mean sea level [m].
+LEVEL = 0.15
 _SHAPE = 0.1  # error of an echo's time by its unknown shape, in echo widths
 _LEAST_ERROR = 1e-3  # of a time [ns]
+
+
+class SurfaceLevel(NamedTuple):
+    """Arrival of the surface as known without a record: by the mean sea level, an infrared channel, or neighbours."""
+
+    time_ns: FloatArray  #: Mean, shape (n,).
+    stderr_ns: FloatArray  #: Standard deviation of the surface about it.
+
+    def part(self, rows: IntArray | slice) -> SurfaceLevel:
+        """Return those of some records."""
+        return SurfaceLevel(self.time_ns[rows], self.stderr_ns[rows])
 
 
 class SurfaceTimes(NamedTuple):
@@ -100,7 +112,7 @@ def surface_times(
     lit = candidate & (np.abs(deviation - middle) <= _LIMIT * np.hypot(extent, tilt))
     # An eighth of the heights' range is their standard deviation.
     heights = 0.125 * (heights_m[1] - heights_m[0]) * per_metre
-    level = np.hypot(heights, _LEVEL * per_metre)
+    level = np.hypot(heights, LEVEL * per_metre)
     variance = np.maximum(noise**2 + method_ns**2, _LEAST_ERROR**2)
     weight = np.where(lit, 1 / (variance + tilt**2), 0)
     precision = weight.sum(axis=1, keepdims=True) + 1 / level**2

@@ -55,9 +55,10 @@ def test_quality_of_points():
     echoes = xr.Dataset({name: (dims, values) for name, values in arrays.items()}, {"echo": echo})
     shot, kind = np.repeat(np.arange(shots), 2), np.tile([41, 40], shots)
     values = {"shot": shot, "pixel": np.zeros(6, dtype=int), "kind": kind, "flags": flags[shot, 0, np.tile([0, 3], 3)]}
+    values["echo"] = np.tile([0, 2], shots)
     points = xr.Dataset({name: ("point", value) for name, value in values.items()})
     found = points.assign(_quality(points, echoes))
-    saturated, poor, corrected, beyond = Quality
+    saturated, poor, corrected, beyond, *_ = Quality
     assert found["quality"].values.tolist() == [
         *(saturated, saturated | corrected),
         *(0, poor | corrected | beyond),

@@ -1,0 +1,386 @@
+"""What the first echo of a record is: land, the sea's surface, or a bottom with or without its surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import log_ndtr, logsumexp
+
+from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, IntArray, Records
+from mitransient_lidar.analysis.waveforms.echo_fits import Limits, Model, WindowFits, Windows, fit_windows
+from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape
+from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel
+from mitransient_lidar.core.validation import FloatArray
+
+#: Separation from which surface and bottom are two echoes, in echo widths.
+SEPARATE = 1.8
+
+_DELAYS = 32  # delays of a bottom that are tried
+_SHORTEST_NS = 0.05  # delay of a bottom that is fitted [ns]
+_FARTHEST = 4.0  # standard deviations of the surface from its level to the longest delay
+_BEFORE, _BEHIND = 2.0, 3.0  # samples before the earliest surface and behind the peak, in echo widths
+_COLUMN_NS = 10.0  # of the column behind a surface that count [ns]
+_OF_SAMPLE, _OF_PEAK = 0.01, 1e-3  # errors of the pulse's shape, relative to the sample and to the peak
+_BOTH = 0.3  # delay from which the peak may be that of the surface or of the bottom, in echo widths
+# Prior distributions: heights of land and depths of bottoms that are as likely as each other [m], and shares.
+_HIGHEST, _DEEPEST, _OF_LAND, _WITHOUT_BOTTOM = 20.0, 10.0, 0.5, 0.3
+_LEAST_COLUMN = 1e-5  # of a column of unknown water, relative to the peak
+_LEVELS, _CLEAR = 64, 3.0  # tried levels of a column, and standard errors from which on its fit alone counts
+_SIGNIFICANT = 5.0  # standard errors of the height of a surface that is told apart
+_LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
+# Light that a bottom sends back to itself by total reflection at the surface: times between which it counts, over those
+# of the depth, and their steps; and the prior of the bottom's reflectance: mean, error, largest.
+_AGAIN, _STEPS, _REFLECTANCE = (1.34, 12.0), 12, (0.2, 0.15, 0.6)
+_OF_FOCUSING, _FAINT = (
+    0.3,
+    0.05,
+)  # error of a column by waves, relative to it, and where it counts, relative to the peak
+_FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the largest
+
+
+@dataclass(frozen=True)
+class FirstEchoes:
+    """What the first echoes of n records are.
+
+    Attributes
+    ----------
+    chance
+        Probabilities of land, of a surface with water whose bottom is not seen, and of a bottom, shape (3, n).
+    bottom, surface
+        Land or bottom, and the surface before a bottom where it has an echo of its own that is told apart.
+    surface_ns, surface_stderr
+        Arrival of the surface of a bottom and its standard deviation [ns], shape (n,); NaN for land.
+    """
+
+    chance: FloatArray
+    bottom: Echoes
+    surface: Echoes
+    surface_ns: FloatArray
+    surface_stderr: FloatArray
+
+    def part(self, rows: BoolArray) -> FirstEchoes:
+        """Return those of some of the records."""
+        bottom, surface = (
+            Echoes(**{name: value[rows] for name, value in vars(one).items()}) for one in (self.bottom, self.surface)
+        )
+        return FirstEchoes(self.chance[:, rows], bottom, surface, self.surface_ns[rows], self.surface_stderr[rows])
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known of n records before they are fitted.
+
+    Attributes
+    ----------
+    level
+        Time of the surface.
+    metres_per_ns, depth_per_ns
+        Height in air and depth in the water per time [m/ns], shape (n,).
+    least_column
+        Signal of the column of the clearest water at the surface [unit of the record], shape (n,); 0 where unknown.
+    decay
+        Typical rate of decay of a column [1/ns].
+    onset
+        Mean focusing of the column's light by waves.
+    """
+
+    level: SurfaceLevel
+    metres_per_ns: FloatArray
+    depth_per_ns: FloatArray
+    least_column: FloatArray
+    decay: float
+    onset: ColumnOnset
+
+    def column(self, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the signal of a column at delays from the surface, over that at the surface, and its derivative."""
+        times, factors = self.onset.times, self.onset.factors
+        slopes = np.append(np.diff(factors) / np.diff(times), 0.0)
+        behind = np.maximum(delay_ns, 0)
+        fall = np.exp(-self.decay * behind)
+        factor = np.interp(behind, times, factors)
+        slope = slopes[np.clip(np.searchsorted(times, behind, side="right") - 1, 0, len(slopes) - 1)]
+        return fall * factor, np.where(delay_ns > 0, fall * (slope - self.decay * factor), 0.0)
+
+
+def first_echoes(
+    records: Records,
+    bins: IntArray,
+    pulse: BlurredPulse,
+    shape: EchoShape,
+    width: float,
+    priors: Priors,
+    extent: FloatArray,
+) -> FirstEchoes:
+    """Decide what the first peaks of records are, with a fit of each possibility.
+
+    Parameters
+    ----------
+    records, bins : Records and ndarray of int, shape (n,)
+        The waveforms and the bins of their first peaks.
+    pulse, shape, width
+        The ideal echo, and the expected full width of an echo [ns].
+    priors
+        What is known before.
+    extent
+        Delays behind these peaks up to which there may be a bottom [ns], shape (n,).
+
+    Notes
+    -----
+    All possibilities consist of the known pulse P, blurred by a Gaussian of free width for what slopes do, and of its
+    integral for a column of constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
+    on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and the echo A' P(t - t1) of
+    its surface; heights are not negative. It is followed by its light that is totally reflected at the surface and
+    meets the bottom again: of a Lambertian bottom of the reflectance rho, 2 rho d^2/u^3 per time at u > 1.34 d behind
+    it (below a level surface, later passages left out). Samples have their noise and the error of the pulse's shape.
+
+    The probabilities are those of Bayes' theorem with these prior distributions: land and water are as likely; heights
+    of land are uniform up to 20 m above the surface, depths of bottoms up to 10 m; the surface has the normal
+    distribution of its level; three waters in ten show no bottom; logarithms of a column's level are uniform from that
+    of the clearest water to the peak. Land is thus what stands above the surface, or what has no column where even the
+    clearest water would show one. The echoes of surface and column beside a bottom cost the volume of their parameters
+    (Laplace's approximation). Depths are means over 32 delays d up to that at which the surface is 4 standard
+    deviations above its level, or from the fit of all parameters where the surface has an echo of its own; errors
+    include the spread of these delays.
+    """
+    level, count = priors.level, len(bins)
+    spread = np.maximum(level.stderr_ns, _LEAST_SPREAD)
+    arrival = records.time_of(bins) - shape.peak_ns
+    longest = np.maximum(arrival - level.time_ns + _FARTHEST * spread, np.maximum(SEPARATE * width, extent))
+    delays = np.linspace(0, 1, _DELAYS + 1)[1:, np.newaxis] ** 1.5 * longest
+    fits = _Fits.of(records, bins, pulse, shape, width, longest, priors)
+    zero = np.zeros(count)
+
+    land = fits.bottom(zero, zero, surface=False)
+    land_ns = arrival + land.values[:, 0]
+    log_land = np.log(_OF_LAND * priors.metres_per_ns / _HIGHEST) - 0.5 * land.cost
+    log_land += log_ndtr((level.time_ns - land_ns) / spread)
+
+    sea = fits.surface()
+    log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
+    log_sea += _log_normal(arrival + sea.values[:, 0], level.time_ns, spread)
+    log_sea += _log_column(sea, priors.least_column, fits.peak)
+
+    tried: list[WindowFits] = []
+    for delay in delays:
+        found = fits.bottom(zero, delay)
+        if (delay > _BOTH * width).any():
+            other = fits.bottom(delay, delay)
+            found = found.replaced(other.cost < found.cost, other)
+        tried.append(found)
+    bottom_ns = arrival + np.stack([one.values[:, 0] for one in tried])
+    surface_ns = bottom_ns - delays
+    prior = np.log((1 - _OF_LAND) * (1 - _WITHOUT_BOTTOM) * priors.depth_per_ns / _DEEPEST)
+    posterior = prior + _log_normal(surface_ns, level.time_ns, spread)
+    posterior += np.stack([-0.5 * one.cost - _occam(one) for one in tried])
+    posterior += np.log(np.gradient(np.concatenate([zero[np.newaxis], delays]), axis=0)[1:])
+    best = np.argmax(posterior, axis=0)
+    # Where the surface has an echo of its own, the delay is much better known than those that are tried.
+    fit = _chosen(tried, best)
+    free = fits.bottom(fit.values[:, 0], np.take_along_axis(delays, best[np.newaxis], axis=0)[0], start=fit.values)
+    delay, error = free.values[:, 6], _error(free, 6)
+    distinct = free.good & (free.values[:, 3] > _SIGNIFICANT * _error(free, 3)) & (delay > _SHORTEST_NS) & (error > 0)
+    own_ns = arrival + free.values[:, 0]
+    of_free = prior + _log_normal(own_ns - delay, level.time_ns, spread) - 0.5 * free.cost - _occam(free)
+    of_free += np.log(np.sqrt(2 * np.pi) * np.where(distinct, error, 1.0))
+    log_bottom = np.maximum(logsumexp(posterior, axis=0), np.where(distinct, of_free, -np.inf))
+
+    logs = np.stack([log_land, log_sea, log_bottom])
+    chance = np.exp(logs - logsumexp(logs, axis=0))
+    dry = chance[0] >= chance[2]
+    distinct &= ~dry
+    weight = np.exp(posterior - logsumexp(posterior, axis=0))
+    noise = np.stack([_error(one, 0) for one in tried])
+    time, time_error = _mean(weight, bottom_ns, noise)
+    top, top_error = _mean(weight, surface_ns, noise)
+    area = pulse.area_ns
+    bottom = _echo(_chosen([land, fit], np.where(dry, 0, 1)), area, shape, 0, time, time_error)
+    # The height of an echo that may include a surface is that of both, whose error is that of one.
+    bottom = replace(bottom, amplitude_stderr=_error(land, 2))
+    own = _echo(land, area, shape, 0, land_ns, _error(land, 0))
+    distinct_bottom = _echo(free, area, shape, 0, own_ns, _error(free, 0))
+    bottom = _where(distinct, distinct_bottom, _where(dry, own, bottom))
+    own_error = np.sqrt(np.maximum(_error(free, 0) ** 2 + error**2 - 2 * free.covariance[:, 0, 6], 0))
+    surface = _echo(free, area, shape, 1, own_ns - delay, own_error).known_only(distinct)
+    surface_ns, surface_stderr = np.where(distinct, (own_ns - delay, own_error), (top, top_error))
+    return FirstEchoes(chance, bottom, surface, *(np.where(dry, np.nan, one) for one in (surface_ns, surface_stderr)))
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Fits of the possibilities to samples; times count from the arrival of an ideal echo with its peak at the bin.
+
+    Parameters are the time [ns] and the variance of the blur [ns^2] of bottom or land, its height, and the heights of
+    the surface's echo and of the column, and perhaps the delay [ns]; or of a surface, its height, and the height of the
+    column.
+    """
+
+    data: Windows
+    peak: FloatArray
+    pulse: BlurredPulse
+    longest: FloatArray
+    priors: Priors
+
+    @classmethod
+    def of(
+        cls,
+        records: Records,
+        bins: IntArray,
+        pulse: BlurredPulse,
+        shape: EchoShape,
+        width: float,
+        longest: FloatArray,
+        priors: Priors,
+    ) -> _Fits:
+        """Return fits of samples about the peaks, with the error of the pulse's shape in their noise."""
+        span = -(float(longest.max()) / width + _BEFORE), _BEHIND + _COLUMN_NS / width
+        data = Windows.of(records, bins, width, 0.0, span, shape)
+        peak = data.peak()
+        # Focusing of a single shot differs from the mean.
+        faint = (data.power < _FAINT * peak[:, np.newaxis]) & (priors.onset.times.size > 1)
+        share = np.where(faint, _OF_FOCUSING, _OF_SAMPLE)
+        error = np.hypot(share * np.maximum(data.power, 0), _OF_PEAK * peak[:, np.newaxis])
+        return cls(replace(data, noise=np.hypot(data.noise, error)), peak, pulse, longest, priors)
+
+    def bottom(
+        self, time: FloatArray, delay: FloatArray, *, surface: bool = True, start: FloatArray | None = None
+    ) -> WindowFits:
+        """Fit bottoms that follow a surface by a delay, shape (n,), free with a start; or land without a surface."""
+        pulse, area, free = self.pulse, self.pulse.area_ns, start is not None
+        half, blur = 0.5 * self.peak, np.full(time.shape, _FIRST_BLUR * self.pulse.variances[-1])
+        mean, deviation, largest = _REFLECTANCE
+        first = np.stack([time, blur, half, half * surface, 0.01 * half * surface, 0 * half + mean * surface], axis=1)
+        if start is not None:
+            first = np.column_stack([start, delay])
+        edges = np.geomspace(*_AGAIN, _STEPS + 1)
+        density = -np.diff(edges**-2.0) / np.diff(edges)
+        rises = np.diff(density, prepend=0.0, append=0.0)
+
+        def model(p: FloatArray, u: FloatArray, apart: FloatArray) -> tuple[FloatArray, FloatArray]:
+            time, blur, height, top, column, again = (p[:, i : i + 1] for i in range(6))
+            apart = p[:, 6:] if free else apart
+            echo, slope, by_blur = pulse.blurred(u - time, blur)
+            if not surface:
+                none = np.zeros_like(echo)
+                return height * echo, np.stack([-height * slope, height * by_blur, echo, none, none, none], axis=1)
+            begins, ends = pulse.plain(u - time + apart), pulse.plain(u - time)
+            fall, falls = self.priors.column(u - time + apart)
+            inside = (begins[2] - ends[2]) / area
+            lit = fall * inside
+            by_delay = top * begins[1] + column * (fall * begins[0] / area + falls * inside)
+            by_time = -height * slope - by_delay + column * fall * ends[0] / area
+            second, falling, stretched = (np.zeros_like(echo) for _ in range(3))
+            per_delay = 1 / np.maximum(apart, _SHORTEST_NS)
+            for edge, rise in zip(edges, rises, strict=True):
+                power, _, passed = pulse.plain(u - time - edge * apart)
+                second += rise * per_delay * passed
+                falling += rise * per_delay * power
+                stretched += rise * per_delay * (edge * power + passed * per_delay)
+            by_time -= height * again * falling
+            by_delay -= height * again * stretched
+            parts = [by_time, height * by_blur, echo + again * second, begins[0], lit, height * second]
+            parts += [by_delay] if free else []
+            return height * (echo + again * second) + top * begins[0] + column * lit, np.stack(parts, axis=1)
+
+        known = (5, np.full(time.shape, mean), np.full(time.shape, deviation)) if surface else None
+        limit = np.array([np.inf] * 3 + [np.inf if surface else 0.0] * 2 + [largest * surface] + [np.inf] * free)
+        return self._fit(model, first, delay, limit, known)
+
+    def surface(self) -> WindowFits:
+        """Fit a surface and the column behind it."""
+        pulse, area, none = self.pulse, self.pulse.area_ns, np.zeros(self.peak.shape)
+        blur = np.full(self.peak.shape, _FIRST_BLUR * self.pulse.variances[-1])
+
+        def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+            time, blur, height, column = (p[:, i : i + 1] for i in range(4))
+            echo, slope, by_blur = pulse.blurred(u - time, blur)
+            power, _, inside = pulse.plain(u - time)
+            fall, falls = self.priors.column(u - time)
+            lit = fall * inside / area
+            by_time = -height * slope - column * (fall * power + falls * inside) / area
+            return height * echo + column * lit, np.stack([by_time, height * by_blur, echo, lit], axis=1)
+
+        first = np.stack([none, blur, self.peak, 0.01 * self.peak], axis=1)
+        return self._fit(model, first, none, np.full(4, np.inf))
+
+    def _fit(
+        self,
+        model: Model,
+        start: FloatArray,
+        rate: FloatArray,
+        most: FloatArray,
+        known: tuple[int, FloatArray, FloatArray] | None = None,
+    ) -> WindowFits:
+        """Fit a model with the largest values of its parameters, and perhaps with what is known of one of them."""
+        size, width = start.shape[1], self.data.width
+        lowest, highest = np.zeros(start.shape), np.tile(most, (len(start), 1))
+        lowest[:, 0], highest[:, 0] = -self.longest - width, self.longest + width
+        highest[:, 1] = self.pulse.variances[-1]
+        if size > 6:
+            lowest[:, 6], highest[:, 6] = _SHORTEST_NS, self.longest
+        unit = np.full(start.shape, width)
+        unit[:, 1] = highest[:, 1]
+        unit[:, 5:6] = 1.0
+        unit[:, 2:5] = np.where(self.peak > 0, self.peak, 1.0)[:, np.newaxis]
+        every = np.ones(len(start), dtype=bool)
+        data = replace(self.data, rate=rate[:, np.newaxis], known=known)
+        return fit_windows(model, start, data, self.peak, every, limits=Limits(lowest, highest, unit))
+
+
+def _chosen(tried: list[WindowFits], best: IntArray) -> WindowFits:
+    """Return the fit of each record that is best."""
+    found = tried[0]
+    for number, one in enumerate(tried[1:], 1):
+        found = found.replaced(best == number, one)
+    return found
+
+
+def _error(fit: WindowFits, index: int) -> FloatArray:
+    """Return the standard error of a parameter, 0 where it is not known."""
+    return np.sqrt(np.maximum(np.nan_to_num(fit.covariance[:, index, index]), 0))
+
+
+def _occam(fit: WindowFits) -> FloatArray:
+    """Return the logarithms of the prior volumes of the heights of surface and column over those of their errors."""
+    ratios = [fit.values[:, index] / np.maximum(_error(fit, index), 1e-300) for index in (3, 4)]
+    return np.asarray(np.sum([np.log1p(np.minimum(ratio, 1e12)) for ratio in ratios], axis=0))
+
+
+def _log_normal(time: FloatArray, middle: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return the logarithm of the density of times [1/ns]."""
+    return np.asarray(-0.5 * ((time - middle) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi)))
+
+
+def _log_column(fit: WindowFits, least: FloatArray, peak: FloatArray) -> FloatArray:
+    """Return the logarithm of the mean likelihood of a column over its prior levels, relative to the fitted one."""
+    error, found = np.where(_error(fit, 3) > 0, _error(fit, 3), peak), fit.values[:, 3]
+    low = np.maximum(np.maximum(least, _LEAST_COLUMN * peak), 1e-300)
+    decades = np.log(np.maximum(peak / low, 10.0))
+    levels = low * np.exp(decades * np.linspace(0, 1, _LEVELS)[:, np.newaxis])
+    coarse = logsumexp(-0.5 * np.minimum(np.abs(levels - found) / error, 1e6) ** 2, axis=0) - np.log(_LEVELS)
+    # Where no level is within the error of a distinct one, the integral of its normal distribution.
+    clear = (found > _CLEAR * error) & (found > low)
+    sharp = np.log(np.sqrt(2 * np.pi) * error / np.where(clear, found, 1.0) / decades)
+    return np.asarray(np.where(clear, sharp, coarse), dtype=np.float64)
+
+
+def _mean(weight: FloatArray, times: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return means of times over possibilities, and their standard deviations."""
+    middle = np.sum(weight * times, axis=0)
+    return middle, np.sqrt(np.sum(weight * ((times - middle) ** 2 + errors**2), axis=0))
+
+
+def _echo(fit: WindowFits, area_ns: float, shape: EchoShape, echo: int, time: FloatArray, error: FloatArray) -> Echoes:
+    """Return the bottom (0) or the surface (1) of fits, with a time and its standard error [ns]."""
+    area, height, height_error = 1e-9 * area_ns, fit.values[:, 2 + echo], _error(fit, 2 + echo)
+    blur = 0.0 if echo else fit.values[:, 1]
+    width = np.sqrt(shape.fwhm_ns**2 + 8 * np.log(2) * blur + 0 * height)
+    width_error = 0 * height if echo else 4 * np.log(2) * _error(fit, 1) / width
+    flags = np.zeros(len(time), dtype=np.intp)
+    return Echoes(time, height, area * height, width, error, height_error, area * height_error, width_error, flags)
+
+
+def _where(first: BoolArray, one: Echoes, other: Echoes) -> Echoes:
+    """Return one echo or another one."""
+    return Echoes(**{name: np.where(first, value, getattr(other, name)) for name, value in vars(one).items()})

@@ -1,0 +1,58 @@
+"""Clipped samples: how long they last about echoes, and which echoes may be light that a bottom has returned twice."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray
+from mitransient_lidar.core.validation import FloatArray
+
+
+def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:
+    """Return how many bins are clipped about echoes, 0 of those without a saturated sample within an echo width.
+
+    Parameters
+    ----------
+    saturated
+        Whether samples are saturated, shape (n, time).
+    bins
+        Bins of the peaks, -1 without an echo, shape (echo, n).
+    width
+        Echo width in bins, by which runs of saturated samples may be apart to count as one.
+    """
+    count, index = saturated.shape[1], np.arange(saturated.shape[1])
+    if not saturated.any():
+        return np.zeros(bins.shape)
+    before = np.maximum.accumulate(np.where(saturated, index, -1), axis=1)
+    after = np.minimum.accumulate(np.where(saturated, index, count)[:, ::-1], axis=1)[:, ::-1]
+    # Samples between two saturated ones that are near each other are in one run.
+    inside = saturated | ((before >= 0) & (after < count) & (after - before <= width))
+    first = np.maximum.accumulate(np.where(inside, -1, index), axis=1) + 1
+    last = np.minimum.accumulate(np.where(inside, count, index)[:, ::-1], axis=1)[:, ::-1] - 1
+    half, lines = int(np.ceil(width)), np.arange(len(saturated))
+    low, top = np.clip(bins - half, 0, count - 1), np.clip(bins + half, 0, count - 1)
+    left, right = after[lines, low], before[lines, top]
+    found = (bins >= 0) & (left <= right)
+    ends = last[lines, np.maximum(right, 0)] - first[lines, np.minimum(left, count - 1)] + 1
+    return np.where(found, ends, 0).astype(np.float64)
+
+
+def longest_run(saturated: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the first and last bin of the longest run of saturated samples, shape (n, time); 1 and 0 without any."""
+    index = np.arange(saturated.shape[1])
+    run = index - np.maximum.accumulate(np.where(saturated, -1, index), axis=1)
+    last = run.argmax(axis=1)
+    return last - run.max(axis=1) + 1, last
+
+
+def may_be_second_return(
+    time_ns: FloatArray, half_ns: FloatArray, clipped_ns: FloatArray, width_ns: float
+) -> BoolArray:
+    """Return which echoes may be light that a bottom within a clipped time has returned twice.
+
+    Times of echoes, and halves of their delays behind the mean surface, are of the shape (n, estimator, echo), first
+    and last clipped times (n, 2). Half delays below two echo widths are within the surface's own echo.
+    """
+    start, end = clipped_ns.T[..., np.newaxis, np.newaxis]
+    clipped = (start <= time_ns - half_ns) & (time_ns - half_ns <= end) & (half_ns > 2 * width_ns)
+    return np.asarray(clipped & (np.arange(time_ns.shape[-1]) > 1))

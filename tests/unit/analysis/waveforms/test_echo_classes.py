@@ -1,0 +1,136 @@
+"""What first echoes are, over drawn records of land and of water from 5 cm on, and depths where echoes merge."""
+
+import numpy as np
+import pytest
+import significance
+import xarray as xr
+from scipy.stats import exponnorm, norm
+from significance import largest_count, largest_z, variance_limits
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
+from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.geometry import LinesOfSight
+
+C, N, ALTITUDE, FWHM = 1e-9 * C0, 1.34, 600.0, 1.5
+DT, BINS, SIGMA = 0.5, 300, FWHM / FWHM_PER_SIGMA
+SURFACE = 2 * ALTITUDE / C
+START = SURFACE - 40
+EDGES = START + DT * np.arange(BINS + 1)
+TIME = EDGES[:-1] + 0.5 * DT
+#: Energy of a white plane across the beam over pi [J], backscattering [1/m], attenuation along the path [1/m].
+UNIT, BB, K = 2e-5 * 0.729 * 0.01 / ALTITUDE**2 / np.pi, 0.006, 0.16
+ATTRIBUTES = {
+    **{"altitude": ALTITUDE, "off_nadir_deg": 0.0, "refractive_index": N, "group_index": N, "pulse_fwhm_ns": FWHM},
+    **{"pulse_energy_mj": 0.02, "aperture_area": 0.01, "field_of_view_mrad": 5.6, "divergence_mrad": 0.35},
+    **{"surface_time_ns": SURFACE, "surface_heights_m": [-0.02, 0.02], "two_way_efficiency": 0.729},
+}
+
+
+def pulse(at, energy, sigma=SIGMA):
+    return energy / (DT * 1e-9) * np.diff(norm.cdf(EDGES, at, sigma))
+
+
+def land(height, reflectance=0.2, blur=0.0):
+    """Power of a plane at a height [m], whose slope blurs the pulse [ns]."""
+    return pulse(SURFACE - 2 / C * height, UNIT * reflectance, np.hypot(SIGMA, blur))
+
+
+def water(depth, glint=0.0, reflectance=0.2, level=0.0):
+    """Power of a surface with a height [m], a column and a bottom at a depth below it [m].
+
+    The glint is relative to a bottom of no depth. Light of the bottom that the surface reflects totally meets it again:
+    cos^2 of its angle is uniform up to 1 - 1/n^2.
+    """
+    surface, rate = SURFACE - 2 / C * level, C / N * K
+    delay = 2 * N * depth / C
+
+    def onset(at):
+        return exponnorm.pdf(TIME, 1 / (rate * SIGMA), loc=at, scale=SIGMA) / rate
+
+    column = UNIT * np.pi * BB / (2 * np.pi) * C0 / (2 * N) * 0.96
+    column = column * np.maximum(onset(surface) - np.exp(-rate * delay) * onset(surface + delay), 0)
+    first = UNIT * reflectance * 0.96 / N**2 * np.exp(-2 * K * depth)
+    total = 1 - 1 / N**2
+    cosines = np.sqrt(total * (np.arange(400) + 0.5) / 400)
+    again = sum(pulse(surface + delay * (1 + 1 / one), first * reflectance * total / 400) for one in cosines)
+    return pulse(surface, UNIT * reflectance * glint) + column + pulse(surface + delay, first) + again
+
+
+def recorded(powers, seed, gain=0.12):
+    """Records of the receiver of an instrument, one for each row of powers [W]."""
+    values = np.asarray(powers)
+    base = results.build(
+        *(one * values[:1] * DT * 1e-9 for one in (1, 0)),
+        *(one * values[:1] for one in (1, 0)),
+        time=TimeAxis(START, DT, BINS),
+        pixel_names=["single"],
+        pixel_centres_mrad=np.zeros((1, 2)),
+        attributes=ATTRIBUTES,
+    )
+    zero, one = np.zeros(1), np.ones(1)
+    lines = LinesOfSight(zero, zero, zero, SURFACE * one, zero, C / (2 * N) * one, one)
+    shots = xr.Dataset(
+        {"waveform": (("shot", "pixel", "time"), values[:, np.newaxis], {"units": "W"})},
+        {"pixel": base["pixel"], "time": base["time"], "shot": np.arange(len(values))},
+        base.attrs,
+    ).assign_coords(lines.coordinates(("pixel",), (1,)))
+    return detect_waveforms(shots, "riegl_vq880g2", gain=gain, seed=seed + significance.seed_shift)
+
+
+def found(record, **options):
+    """Return classes of surface and bottom, depths, and errors of all kinds [m]."""
+    table = echo_table.extract(record, **options).isel(pixel=0)
+    bottom = table.sel(echo="bottom")
+    error = np.hypot(bottom["depth_m_stderr"], bottom["depth_m_method_error"]).values
+    return table["class"].sel(echo=["surface", "bottom"]).values.T, bottom["depth_m"].values, error
+
+
+def test_land_and_shallow_water_are_what_they_are():
+    """Land is timed in air, and a bottom from 0.3 m on in the water; the false echo would be 5 cm and more off."""
+    heights, depths = np.array([0.3, 1.0, 3.0, 4.5]), np.array([0.3, 0.5, 0.8, 2.0])
+    powers = [land(one, blur=0.3) for one in heights] + [water(one, 0.2) for one in depths]
+    (surface, bottom), depth, error = found(recorded(powers, 1))
+    assert (surface[:4] == EchoClass.NONE).all()
+    assert (bottom[:4] == EchoClass.LAND).all()
+    assert np.isin(bottom[4:], [EchoClass.BOTTOM, EchoClass.MERGED]).all()
+    np.testing.assert_allclose(depth[:4], -heights, atol=0.01)
+    assert (np.abs(depth[4:] - depths) < 3 * error[4:]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "seed"), [(150, 3)])
+def test_error_rates_over_drawn_records(count, seed):
+    """Land from 0.2 to 4 m, and water from 0.3 to 4 m with glints of all strengths: the rates that `decide` states."""
+    rng = np.random.default_rng(seed + significance.seed_shift)
+    heights, depths = rng.uniform(0.2, 4, count), np.exp(rng.uniform(np.log(0.3), np.log(4), count))
+    glints = np.exp(rng.normal(-2, 2, count)) * (rng.random(count) < 0.7)
+    of_ground = rng.uniform(0.05, 0.4, 2 * count)
+    powers = [land(h, r, rng.uniform(0, 0.5)) for h, r in zip(heights, of_ground, strict=False)]
+    powers += [water(d, g, r) for d, g, r in zip(depths, np.minimum(glints, 5), of_ground[count:], strict=True)]
+    (_, bottom), depth, error = found(recorded(powers, seed, gain=0.05))
+    dry = np.arange(2 * count) < count
+    wet = np.isin(bottom[~dry], [EchoClass.BOTTOM, EchoClass.MERGED])
+    assert np.count_nonzero(bottom[dry] != EchoClass.LAND) <= largest_count(count, 0.02)
+    assert np.count_nonzero(~wet) <= largest_count(count, 0.02)
+    z = ((depth[~dry] - depths) / error[~dry])[wet]
+    np.testing.assert_allclose(depth[dry], -heights, atol=0.02)
+    assert np.mean(z**2) < variance_limits(np.count_nonzero(wet))[1]
+    assert np.abs(z).max() < largest_z(count, count)
+
+
+def test_a_level_known_from_elsewhere_gives_the_depth_of_a_bottom_without_a_surface():
+    """10 cm of water without a surface echo, 20 cm above the mean sea level: an infrared channel has its surface."""
+    record = recorded([water(0.1, level=0.2)], 2)
+    level = SurfaceLevel(np.array([SURFACE - 0.4 / C]), np.array([0.05]))
+    (_, bottom), depth, error = found(record, level=level)
+    assert bottom[0] == EchoClass.MERGED
+    assert abs(depth[0] - 0.1) < 3 * error[0]
+    assert error[0] < 0.06
+    without = found(record)
+    assert without[2][0] > error[0] or without[0][1][0] == EchoClass.LAND
