@@ -137,7 +137,7 @@ FAULTS = (
     ),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),
-        "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), received, shots, paths)\n",
+        "        trace_connected(scene, self.sampler, complement, received, shots, paths)\n",
         "",
         near="tests/analytic/test_agreement.py",
     ),

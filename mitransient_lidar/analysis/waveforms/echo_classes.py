@@ -40,6 +40,7 @@ _RETURNS, _BRIGHTEST = (
 )  # its delays over those of the bottom, and its largest height times delay over width
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
+_OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
 
 
 class EchoClass(IntEnum):
@@ -189,7 +190,8 @@ def decide(
         (found.surface >= 0) & early & (following < last) & (following - found.surface > _APART * apart)
     )
     if over.size:
-        found, above = _with_objects(found, over, search(over, records.time_of(found.surface[over]) + SEPARATE * width))
+        again = search(over, records.time_of(found.surface[over]) + SEPARATE * width)
+        found, above = _with_objects(found, over, again, detection.targets)
     at = np.rint((level.time_ns + waveforms.echo_shape.peak_ns - records.time_ns[0]) / records.bin_ns).astype(np.intp)
     found = _without_second_return(records, found, at, apart)
     following = _following(found, last)
@@ -198,6 +200,14 @@ def decide(
     # A first echo below the surface's level may be the bottom, and the second one its light that met it twice.
     second = (distance < _SECOND) | (deviation() > _FAR)
     near |= second & (following < last) & _is_weak_behind(records, found.surface, following)
+    # A column between both tells a weak surface: that of the column's onset is more accurate than the level.
+    until = (following - found.surface) * records.bin_ns - 1.5 * width
+    open_rows = np.flatnonzero(
+        near & (following < last) & (np.abs(deviation()) < _FAR) & (until > waveforms.tail_ns + _OPEN * width)
+    )
+    near[open_rows] = ~_has_column(
+        records.part(open_rows), found.surface[open_rows], waveforms.tail_ns, until[open_rows, np.newaxis]
+    )
     tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)))
     at_level = np.abs(deviation()[tested]) < _FAR
     beyond = waveforms.tail_ns + _FAR_APART * width
@@ -284,24 +294,32 @@ def _without_second_return(records: Records, found: DetectedEchoes, level: IntAr
     return DetectedEchoes(bins, flags)
 
 
-def _with_objects(found: DetectedEchoes, rows: IntArray, again: DetectedEchoes) -> tuple[DetectedEchoes, BoolArray]:
-    """Return echoes, of which the first ones of some rows are objects, before those that were found again."""
-    targets = max(len(found.bins) - 2, len(again.bins) - 1)
+def _with_objects(
+    found: DetectedEchoes, rows: IntArray, again: DetectedEchoes, most: int | None
+) -> tuple[DetectedEchoes, BoolArray]:
+    """Return echoes, of which the first ones of some rows are objects, before those that were found again.
+
+    Of `most` targets, the object takes the place of the last one.
+    """
+    targets = max(len(found.bins) - 2, len(again.bins) - 1) if most is None else most
     bins = np.full((targets + 2, found.bins.shape[1]), -1, dtype=np.intp)
     flags = np.full(bins.shape, int(EchoFlag.NO_ECHO))
     for mine, old, new in ((bins, found.bins, again.bins), (flags, found.flags, again.flags)):
         mine[: len(old) - 1], mine[-1] = old[:-1], old[-1]
         mine[:, rows] = -1 if mine is bins else int(EchoFlag.NO_ECHO)
         mine[0, rows], mine[1, rows], mine[-1, rows] = new[0], old[0][rows], new[-1]
-        mine[2 : len(new), rows] = new[1:-1]
+        others = new[1:-1][: targets - 1]
+        mine[2 : 2 + len(others), rows] = others
     above = np.zeros(bins.shape, dtype=bool)
     above[1, rows] = True
     return DetectedEchoes(bins, flags), above
 
 
-def _has_column(records: Records, surface: IntArray, tail_ns: float) -> BoolArray:
-    """Return whether a column follows peaks, from a delay on that is longer than their tail [ns]."""
+def _has_column(
+    records: Records, surface: IntArray, tail_ns: float, until_ns: FloatArray | float = np.inf
+) -> BoolArray:
+    """Return whether a column follows peaks, from a delay on that is longer than their tail, to another one [ns]."""
     delay = records.time_ns - records.time_ns[surface, np.newaxis]
-    inside = (delay >= tail_ns) & (delay <= tail_ns + _COLUMN_NS)
+    inside = (delay >= tail_ns) & (delay <= np.minimum(tail_ns + _COLUMN_NS, until_ns))
     total = np.sum(np.where(inside, records.power, 0.0), axis=1)
     return np.asarray(total > _COLUMN * error_of_sums(np.where(inside, records.noise, 0.0), None, records.shared))
