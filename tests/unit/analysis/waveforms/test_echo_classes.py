@@ -134,3 +134,13 @@ def test_a_level_known_from_elsewhere_gives_the_depth_of_a_bottom_without_a_surf
     assert error[0] < 0.06
     without = found(record)
     assert without[2][0] > error[0] or without[0][1][0] == EchoClass.LAND
+
+
+def test_a_pulse_that_meets_the_edge_of_a_pier_keeps_the_number_of_targets():
+    """Half of the beam on its top, 2 m above the water: the object is the one target of a flight's table."""
+    record = recorded([0.5 * land(2.0, 0.3) + 0.5 * water(3.0, 0.3), water(3.0, 0.3)], 4)
+    table = echo_table.extract(record, targets=1).isel(pixel=0)
+    assert table.sizes["echo"] == 4
+    assert table["class"].sel(echo="target").values.tolist() == [EchoClass.ABOVE, EchoClass.NONE]
+    np.testing.assert_allclose(table["depth_m"].sel(echo="bottom"), 3.0, atol=0.05)
+    assert float(table["depth_m"].sel(echo="target")[0]) == pytest.approx(-2.0, abs=0.05)
