@@ -243,12 +243,12 @@ def test_command_refuses_bad_flights(tmp_path):
 def test_weak_surfaces_are_timed_by_the_onset_of_their_column(tmp_path):
     """Of the shipped `semi_arc`, 20 degrees from nadir: by the level alone errors are 0.12 m, and depths 0.1 m off."""
     plan = tomllib.loads((folder_of_scenes() / "flights" / "semi_arc.toml").read_text("utf-8"))
-    plan["pulses"]["most"] = 24
+    plan["pulses"]["most"] = 12
     plan["seed"] = 1 + significance.seed_shift
     points = fly(plan, tmp_path / "flight", workers=1).load()
     bottoms = points.isel(point=points["kind"] == PointClass.BOTTOM)
     error = bottoms["z"] - bottoms["true_z"]
-    assert bottoms.sizes["point"] >= 94
+    assert bottoms.sizes["point"] >= 46
     assert float(bottoms["vertical_uncertainty"].median()) < 0.08
     assert float((error**2).mean()) ** 0.5 < 0.1
 
