@@ -91,7 +91,7 @@ def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_sea
 def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsewhere(lidar_scene):
     """Waves of 10 m/s reach 1.5 m below the mean sea level somewhere on the sea, a bottom is at 1.25 m."""
     pose = {"altitude": 20.0, "off_nadir_deg": 0.0}
-    sea = {"spectrum": "elfouhaily", "wind_speed": 10.0}
+    sea = {"spectrum": "elfouhaily", "wind_speed": 10.0, "shoaling": "none"}
     scene = lidar_scene(integrator=MERGING, tx=pose, rx=pose, sea=sea, bottom=1.25)
     lidar = find_lidar_scene(scene, scene.sensors()[0])
     assert min(float(surface.bbox().min.z) for surface in lidar.surfaces) < -1.25

@@ -210,8 +210,11 @@ def decide(
     )
     tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)))
     at_level = np.abs(deviation()[tested]) < _FAR
-    beyond = waveforms.tail_ns + _FAR_APART * width
-    has_column = at_level & ~near[tested] & _has_column(records.part(tested), found.surface[tested], beyond)
+    # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
+    left = records.time_ns[-1] - records.time_of(found.surface[tested])
+    beyond = waveforms.tail_ns + np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
+    has_column = _has_column(records.part(tested), found.surface[tested], beyond[:, np.newaxis])
+    has_column &= at_level & ~near[tested]
     tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
     if not tested.size:
@@ -316,7 +319,7 @@ def _with_objects(
 
 
 def _has_column(
-    records: Records, surface: IntArray, tail_ns: float, until_ns: FloatArray | float = np.inf
+    records: Records, surface: IntArray, tail_ns: FloatArray | float, until_ns: FloatArray | float = np.inf
 ) -> BoolArray:
     """Return whether a column follows peaks, from a delay on that is longer than their tail, to another one [ns]."""
     delay = records.time_ns - records.time_ns[surface, np.newaxis]

@@ -94,6 +94,7 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
         "components": None,
         "derivatives": None,
         "batches": None,
+        "smooth": None,
         "variant": None,
     }
     for part in ("1.23", "peak power, [red] (W)", "3e-06", "5e-06", "1.50"):

@@ -189,7 +189,7 @@ def test_examples_in_the_manual_load(module, tmp_path, monkeypatch):
     (tmp_path / "harbour.csv").write_text("".join(f"{angle}, 0.0796\n" for angle in range(0, 181, 10)))
     monkeypatch.chdir(tmp_path)
     classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
-    name = module.removeprefix("phase.")
+    name = module.rpartition(".")[2]
     (manual,) = (c.__doc__ for c in classes if isinstance(c, type) and f"(``{name}``)" in (c.__doc__ or ""))
     xml, python = re.search(r"code-block:: xml\n(.*?)\.\. code-block:: python\n(.*)", manual, re.DOTALL).groups()
     load = ast.literal_eval(python.strip())

@@ -144,7 +144,8 @@ def rendered(monkeypatch):
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
-        return shot_batches.ReceivedShots(2 * (power, 0.1 * power), 0.0, np.full(len(places), batches.passes))
+        made, passes = 2 * (power, 0.1 * power), np.full(len(places), batches.passes)
+        return shot_batches.ReceivedShots(made, 0.0, passes, errors=np.full(1, 0.1))
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", render)
     return asked
