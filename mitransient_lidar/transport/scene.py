@@ -92,6 +92,8 @@ class WaterScene:
         Changes of water and solids whose effect on each path is summed.
     groups
         Groups of shapes that instances repeat.
+    interpolates
+        Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
     """
 
     OF_SHOTS: ClassVar[tuple[str, ...]] = ("parts", "receiver_poses")
@@ -105,6 +107,7 @@ class WaterScene:
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
     groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)
+    interpolates: bool = field(default=False, kw_only=True)
 
     def with_parts_of(self, shapes: Sequence[mi.Shape]) -> Self:
         """Return a scene in parts without the parts that hold none of the shapes; the same one if all hold none."""
@@ -318,6 +321,16 @@ class WaterScene:
             si.sh_frame = frame
         return si
 
+    def on_shapes(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        """Return intersections at their places on the shapes of parts, between whose vertices BSDFs interpolate."""
+        if not (self.parts and self.interpolates):
+            return si
+        found = mi.SurfaceInteraction3f(si)
+        for part in self.parts:
+            place = part.ray(mi.Ray3f(si.p, si.n)).o
+            found.p = dr.select(is_one_of(si.shape, part.shapes.shapes()), place, found.p)
+        return found
+
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
         """Return whether rays are blocked."""
         if not self.parts:
@@ -340,7 +353,7 @@ class WaterScene:
             ray: mi.Ray3f, si: mi.SurfaceInteraction3f, before: mi.Float, share: mi.Float, looking: mi.Bool
         ) -> tuple[mi.Ray3f, mi.SurfaceInteraction3f, mi.Float, mi.Float, mi.Bool]:
             si = dr.select(looking, self.ray_intersect(ray, looking), si)
-            passed = si.bsdf().eval_null_transmission(si, looking & si.is_valid())[0]
+            passed = si.bsdf().eval_null_transmission(self.on_shapes(si), looking & si.is_valid())[0]
             looking &= si.is_valid() & (passed > 0)
             share = dr.select(looking, share * passed, share)
             beyond = self.spawn_ray(si, ray.d).o

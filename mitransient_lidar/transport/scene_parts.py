@@ -25,6 +25,7 @@ from mitransient_lidar.transport.plugin_types import (
     Daylight,
     GatedFilm,
     LidarSensor,
+    SeabedShape,
     SeaShape,
     Transmitter,
     WaterMedium,
@@ -197,11 +198,10 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     if joined:
         scene.parameters_changed([])
     groups = shape_groups(scene)
-    for shape in (*scene.shapes(), *(member for group in groups for member in children(group))):
-        if shape.bsdf() is not None:
-            _check_bsdf(shape)
+    members = [member for group in groups for member in children(group)]
+    interpolates = any([_check_bsdf(shape) for shape in (*scene.shapes(), *members) if shape.bsdf() is not None])
     seen = without_unseen(scene, groups)
-    found = WaterScene(seen, receiver, *find_water(seen), groups=groups)
+    found = WaterScene(seen, receiver, *find_water(seen), groups=groups, interpolates=interpolates)
     solids = found.solids
     for solid in solids:
         _check_mirrored(solid)
@@ -234,8 +234,12 @@ def _check_mirrored(solid: mi.Shape) -> None:
         )
 
 
-def _check_bsdf(shape: mi.Shape) -> None:
-    """Refuse a BSDF that raises an error, or with a ``mesh_attribute`` that its shape lacks, which would be 0."""
+def _check_bsdf(shape: mi.Shape) -> bool:
+    """Refuse a BSDF that raises an error, or with a ``mesh_attribute`` that its shape lacks, which would be 0.
+
+    Return whether it has an attribute of vertices whose values may differ.
+    """
+    interpolates, is_even = False, isinstance(shape, SeabedShape) and shape.uniform_reflectance is not None
     bsdf, point = shape.bsdf(), dr.zeros(mi.SurfaceInteraction3f)
     up = point.wi = mi.Vector3f(0, 0, 1)
     try:
@@ -254,6 +258,8 @@ def _check_bsdf(shape: mi.Shape) -> None:
                     f"mesh_attribute: shape {shape.id()!r} has no attribute {named[1]!r}, which its bsdf names; "
                     "allowed are those of its PLY file"
                 )
+            interpolates |= named is not None and named[1].startswith("vertex_") and not is_even
+    return interpolates
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:

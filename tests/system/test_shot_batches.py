@@ -114,6 +114,30 @@ def test_poses_over_a_plume_give_what_single_shots_do():
 
 
 @pytest.mark.slow
+def test_patches_of_the_bottom_lie_where_shots_see_them(tmp_path):
+    """Both look at the edge of a bright patch, the second one turned: its light was 0.04 of what it is."""
+    scene, passes = tmp_path / "patch.xml", 16
+    text = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
+    bright = '<shape type="seabed" id="patched"><float name="depth" value="5.9"/><float name="cell_size" value="1"/>'
+    bright += '<string name="patches" value="4 0 3 0.9"/></shape>'
+    scene.write_text(text.replace("</scene>", bright + "</scene>"), "utf-8")
+    params = {"spectrum": "flat", "bottom_depth": 9}
+    given = [looking((-6.5, 3.0), 0.0, 20.0, 300.0, 0.0), looking((0.5, 0.0), 150.0, 10.0, 300.0, 0.0)]
+    renderer = prepared(scene, params, None)
+    share = 2**12 / renderer.paths
+    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, None, [])
+    poses, axis = ShotPoses.of_receiver(renderer.scene, stacked(given)), renderer.scene.axis
+    seeds = [pass_seed(number, each) for number in range(2) for each in range(passes)]
+    together = batches.at(poses)(passes).render_pass(seeds).histogram.energy().reshape(2, passes, -1)
+    later = poses.extra_range(renderer.scene) / 0.299792458
+    for pose, delay, found in zip(given, later, together, strict=True):
+        record = replace(axis, start_ns=axis.start_ns + delay)
+        alone = alone_at(scene, params, pose, record, None).scaled(share)
+        energy = np.array([alone.render_pass(1000 + seed).histogram.energy().sum() for seed in range(passes)])
+        assert_same(found.sum(axis=1, keepdims=True), energy[:, np.newaxis], error=0.06, bias=0.01)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("depth", "slope"), [(6.0, 0.0), (1.5, 4.0)])
 def test_heights_of_shots_are_those_at_their_places(depth, slope):
     """Of the sea, and of a bottom below all troughs or one that rises above the sea, in the last of several passes."""

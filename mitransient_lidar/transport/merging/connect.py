@@ -157,7 +157,7 @@ class WaterConnections:
         active = exists & si.is_valid() & (dr.abs(si.t - distance) < tolerance)
         outgoing = si.to_local(-photon.direction)
         cosine = dr.abs(dr.dot(si.n, photon.direction))
-        bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / cosine
+        bsdf = si.bsdf().eval(mi.BSDFContext(), scene.on_shapes(si), outgoing, active)[0] / cosine
         x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection

@@ -97,7 +97,7 @@ def merge_on_solids(
         solid, sums = received.classes.solid(shape), received.histogram.perturbations.at_solid(path.sums, shape)
         covered = patches.inverse_share(patch, shape, random, active & (first < end))
         weight = path.throughput * covered / patch.area
-        typical = patches.typical_area(si)
+        typical, at_place = patches.typical_area(si), patches.scene.on_shapes(si)
         connection = connections * path.inverse_density / dr.abs(dr.dot(si.n, path.direction))
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
@@ -108,7 +108,7 @@ def merge_on_solids(
             # Mitsuba's BSDFs include the cosine of the shading normal. The photon's energy per area includes that of
             # the true surface, which is divided out.
             cosine = dr.abs(dr.dot(si.n, photon.direction))
-            bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
+            bsdf = si.bsdf().eval(mi.BSDFContext(), at_place, outgoing, within)[0] / cosine
             connected = dr.select(connectable > 0, connection, 0)
             share = typical / (connected + typical)
             energy = weight * photon.throughput * foreshortening(cosine, patch.cosine) * bsdf * share

@@ -270,7 +270,7 @@ class SurfaceHeights:
                 found.x = dr.select(dry, si.p.z, found.x)
             passes = mi.Bool(False)
             if solids and scene.has_veils:
-                share = si.bsdf().eval_null_transmission(si, active & wanted)[0]
+                share = si.bsdf().eval_null_transmission(scene.on_shapes(si), active & wanted)[0]
                 passes = wanted & (((share == 0) | (share == 1)) if veils else (share > 0))
                 wanted &= ~passes
             found = dr.select(active & wanted, mi.Vector4f(si.p.z, -si.n.x / si.n.z, -si.n.y / si.n.z, 0), found)

@@ -172,7 +172,7 @@ class RandomWalk:
         """Draw the next direction."""
         step, si = self._step, vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        bs, bsdf_weight = si.bsdf().sample(step.context, si, pick, u, vertex.on_surface)
+        bs, bsdf_weight = si.bsdf().sample(step.context, self.scene.on_shapes(si), pick, u, vertex.on_surface)
         event = step.scattering_event(path, vertex.scattered, rng)
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)

@@ -321,4 +321,5 @@ def _bsdf_towards(
     """Return BSDF times cosine [1/sr] for a direction in the air, or in the water; 0 on the sea's other side."""
     cosine = dr.dot(direction, si.n)
     active = active & ~(scene.is_surface(si.shape) & ((cosine >= 0) if wet else (cosine <= 0)))
-    return dr.select(active, si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0], 0)
+    value = si.bsdf().eval(mi.BSDFContext(), scene.on_shapes(si), si.to_local(direction), active)
+    return dr.select(active, value[0], 0)

@@ -395,7 +395,8 @@ class PathTracer:
             value = dr.select(at_event, phase_value[0], 0)
             pdf = dr.select(at_event, dr.lerp(phase_pdf, guided, probability), 0)
         on_solid = active & ~vertex.scattered
-        solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), on_solid)
+        at_place, local = self.scene.on_shapes(si), si.to_local(direction)
+        solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), at_place, local, on_solid)
         solid_pdf = dr.select(vertex.is_rough, dr.lerp(solid_pdf, guided, probability), solid_pdf)
         return dr.select(on_solid, solid_value[0], value), dr.select(on_solid, solid_pdf, pdf)
 
@@ -420,7 +421,8 @@ class PathTracer:
         # The random number is rescaled and reused by the phase function and the BSDF.
         rest = dr.clip((pick - probability) / (1 - probability), 0, 1)
         u_bsdf = dr.select(mixed, rest, pick)
-        bs, bsdf_weight = si.bsdf().sample(self._step.context, si, u_bsdf, u, vertex.on_surface)
+        at_place = self.scene.on_shapes(si)
+        bs, bsdf_weight = si.bsdf().sample(self._step.context, at_place, u_bsdf, u, vertex.on_surface)
         direction, pdf = si.to_world(bs.wo), bs.pdf
         factor = dr.select(vertex.on_surface, bsdf_weight[0], 1)
         if event.phase is not None:
