@@ -115,14 +115,14 @@ def test_poses_over_a_plume_give_what_single_shots_do():
 
 @pytest.mark.slow
 def test_patches_of_the_bottom_lie_where_shots_see_them(tmp_path):
-    """Both look at the edge of a bright patch, the second one turned: its light was 0.04 of what it is."""
+    """Both look at the edge of a bright patch, the second one turned, which had lost most of its light."""
     scene, passes = tmp_path / "patch.xml", 16
     text = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
     bright = '<shape type="seabed" id="patched"><float name="depth" value="5.9"/><float name="cell_size" value="1"/>'
-    bright += '<string name="patches" value="4 0 3 0.9"/></shape>'
+    bright += '<string name="patches" value="-12 5 3 0.9"/></shape>'
     scene.write_text(text.replace("</scene>", bright + "</scene>"), "utf-8")
     params = {"spectrum": "flat", "bottom_depth": 9}
-    given = [looking((-6.5, 3.0), 0.0, 20.0, 300.0, 0.0), looking((0.5, 0.0), 150.0, 10.0, 300.0, 0.0)]
+    given = [looking((-16.5, 5.0), 0.0, 20.0, 300.0, 0.0), looking((-8.3, 4.6), 150.0, 10.0, 300.0, 0.0)]
     renderer = prepared(scene, params, None)
     share = 2**12 / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, None, [])
