@@ -212,8 +212,9 @@ def decide(
     at_level = np.abs(deviation()[tested]) < _FAR
     # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
     left = records.time_ns[-1] - records.time_of(found.surface[tested])
-    beyond = waveforms.tail_ns + np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
-    has_column = _has_column(records.part(tested), found.surface[tested], np.asarray(beyond)[:, np.newaxis])
+    far = np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
+    beyond = np.asarray(waveforms.tail_ns + far, np.float64)[:, np.newaxis]
+    has_column = _has_column(records.part(tested), found.surface[tested], beyond)
     has_column &= at_level & ~near[tested]
     tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
