@@ -201,7 +201,7 @@ def decide(
     second = (distance < _SECOND) | (deviation() > _FAR)
     near |= second & (following < last) & _is_weak_behind(records, found.surface, following)
     # A column between both tells a weak surface: that of the column's onset is more accurate than the level.
-    until = (following - found.surface) * records.bin_ns - 1.5 * width
+    until = np.asarray((following - found.surface) * records.bin_ns - 1.5 * width, np.float64)
     open_rows = np.flatnonzero(
         near & (following < last) & (np.abs(deviation()) < _FAR) & (until > waveforms.tail_ns + _OPEN * width)
     )
@@ -212,9 +212,8 @@ def decide(
     at_level = np.abs(deviation()[tested]) < _FAR
     # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
     left = records.time_ns[-1] - records.time_of(found.surface[tested])
-    far = np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
-    beyond = np.asarray(waveforms.tail_ns + far, np.float64)[:, np.newaxis]
-    has_column = _has_column(records.part(tested), found.surface[tested], beyond)
+    beyond = waveforms.tail_ns + np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
+    has_column = _has_column(records.part(tested), found.surface[tested], beyond[:, np.newaxis])
     has_column &= at_level & ~near[tested]
     tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
