@@ -72,8 +72,8 @@ FAULTS = (
     # Radiance is connected to the laser through the surface without the square of the refractive index.
     Fault(
         *("radiance_without_index_squared", f"{_T}/paths/refracted_connection.py"),
-        "si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction)",
-        "si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(direction)",
+        "si.bsdf().eval(mi.BSDFContext(), scene.on_shapes(si), si.to_local(direction)",
+        "si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), scene.on_shapes(si), si.to_local(direction)",
     ),
     # The cosine of the photon stays in the BSDF of merges on solids.
     Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
@@ -92,7 +92,7 @@ FAULTS = (
     # All photons enter the water.
     Fault(
         *("no_fresnel_at_entry", f"{_T}/paths/random_walk.py"),
-        "sample(step.context, si, pick, u, vertex.on_surface)",
+        "sample(step.context, self.scene.on_shapes(si), pick, u, vertex.on_surface)",
         "sample(step.context, si, dr.select(vertex.at_sea & step.adjoint, 1, pick), u, vertex.on_surface)",
     ),
     Fault(

@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE, FirstEchoes, Priors, first_echoes
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel
+from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 
@@ -40,6 +40,8 @@ _RETURNS, _BRIGHTEST = (
 )  # its delays over those of the bottom, and its largest height times delay over width
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
+_SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
+_CLEAR = 8.0  # least height over the noise of one of the echoes that are decided upon
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
 
 
@@ -137,6 +139,7 @@ def decide(
 ) -> Decision:
     """Find the echoes of records, and decide what the first ones are.
 
+    That is for angles below 60 degrees, and bottoms less than 2 m deep: others are those of `find_echoes`.
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
@@ -184,7 +187,9 @@ def decide(
     def deviation() -> FloatArray:
         return (records.time_of(found.surface) - waveforms.echo_shape.peak_ns - level.time_ns) / level.stderr_ns
 
-    early = deviation() < -_FAR - 0.5 * width / level.stderr_ns
+    lines = waveforms.lines_of(part)
+    shallow = np.where(lines.off_nadir < GRAZING, _SHALLOW / lines.depth_per_ns, -np.inf)
+    early = (deviation() < -_FAR - 0.5 * width / level.stderr_ns) & np.isfinite(shallow)
     following = _following(found, last)
     over = np.flatnonzero(
         (found.surface >= 0) & early & (following < last) & (following - found.surface > _APART * apart)
@@ -193,33 +198,41 @@ def decide(
         again = search(over, records.time_of(found.surface[over]) + SEPARATE * width)
         found, above = _with_objects(found, over, again, detection.targets)
     at = np.rint((level.time_ns + waveforms.echo_shape.peak_ns - records.time_ns[0]) / records.bin_ns).astype(np.intp)
-    found = _without_second_return(records, found, at, apart)
+    found = _without_second_return(records, found, at, apart, 2 * shallow / records.bin_ns)
     following = _following(found, last)
     distance = (following - found.surface) / apart
     near = (distance < SEPARATE) | ((distance < _FAR_APART) & _is_weak(records, found.surface))
     # A first echo below the surface's level may be the bottom, and the second one its light that met it twice.
     second = (distance < _SECOND) | (deviation() > _FAR)
-    near |= second & (following < last) & _is_weak_behind(records, found.surface, following)
-    # A column between both tells a weak surface: that of the column's onset is more accurate than the level.
+    near |= second & _is_weak_behind(records, found.surface, following)
+    near &= following < last
+    # A column between a weak surface and a bottom: its onset is more accurate than the level.
+    rises = ~_is_weak_behind(records, found.surface, following, 1.0)
     until = np.asarray((following - found.surface) * records.bin_ns - 1.5 * width, np.float64)
     open_rows = np.flatnonzero(
-        near & (following < last) & (np.abs(deviation()) < _FAR) & (until > waveforms.tail_ns + _OPEN * width)
+        near & rises & (np.abs(deviation()) < _FAR) & (until > waveforms.tail_ns + _OPEN * width)
     )
     near[open_rows] = ~_has_column(
         records.part(open_rows), found.surface[open_rows], waveforms.tail_ns, until[open_rows, np.newaxis]
     )
-    tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)))
+    farthest = level.time_ns + waveforms.echo_shape.peak_ns + shallow + _FAR * level.stderr_ns
+    is_shallow = records.time_of(np.where(near, following, found.surface)) < farthest
+    # A faint echo may be the rise of the column, and one at the record's end may have a column behind it.
+    left = records.time_ns[-1] - records.time_of(found.surface)
+    behind = np.minimum(following, last - 1)
+    is_clear = ~_is_weak(records, found.surface, _CLEAR) | (near & ~_is_weak(records, behind, _CLEAR))
+    is_clear &= left > waveforms.tail_ns + _COLUMN_NS
+    tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)) & is_shallow & is_clear)
     at_level = np.abs(deviation()[tested]) < _FAR
     # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
-    left = records.time_ns[-1] - records.time_of(found.surface[tested])
-    beyond = waveforms.tail_ns + np.clip(left - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
+    beyond = waveforms.tail_ns + np.clip(left[tested] - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
     has_column = _has_column(records.part(tested), found.surface[tested], beyond[:, np.newaxis])
     has_column &= at_level & ~near[tested]
     tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
     if not tested.size:
         return Decision(found, above, probability, tested)
-    lines = waveforms.lines_of(part).at(tested)
+    lines = lines.at(tested)
     priors = Priors(
         level.part(tested),
         IN_AIR * np.cos(lines.off_nadir),
@@ -263,10 +276,10 @@ def _following(found: DetectedEchoes, last: int) -> IntArray:
     return np.asarray(np.where(found.bins[1:] > found.surface, found.bins[1:], last).min(axis=0))
 
 
-def _is_weak(records: Records, bins: IntArray) -> BoolArray:
+def _is_weak(records: Records, bins: IntArray, least: float = _WEAK) -> BoolArray:
     """Return which peaks are so weak that the time of an echo there is not well known."""
     rows, at = np.arange(len(bins)), np.maximum(bins, 0)
-    return np.asarray(records.power[rows, at] < _WEAK * np.broadcast_to(records.noise, records.power.shape)[rows, at])
+    return np.asarray(records.power[rows, at] < least * np.broadcast_to(records.noise, records.power.shape)[rows, at])
 
 
 def _is_weak_behind(
@@ -278,18 +291,26 @@ def _is_weak_behind(
     return np.asarray(behind < most * before)
 
 
-def _without_second_return(records: Records, found: DetectedEchoes, level: IntArray, apart: float) -> DetectedEchoes:
+def _without_second_return(
+    records: Records, found: DetectedEchoes, level: IntArray, apart: float, shallow: FloatArray
+) -> DetectedEchoes:
     """Return echoes without bottoms that are the light of a target which the surface has reflected, and so met twice.
 
     Light that is totally reflected arrives from 2.34 times the depth on, where it is brightest: per pulse width w and
-    delay d at most 0.8 rho w/d of the bottom's echo. Without an echo the surface is in the bins `level`.
+    delay d at most 0.8 rho w/d of the bottom's echo. Without an echo the surface is in the bins `level`; of
+    targets within a number of `shallow` bins behind it.
     """
     bins, flags = found.bins.copy(), found.flags.copy()
     surface = np.where(bins[0] >= 0, bins[0], level)
     for target in range(1, len(bins) - 1):
         delay = bins[target] - surface
         most = np.minimum(_TWICE, _BRIGHTEST * apart / np.maximum(delay, 1))
-        twice = (bins[target] >= 0) & (bins[-1] >= 0) & _is_weak_behind(records, bins[target], bins[-1], most)
+        twice = (
+            (bins[target] >= 0)
+            & (delay < shallow)
+            & (bins[-1] >= 0)
+            & _is_weak_behind(records, bins[target], bins[-1], most)
+        )
         twice &= (bins[-1] - surface > _RETURNS[0] * delay) & (bins[-1] - surface < _RETURNS[1] * delay)
         for mine, none in ((bins, -1), (flags, int(EchoFlag.NO_ECHO))):
             mine[-1] = np.where(twice, mine[target], mine[-1])

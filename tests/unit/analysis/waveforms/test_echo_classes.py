@@ -106,7 +106,7 @@ def test_land_and_shallow_water_are_what_they_are():
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "seed"), [(150, 3)])
 def test_error_rates_over_drawn_records(count, seed):
-    """Land from 0.2 to 4 m, and water from 0.3 to 4 m with glints of all strengths: the rates that `decide` states."""
+    """Land from 0.2 to 4 m, and water from 0.3 to 4 m with glints of all strengths, as `decide` states."""
     rng = np.random.default_rng(seed + significance.seed_shift)
     heights, depths = rng.uniform(0.2, 4, count), np.exp(rng.uniform(np.log(0.3), np.log(4), count))
     glints = np.exp(rng.normal(-2, 2, count)) * (rng.random(count) < 0.7)
