@@ -77,9 +77,11 @@ class Flown:
 
     @classmethod
     def of(cls, store: Store) -> Flown:
-        """Return the pulses of a store; raise `UserError` if none is rendered, or it is no flight."""
+        """Return the pulses of a store; raise `UserError` if none is rendered, or it is no flight of this version."""
         if store.kind != "flight":
             raise UserError(f"{store.path} is the store of a {store.kind}, not of a flight")
+        if "echo_class" not in store.variables:
+            raise UserError(f"{store.path} is of an earlier version, without echo classes: fly into another folder")
         pulse = store.inputs(slice(0, store.count))["pulse"]
         order = np.argsort(pulse)
         rows = order[store.status()[order] != PLANNED]

@@ -278,3 +278,7 @@ def test_flight_over_a_pier(tmp_path):
     assert np.isin(kind[beside], [PointClass.SURFACE, PointClass.BOTTOM]).all()
     np.testing.assert_allclose(z[beside & (kind == PointClass.BOTTOM)], -6.0, atol=0.1)
     assert np.count_nonzero(beside & (kind == PointClass.BOTTOM)) == 8
+    store = Store(tmp_path / "flight" / STORE)
+    store.variables.remove("echo_class")
+    with pytest.raises(UserError, match="is of an earlier version, without echo classes: fly into another folder"):
+        Flown.of(store)
