@@ -190,7 +190,7 @@ def _check_reflection(scene: LidarScene, view: Rays) -> None:
 
 
 def _check_solids(probe: Probe) -> None:
-    """Refuse a target below the bottom; tell of solids in the air, and warn of those above a sea without land."""
+    """Refuse a target below the bottom, and warn of solids that hang in the air where there is no land."""
     scene, bottoms = probe.scene, probe.scene.bottoms
     lowest = min(bottoms, key=lambda bottom: float(bottom.bbox().min.z), default=None)
     _, highest = scene.sea_heights or (np.inf, np.inf)

@@ -34,10 +34,8 @@ _APART = 1.2  # least separation of two echoes of which the first one stands abo
 _WEAK, _FAR_APART = 15.0, 8.0  # height of a weak first echo over the noise, and farthest others behind it, in widths
 _SEA, _SURE = 1, 0.6  # place of the surface among the probabilities of first echoes, and its least one without a column
 _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and its farthest distance in echo widths
-_RETURNS, _BRIGHTEST = (
-    (2.2, 3.2),
-    0.5,
-)  # its delays over those of the bottom, and its largest height times delay over width
+# Its delays over those of the bottom, and its largest height times delay over width.
+_RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]

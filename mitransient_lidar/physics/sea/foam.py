@@ -12,7 +12,6 @@ from mitransient_lidar.core.validation import FloatArray, in_range
 #: Names of laws of the cover by wind speed.
 LAWS = ("monahan_omuircheartaigh_1980", "callaghan_2008", "stramska_petelski_2003")
 
-
 #: Distance of the surroundings above which crests rise [m].
 SURROUNDINGS = 2.0
 

@@ -136,7 +136,7 @@ def test_deep_waters_keep_their_bits():
         np.testing.assert_array_equal(sea.at(3.0).heights(x, y), same.at(3.0).heights(x, y))
     limited = over(level(0.3), wind_speed=3.0, **SPECTRUM)
     assert np.std(limited.heights(x, y)) < 0.6 * np.std(same.heights(x, y))
-    # A depth of all waves is one of the user's.
+    # A given water_depth already shoals all waves.
     given = over(level(0.3), wind_speed=3.0, **SPECTRUM, water_depth=20.0)
     np.testing.assert_array_equal(
         given.heights(x, y), over(None, wind_speed=3.0, **SPECTRUM, water_depth=20.0).heights(x, y)
