@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -278,14 +278,28 @@ class SeaPatches:
             self._later = time_s, self._surface.sea.at(time_s)
         return self._later[1]
 
+    def _seas(self, places: FloatArray, times_s: FloatArray | None) -> Iterable[SeaSurface]:
+        """Return the sea at the time of each place."""
+        return [self._surface.sea] * len(places) if times_s is None else map(self._at, times_s.tolist())
+
+    def heights(self, places: FloatArray, times_s: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return the heights of the patches, as of `SeaSurface.height_patches`, without a mesh."""
+        sea = self._surface.sea
+        return sea.height_patches(places, self._surface.footprint_size, self._seas(places, times_s))
+
+    @property
+    def sea(self) -> SeaSurface:
+        """The sea."""
+        return self._surface.sea
+
     def move(self, places: FloatArray, times_s: FloatArray | None = None) -> FloatArray:
         """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way.
 
         Waves are those at times [s], shape (n,), or at the time of the surface.
         """
-        sea = self._surface.sea
-        seas = [sea] * len(places) if times_s is None else map(self._at, times_s.tolist())
-        mesh, positions = sea.patches(places, self._surface.footprint_size, seas)
+        mesh, positions = self._surface.sea.patches(
+            places, self._surface.footprint_size, self._seas(places, times_s)
+        )
         fill_mesh(self.shape, mesh)
         if self.shapes is None:
             self.shapes = mi.load_dict({"type": "scene", "sea": self.shape}, parallel=False)

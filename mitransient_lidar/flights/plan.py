@@ -94,6 +94,7 @@ class FlightPlan(Plan):
     target_error: Annotated[
         float, positive_option("Relative standard error of the median bin of the shots of a batch")
     ] = 0.1
+    light: Annotated[str, Option("How light is computed: merging, or maps")] = "merging"
     max_time: Annotated[
         float | None,
         positive_option("Longest time for the passes of a batch; shots that it ends have other bits elsewhere", "s"),
@@ -110,6 +111,7 @@ class FlightPlan(Plan):
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of("estimator", self.estimator, ESTIMATORS)
+        one_of("light", self.light, ("merging", "maps"))
         for name in POSE_PARAMETERS:
             if name in self.parameters:
                 raise UserError(

@@ -64,6 +64,9 @@ _ROUNDING = 1e-6
 #: before it, and passes of each.
 _PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
 
+#: Passes of pulses whose light is looked up in maps.
+_MAP_PASSES = 2
+
 
 @dataclass(frozen=True, eq=False)
 class FlightRenderer(Renderer):
@@ -191,6 +194,8 @@ class FlightRenderer(Renderer):
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
         from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
 
+        if self.plan.light == "maps":
+            return _MAP_PASSES, 1.0, None
         error = self.plan.target_error
         share = share_for_error(error)
         return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
@@ -298,7 +303,7 @@ def _shot_scene(
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
-    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False)
+    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False, light=renderer.plan.light)
 
 
 @functools.lru_cache(maxsize=256)

@@ -357,15 +357,20 @@ def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> 
     heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
     directions = np.broadcast_to(axes, origins.shape)
     corners = [np.insert(sea.at_height(origins, directions, z), 2, z, axis=1) for z in heights]
-    return first_along(scene, bottoms, [origins, *corners]) + scene.frame_origin
+    return _first_along(scene.bottoms_alone, [origins, *corners]) + scene.frame_origin
 
 
 def first_along(scene: WaterScene, shapes: Sequence[mi.Shape], corners: Sequence[FloatArray]) -> FloatArray:
     """Return where lines through corners in the frame [m], shape (n, 3) each, first meet one of some shapes, or NaN."""
-    found = np.full(corners[0].shape, np.nan)
     if not shapes:
-        return found
-    active, some = aligned(mi.Bool, np.ones(len(found), dtype=bool)), scene_of_shapes(shapes, scene.groups)
+        return np.full(corners[0].shape, np.nan)
+    return _first_along(scene_of_shapes(shapes, scene.groups), corners)
+
+
+def _first_along(some: mi.Scene, corners: Sequence[FloatArray]) -> FloatArray:
+    """Return where lines first meet a shape of a scene, as `first_along`."""
+    found = np.full(corners[0].shape, np.nan)
+    active = aligned(mi.Bool, np.ones(len(found), dtype=bool))
     for start, end in itertools.pairwise(corners):
         origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
         ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Self, TypeVar
 
 import drjit as dr
@@ -24,7 +25,7 @@ from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import OpenShape, SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import box_of, children
+from mitransient_lidar.transport.solids import box_of, children, scene_of_shapes
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -158,6 +159,11 @@ class WaterScene:
         smallest = _BOTTOM_PER_LARGEST * max(sides, default=0.0)
         rows = zip(self.solids, sides, widths, strict=True)
         return [solid for solid, side, width in rows if side >= max(width, smallest)]
+
+    @cached_property
+    def bottoms_alone(self) -> mi.Scene:
+        """Scene of the bottoms."""
+        return scene_of_shapes(self.bottoms, self.groups)
 
     @property
     def targets(self) -> list[mi.Shape]:

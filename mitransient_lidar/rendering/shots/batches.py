@@ -22,6 +22,8 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
+from mitransient_lidar.transport.light_maps.heights import HeightFields
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
@@ -264,7 +266,10 @@ class ShotBatches:
         level = [sea for sea in lidar.seas if np.isinf(sea.sea.cell_size)]
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
-        self._seas = [SeaPatches(shape) for shape in waves]
+        self._seas = [SeaPatches(shape) for shape in (lidar.seas if isinstance(renderer, LightMapRenderer) else waves)]
+        if isinstance(renderer, LightMapRenderer):
+            going = list(companions)
+        self._mitsuba_scene = lidar.mitsuba_scene
         self._going, self._fixed = (
             scene_of_shapes(shapes, lidar.groups) if shapes else None for shapes in (going, fixed)
         )
@@ -279,6 +284,8 @@ class ShotBatches:
 
     def at(self, shots: ShotPoses) -> Callable[[int], PassRenderer]:
         """Return a function that returns the renderer of shots, each several times."""
+        if isinstance(self._renderer, LightMapRenderer):
+            return self._maps_at(self._renderer, shots)
         parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
         for sea in self._seas:
             positions = sea.move(shots.places, shots.times_s)
@@ -303,6 +310,30 @@ class ShotBatches:
 
         placed = self._renderer.of_shots(scene_of(1), len(shots))
         return lambda copies: placed.repeated(scene_of(copies), copies)
+
+    def _maps_at(self, renderer: LightMapRenderer, shots: ShotPoses) -> Callable[[int], PassRenderer]:
+        """Return as `at` a renderer of light maps, over heights of the sea instead of a mesh."""
+        lidar, (sea,) = renderer.scene, self._seas
+        heights = sea.heights(shots.places, shots.times_s)
+        parts = [(self._going, None)] if self._going is not None else []
+        parts += [(self._fixed, shots.places - self._frame_origin)] if self._fixed is not None else []
+
+        def renderer_of(copies: int) -> PassRenderer:
+            all_shots = shots.repeated(copies)
+            moved = tuple(all_shots.scene_part(shapes, None if places is None else np.repeat(places, copies, axis=0), self._aim) for shapes, places in parts)
+            waves = all_shots.scene_part(self._mitsuba_scene, np.repeat(shots.places, copies, axis=0), self._aim)
+            receiver, transmitter = all_shots.receiver, all_shots.transmitter
+            placed = replace(lidar, parts=moved, receiver_poses=receiver, transmitter_poses=transmitter)
+            fields = HeightFields.of_patches(
+                *(np.repeat(each, copies, axis=0) for each in heights),
+                sea.sea.cell_size if np.isfinite(sea.sea.cell_size) else 1.0,
+                sea.sea.wind_direction,
+                waves.displacement,
+                waves.turn,
+            )
+            return renderer.over(placed, fields)
+
+        return renderer_of
 
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].

@@ -70,6 +70,7 @@ class ShotScene:
         components: bool = False,
         derivatives: Sequence[str] | str = (),
         check: bool = True,
+        light: str = "merging",
     ) -> None:
         from mitransient_lidar.rendering.accuracy import ErrorWindow
         from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
@@ -92,7 +93,13 @@ class ShotScene:
         axis = own.axis if axis is None else _checked_axis(axis, own.axis)
         if check:
             self.session.tell_axis(axis, own.record_end)
-        renderer = self._integrator.prepare(*loaded, axis=axis)
+        if light == "maps":
+            from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+            from mitransient_lidar.transport.paths.path_classes import PathClasses
+
+            renderer = LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())
+        else:
+            renderer = self._integrator.prepare(*loaded, axis=axis)
         renderer = renderer.by_origin() if components else renderer
         self.parameters = path_parameters(renderer, derivatives)
         self._renderer = renderer.perturbed(perturbations(self.parameters)) if self.parameters else renderer

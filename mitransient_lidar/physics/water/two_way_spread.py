@@ -1,0 +1,223 @@
+"""Spread of light by scattering on its way down to a depth and back up, drawn from the phase functions.
+
+Light goes down from the surface, turns once, by the bottom or by one scattering event, and returns. On each way it
+scatters any number of times and goes down (or up) all the time. By reciprocity both ways have the same distribution;
+pairs of independent ways give that of the whole path. Light that changes more often between down and up is left out:
+its share is about the square of backscattering times depth.
+Two-way use of a beam spread function follows Katsev et al. (1997), J. Opt. Soc. Am. A 14, 1338,
+doi:10.1364/JOSAA.14.001338; here ways are followed without a small-angle approximation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.water.forward_scattering import scattering_angles
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+
+#: Least downward component of a direction: light that is more nearly level leaves beam and view.
+_LEVEL = 0.01
+
+#: Largest number of events of a way.
+_MOST_EVENTS = 200
+
+#: Least scattering coefficient, so that optical depths increase strictly [1/m].
+_LEAST_SCATTERING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class TwoWaySpread:
+    """Paths that scatter forwards on at least one of their ways, by depth; arrays of shape (depths, paths).
+
+    All are relative to the straight path along the axis, which is tilted towards +x. The sum over the paths of a weight
+    divided by their number is the ratio of the energy of scattered light to (1 - q^2) times that of light of the same
+    absorption without scattering, where q is the share of light that no event has met on one way.
+
+    Attributes
+    ----------
+    depths
+        Depths [m], increasing, shape (depths,).
+    shift_x, shift_y
+        Displacement of the straight way that the light came down beside, from that in which it is seen [m].
+    excess
+        Length of the path beyond the straight one [m].
+    of_bottom, of_water
+        Weights of light that a horizontal Lambertian plane has turned, and that one scattering event has turned [1].
+    events
+        Number of scattering events without that one.
+    """
+
+    depths: FloatArray
+    shift_x: FloatArray
+    shift_y: FloatArray
+    excess: FloatArray
+    of_bottom: FloatArray
+    of_water: FloatArray
+    events: IntArray
+
+    @classmethod
+    def of_column(
+        cls,
+        column: WaterColumn,
+        phases: Sequence[PowerLawTable],
+        depths: FloatArray,
+        cos_water: float,
+        paths: int,
+        rng: np.random.Generator,
+    ) -> TwoWaySpread:
+        """Draw paths.
+
+        Parameters
+        ----------
+        column, phases
+            Layers of water, and the phase function of each.
+        depths
+            Depths [m], increasing, positive, shape (depths,).
+        cos_water
+            Cosine of the axis in the water from the vertical, above 0 to 1.
+        paths
+            Number of paths for each depth, and of ways.
+        rng
+            Random numbers.
+        """
+        ways = _Ways(column, phases, depths, cos_water, paths, rng)
+        found: list[list[FloatArray]] = []
+        layers = column.layer_at(depths)
+        for number, (layer, q) in enumerate(zip(layers, ways.unscattered, strict=True)):
+            scattered = np.flatnonzero(ways.events[number] > 0)
+            mass = ways.share * scattered.size / paths
+            shares = np.array([q * mass, q * mass, mass**2])
+            if shares.sum() <= 0:
+                found.append([np.zeros(paths)] * 6)
+                continue
+            # The first part has scattered on the way down alone, the second on the way up, the third on both.
+            ends = np.round(np.cumsum(shares) / shares.sum() * paths).astype(int)
+            place = np.arange(paths)
+            down, up = (rng.choice(scattered, paths) for _ in range(2))
+            down[(place >= ends[0]) & (place < ends[1])] = up[place < ends[0]] = -1
+            (x1, y1, e1, a1, u1, n1), (x2, y2, e2, a2, u2, n2) = ways.at(number, down), ways.at(number, up)
+            absorbed = np.exp(-(a1 + a2)) * shares.sum() / (1 - q**2)
+            s = np.clip(0.5 + 0.5 * np.sum(u1 * u2, axis=0), 1e-6, 1)
+            phase = phases[layer].eval_s(s) / phases[layer].eval_s(1.0)
+            of_water = absorbed * phase * cos_water**2 / (u1[2] * u2[2])
+            # Seen at x, light has turned at x + (x2, y2), which that of the way down reaches from x + (x2 - x1, ...).
+            found.append([x2 - x1, y2 - y1, e1 + e2, absorbed, of_water, n1 + n2])
+        arrays = [np.array(each) for each in zip(*found, strict=True)]
+        return cls(depths, *arrays[:5], arrays[5].astype(np.int64))
+
+
+class _Ways:
+    """Ways down from the surface along a tilted axis, all with an event above the last depth.
+
+    Attributes
+    ----------
+    share
+        Share of the light that meets an event above the last depth.
+    unscattered
+        Share of the light that has met none at each depth, shape (depths,).
+    events
+        Number of events at each depth, 0 for ways that go up before it, shape (depths, ways).
+    """
+
+    def __init__(
+        self,
+        column: WaterColumn,
+        phases: Sequence[PowerLawTable],
+        depths: FloatArray,
+        cos_water: float,
+        count: int,
+        rng: np.random.Generator,
+    ) -> None:
+        deepest = float(depths[-1])
+        tops = column.layer_tops[column.layer_tops < deepest]
+        edges = np.append(tops, deepest)
+        used = slice(0, tops.size)
+        optical = np.append(0, np.cumsum(np.diff(edges) * np.maximum(column.scattering[used], _LEAST_SCATTERING)))
+        absorbed = np.append(0, np.cumsum(np.diff(edges) * column.absorption[used]))
+        whole = optical[-1] / cos_water
+        self.share = -np.expm1(-whole)
+        self.unscattered = np.exp(-np.interp(depths, edges, optical) / cos_water)
+        axis = np.array([np.sqrt(1 - cos_water**2), 0.0, cos_water])
+        self._straight = axis
+        shape = depths.size, count
+        self.events = np.zeros(shape, np.int64)
+        self._x, self._y, self._length, self._absorbed = (np.zeros(shape) for _ in range(4))
+        self._direction = np.tile(axis[:, None, None], (1, *shape))
+        position, direction = np.zeros((3, count)), np.tile(axis[:, None], (1, count))
+        length, depth_a = np.zeros(count), np.zeros(count)
+        alive = np.arange(count)
+        # Stratified, so that the share of ways that have scattered above each depth has little noise.
+        flight = -np.log1p(-self.share * (rng.permutation(count) + rng.random(count)) / count)
+        for event in range(_MOST_EVENTS):
+            below = np.interp(position[2], edges, optical) + flight * direction[2]
+            z = np.where(below < optical[-1], np.interp(below, optical, edges), np.inf)
+            for number in np.flatnonzero(depths >= position[2].min(initial=np.inf)) if event else ():
+                crosses = np.flatnonzero((position[2] < depths[number]) & (z >= depths[number]))
+                step = (depths[number] - position[2][crosses]) / direction[2][crosses]
+                ways = alive[crosses]
+                run = length[crosses] + step
+                tilt = depths[number] / cos_water
+                self._x[number, ways] = position[0][crosses] + step * direction[0][crosses] - tilt * axis[0]
+                self._y[number, ways] = position[1][crosses] + step * direction[1][crosses]
+                self._length[number, ways] = run - tilt
+                above = np.interp([depths[number]], edges, absorbed) - np.interp(position[2][crosses], edges, absorbed)
+                total = depth_a[crosses] + above / direction[2][crosses]
+                self._absorbed[number, ways] = total - np.interp(depths[number], edges, absorbed) / cos_water
+                self._direction[:, number, ways] = direction[:, crosses]
+                self.events[number, ways] = event
+            goes_on = np.isfinite(z)
+            step = (z[goes_on] - position[2][goes_on]) / direction[2][goes_on]
+            alive, position, direction = alive[goes_on], position[:, goes_on], direction[:, goes_on]
+            depth_a = depth_a[goes_on] + (
+                np.interp(z[goes_on], edges, absorbed) - np.interp(position[2], edges, absorbed)
+            ) / direction[2]
+            length = length[goes_on] + step
+            position = position + step * direction
+            position[2] = z[goes_on]
+            direction = _turned(direction, self._angles(column, phases, position[2], rng), rng)
+            down = direction[2] > _LEVEL
+            alive, position, direction = alive[down], position[:, down], direction[:, down]
+            length, depth_a = length[down], depth_a[down]
+            if not alive.size:
+                break
+            flight = rng.exponential(size=alive.size)
+
+    @staticmethod
+    def _angles(
+        column: WaterColumn, phases: Sequence[PowerLawTable], depths: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Return scattering angles at depths [rad]."""
+        u, layers, theta = rng.random(depths.size), column.layer_at(depths), np.empty(depths.size)
+        for layer in np.unique(layers):
+            here = layers == layer
+            theta[here] = scattering_angles(phases[layer], u[here])
+        return theta
+
+    def at(self, number: int, ways: IntArray) -> tuple[FloatArray, ...]:
+        """Return displacement x, y [m], excess length [m], excess absorption, direction and events of ways at a depth.
+
+        Way -1 is the straight one.
+        """
+        straight = ways < 0
+        fields = (self._x, self._y, self._length, self._absorbed)
+        x, y, length, absorbed = (np.where(straight, 0.0, each[number, ways]) for each in fields)
+        direction = np.where(straight, self._straight[:, None], self._direction[:, number, ways])
+        return x, y, length, absorbed, direction, np.where(straight, 0, self.events[number, ways])
+
+
+def _turned(direction: FloatArray, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return unit directions, shape (3, n), turned by angles [rad] to a random side."""
+    azimuth = 2 * np.pi * rng.random(theta.size)
+    # Frame of Duff et al. (2017), J. Comput. Graph. Tech. 6 (1); z is positive here.
+    x, y, z = direction
+    a = -1 / (1 + z)
+    side = np.array([1 + x * x * a, x * y * a, -x])
+    other = np.array([x * y * a, 1 + y * y * a, -y])
+    sin = np.sin(theta)
+    turned = sin * np.cos(azimuth) * side + sin * np.sin(azimuth) * other + np.cos(theta) * direction
+    return np.asarray(turned / np.linalg.norm(turned, axis=0))

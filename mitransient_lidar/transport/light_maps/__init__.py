@@ -1,0 +1,1 @@
+"""Light by maps of the beam at several depths, without random walks."""
