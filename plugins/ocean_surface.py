@@ -288,18 +288,21 @@ class SeaPatches:
         return sea.height_patches(places, self._surface.footprint_size, self._seas(places, times_s))
 
     @property
-    def sea(self) -> SeaSurface:
-        """The sea."""
-        return self._surface.sea
+    def cell_size(self) -> float:
+        """Distance of the lines of `heights` [m]."""
+        return self._surface.sea.line_distance
+
+    @property
+    def wind_direction(self) -> float:
+        """Direction of the first axis of the ripples [rad]."""
+        return self._surface.sea.wind_direction
 
     def move(self, places: FloatArray, times_s: FloatArray | None = None) -> FloatArray:
         """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way.
 
         Waves are those at times [s], shape (n,), or at the time of the surface.
         """
-        mesh, positions = self._surface.sea.patches(
-            places, self._surface.footprint_size, self._seas(places, times_s)
-        )
+        mesh, positions = self._surface.sea.patches(places, self._surface.footprint_size, self._seas(places, times_s))
         fill_mesh(self.shape, mesh)
         if self.shapes is None:
             self.shapes = mi.load_dict({"type": "scene", "sea": self.shape}, parallel=False)

@@ -38,6 +38,7 @@ def fly(
     ],
     folder: str | os.PathLike[str],
     *,
+    light: Annotated[str | None, Option("Computation of the light instead of the flight's: merging or maps")] = None,
     workers: ProcessCount = None,
     scheduler: Scheduler = None,
     shard_size: Annotated[
@@ -57,6 +58,8 @@ def fly(
         A TOML file, the name of a shipped flight, or a dict of its contents; see docs/guide/flights.md.
     folder
         Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``.
+    light
+        As of `rendering.shots.series.render_shots`; pulses near targets are merged.
     workers, scheduler
         As for `campaigns.sweep.sweep`.
     shard_size
@@ -82,6 +85,7 @@ def fly(
         plan = FlightPlan.of_file(flight)
     else:
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(checked_path("flight", flight))
+    plan = plan.lit_by(light)
     folder = checked_path("folder", folder)
     coordinate_system_wkt(plan.crs, plan.origin[:2])
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size, progress), workers, scheduler, False, progress)

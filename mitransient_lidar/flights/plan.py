@@ -27,6 +27,7 @@ from mitransient_lidar.flights.poses.platforms import XYZ, Platform, SbetFile, T
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.physics.receiver.receiver_files import Setting
+from mitransient_lidar.rendering.options import LIGHT, LightOption
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
@@ -94,7 +95,7 @@ class FlightPlan(Plan):
     target_error: Annotated[
         float, positive_option("Relative standard error of the median bin of the shots of a batch")
     ] = 0.1
-    light: Annotated[str, Option("How light is computed: merging, or maps")] = "merging"
+    light: LightOption = "merging"
     max_time: Annotated[
         float | None,
         positive_option("Longest time for the passes of a batch; shots that it ends have other bits elsewhere", "s"),
@@ -111,7 +112,7 @@ class FlightPlan(Plan):
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of("estimator", self.estimator, ESTIMATORS)
-        one_of("light", self.light, ("merging", "maps"))
+        one_of("light", self.light, LIGHT)
         for name in POSE_PARAMETERS:
             if name in self.parameters:
                 raise UserError(
@@ -147,6 +148,10 @@ class FlightPlan(Plan):
         }
         values = {**given, **paths} | ({"receiver": receiver} if "receiver" in given else {})
         return cls.of(values, "a flight", folder=folder, text=text)
+
+    def lit_by(self, light: str | None) -> FlightPlan:
+        """Return the flight with another `light`; itself if None."""
+        return self if light is None else FlightPlan.of_file({**json.loads(self.text), "light": light}, self.folder)
 
     @classmethod
     def from_json(cls, text: str) -> FlightPlan:

@@ -194,8 +194,6 @@ class FlightRenderer(Renderer):
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
         from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
 
-        if self.plan.light == "maps":
-            return _MAP_PASSES, 1.0, None
         error = self.plan.target_error
         share = share_for_error(error)
         return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
@@ -225,11 +223,11 @@ class FlightRenderer(Renderer):
                     progress(Progress(done=done, planned=rows.size, unit="sampling pulse"))
         return found
 
-    def _scene_of(self, inputs: Mapping[str, Column]) -> ShotScene:
-        """Return the loaded scene of the lidar of pulses of one group."""
+    def _scene_of(self, inputs: Mapping[str, Column], light: str | None = None) -> ShotScene:
+        """Return the loaded scene of the lidar of pulses of one group, by default for the light of the flight."""
         # That of a scene which was loaded before.
         variants.leave_the_gpu("shots are rendered")
-        return _shot_scene(self, *self._lidar_and_record(inputs))
+        return _shot_scene(self, *self._lidar_and_record(inputs), light or self.plan.light)
 
     def _lidar_and_record(self, inputs: Mapping[str, Column]) -> tuple[float, float, float, float, TimeAxis]:
         """Return the lidar of pulses of one group, as of `lidar_of`, and its time bins."""
@@ -252,7 +250,7 @@ class FlightRenderer(Renderer):
 
         The last array are the relative errors of the bins that count.
         """
-        from mitransient_lidar.rendering.shots.batches import ReceivedShots
+        from mitransient_lidar.rendering.shots.batches import ReceivedShots, suits_maps
         from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan
@@ -261,20 +259,28 @@ class FlightRenderer(Renderer):
         # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
         further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * scene.lidar.axis.bin_width_ns
         poses = poses.delayed(further % width)
-        batches = _batches(scene, *passes)
-        if plan.max_time is not None:
-            batches = batches.limited(passes[0], plan.max_time)
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
             poses = replace(poses, times_s=np.full(len(poses), time_s))
             sea = sea if sea is None else sea.at(time_s)
         pulses = inputs["pulse"].astype(np.int64)
-        rendered = [
-            batches.render(poses.part(part), [plan.seed * 2**20 + int(pulse) for pulse in pulses[part]])
-            for part in batches.parts(len(poses))
-        ]
-        joined = ReceivedShots.joined(rendered)
+        by_maps = suits_maps(scene.lidar, poses) if plan.light == "maps" else np.zeros(len(poses), dtype=bool)
+        rendered, rows = [], []
+        for light in ("maps", "merging"):
+            if not (own := np.flatnonzero(by_maps == (light == "maps"))).size:
+                continue
+            # Maps have the errors of a few passes.
+            options = (_MAP_PASSES, 1.0, None) if light == "maps" else passes
+            batches = _batches(self._scene_of(inputs, light), *options)
+            if plan.max_time is not None:
+                batches = batches.limited(options[0], plan.max_time)
+            for part in batches.parts(own.size):
+                some = own[part]
+                seeds = [plan.seed * 2**20 + int(pulse) for pulse in pulses[some]]
+                rendered.append(batches.render(poses.part(some), seeds))
+                rows.append(some)
+        joined = ReceivedShots.joined(rendered, np.argsort(np.concatenate(rows)))
         attributes = scene.attributes(used=batches.used_values, passes=int(joined.passes.max()))
         series = scene.dataset(joined, attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
         return series, 1e9 / C0 * (further - further % width), joined.errors
@@ -295,15 +301,15 @@ def scene_of(plan: FlightPlan) -> SceneSource:
     return source
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=4)
 def _shot_scene(
-    renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis
+    renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis, light: str
 ) -> ShotScene:
     """Return the loaded scene of the lidar of a group."""
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
-    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False, light=renderer.plan.light)
+    return ShotScene(renderer.scene, params, np.array([[x, y]]), axis=axis, check=False, light=light)
 
 
 @functools.lru_cache(maxsize=256)
@@ -313,10 +319,11 @@ def _turned_lines(
     """Return the lines of sight of the lidar of a group whose pixels are turned about the receiver's axis [deg]."""
     from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 
-    return lines_of_sight(_shot_scene(renderer, angle_deg, height, x, y, axis).lidar, turn_deg)
+    scene = _shot_scene(renderer, angle_deg, height, x, y, axis, renderer.plan.light)
+    return lines_of_sight(scene.lidar, turn_deg)
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=4)
 def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
     """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
     return scene.batches(passes, share, error)

@@ -18,7 +18,7 @@ from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_source import SceneSource, json_attribute
-from mitransient_lidar.rendering.options import KEPT
+from mitransient_lidar.rendering.options import KEPT, LIGHT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
 
 logger = logging.getLogger(__name__)
@@ -146,6 +146,7 @@ def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[s
         "target_error": attributes.get("target_error"),
         "move_target": bool(attributes["moved_target"]),
         "first_seed": int(attributes.get("first_seed", 0)),
+        "light": str(attributes.get("light", LIGHT[0])),
         **same,
     }
 

@@ -61,6 +61,16 @@ Smooth = Annotated[
         *(0.2, 20),
     ),
 ]
+#: Ways to compute the light of shots.
+LIGHT = ("merging", "maps")
+LightOption = Annotated[
+    str,
+    Option(
+        "Computation of the light: merging (the default), or maps of the beam at several depths, 20 times faster and "
+        "1 to 2 % in error",
+        form="|".join(LIGHT),
+    ),
+]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
 
 #: Options that results keep, and the attributes that hold them.

@@ -276,30 +276,28 @@ class SeaSurface:
             meshes.append(sea._with_foam(mesh, x, y))
         return joined(meshes), positions
 
+    @property
+    def line_distance(self) -> float:
+        """Distance of grid lines [m]: the side of a cell, 1 m for a level sea."""
+        return self.cell_size if np.isfinite(self.cell_size) else 1.0
+
     def height_patches(
         self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the heights of fine patches about places, as of `patches` without what surrounds them.
+        """Return elevations [m] on grid lines about places, shape (n, along y, along x), and first x, y of each [m].
 
-        Returns
-        -------
-        heights : ndarray
-            Elevations [m] on lines one cell apart, shape (n, lines along y, lines along x).
-        corners : ndarray
-            First x and y of each patch [m], shape (n, 2).
+        The fine patches of `patches`, of the same arguments.
         """
-        half = max(1, math.ceil(0.5 * refined_size / self.cell_size)) if np.isfinite(self.cell_size) else 1
-        lines = np.arange(-half, half + 1)
-        found, corners = [], []
-        for place, sea in zip(places, seas, strict=True):
-            if not np.isfinite(self.cell_size):
-                found.append(np.zeros((lines.size, lines.size)))
-                corners.append(place - half)
-                continue
-            x, y = ((lines + round(centre / self.cell_size)) * self.cell_size for centre in place)
-            found.append(sea.heights_about(place, x, y))
-            corners.append(np.array([x[0], y[0]]))
-        return np.array(found), np.array(corners)
+        cell = self.line_distance
+        half = max(1, math.ceil(0.5 * refined_size / cell))
+        lines = np.array([np.round(place / cell) for place in places])[..., None] + np.arange(-half, half + 1)
+        heights = [
+            sea.heights_about(place, *(numbers * cell))
+            if np.isfinite(self.cell_size)
+            else np.zeros((2 * half + 1,) * 2)
+            for place, sea, numbers in zip(places, seas, lines, strict=True)
+        ]
+        return np.array(heights), np.asarray(lines[..., 0] * cell, np.float64)
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""

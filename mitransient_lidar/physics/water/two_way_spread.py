@@ -26,6 +26,9 @@ _LEVEL = 0.01
 #: Largest number of events of a way.
 _MOST_EVENTS = 200
 
+#: Ways, and pairs of them, for each path: paths are sorted by displacement, and one stands for its neighbours.
+_WAYS, _PAIRS = 16, 64
+
 #: Least scattering coefficient, so that optical depths increase strictly [1/m].
 _LEAST_SCATTERING = 1e-12
 
@@ -34,9 +37,9 @@ _LEAST_SCATTERING = 1e-12
 class TwoWaySpread:
     """Paths that scatter forwards on at least one of their ways, by depth; arrays of shape (depths, paths).
 
-    All are relative to the straight path along the axis, which is tilted towards +x. The sum over the paths of a weight
-    divided by their number is the ratio of the energy of scattered light to (1 - q^2) times that of light of the same
-    absorption without scattering, where q is the share of light that no event has met on one way.
+    All are relative to the straight path along the axis, which is tilted towards +x, and sorted by displacement. The
+    mean of a weight is the energy of scattered light over (1 - q^2) times that of light that meets absorption alone,
+    where q is the share of light that no event has turned on one way.
 
     Attributes
     ----------
@@ -68,9 +71,9 @@ class TwoWaySpread:
         depths: FloatArray,
         cos_water: float,
         paths: int,
-        rng: np.random.Generator,
+        seed: int = 0,
     ) -> TwoWaySpread:
-        """Draw paths.
+        """Draw paths, the same ones for the same arguments.
 
         Parameters
         ----------
@@ -81,24 +84,26 @@ class TwoWaySpread:
         cos_water
             Cosine of the axis in the water from the vertical, above 0 to 1.
         paths
-            Number of paths for each depth, and of ways.
-        rng
-            Random numbers.
+            Number of paths for each depth.
+        seed
+            Seed of the random numbers.
         """
-        ways = _Ways(column, phases, depths, cos_water, paths, rng)
+        rng = np.random.default_rng(seed)
+        ways = _Ways(column, phases, depths, cos_water, _WAYS * paths, rng)
+        count = _PAIRS * paths
         found: list[list[FloatArray]] = []
         layers = column.layer_at(depths)
         for number, (layer, q) in enumerate(zip(layers, ways.unscattered, strict=True)):
             scattered = np.flatnonzero(ways.events[number] > 0)
-            mass = ways.share * scattered.size / paths
+            mass = ways.share * scattered.size / (_WAYS * paths)
             shares = np.array([q * mass, q * mass, mass**2])
             if shares.sum() <= 0:
                 found.append([np.zeros(paths)] * 6)
                 continue
             # The first part has scattered on the way down alone, the second on the way up, the third on both.
-            ends = np.round(np.cumsum(shares) / shares.sum() * paths).astype(int)
-            place = np.arange(paths)
-            down, up = (rng.choice(scattered, paths) for _ in range(2))
+            ends = np.round(np.cumsum(shares) / shares.sum() * count).astype(int)
+            place = np.arange(count)
+            down, up = (rng.choice(scattered, count) for _ in range(2))
             down[(place >= ends[0]) & (place < ends[1])] = up[place < ends[0]] = -1
             (x1, y1, e1, a1, u1, n1), (x2, y2, e2, a2, u2, n2) = ways.at(number, down), ways.at(number, up)
             absorbed = np.exp(-(a1 + a2)) * shares.sum() / (1 - q**2)
@@ -106,9 +111,13 @@ class TwoWaySpread:
             phase = phases[layer].eval_s(s) / phases[layer].eval_s(1.0)
             of_water = absorbed * phase * cos_water**2 / (u1[2] * u2[2])
             # Seen at x, light has turned at x + (x2, y2), which that of the way down reaches from x + (x2 - x1, ...).
-            found.append([x2 - x1, y2 - y1, e1 + e2, absorbed, of_water, n1 + n2])
+            groups = np.argsort(np.hypot(x2 - x1, y2 - y1)).reshape(paths, _PAIRS)
+            one = groups[:, 0]
+            moved = [each[one] for each in (x2 - x1, y2 - y1, e1 + e2)]
+            found.append([*moved, *(each[groups].mean(axis=1) for each in (absorbed, of_water)), (n1 + n2)[one]])
         arrays = [np.array(each) for each in zip(*found, strict=True)]
-        return cls(depths, *arrays[:5], arrays[5].astype(np.int64))
+        x, y, excess, of_bottom, of_water, events = arrays
+        return cls(depths, x, y, excess, of_bottom, of_water, events.astype(np.int64))
 
 
 class _Ways:
@@ -173,9 +182,10 @@ class _Ways:
             goes_on = np.isfinite(z)
             step = (z[goes_on] - position[2][goes_on]) / direction[2][goes_on]
             alive, position, direction = alive[goes_on], position[:, goes_on], direction[:, goes_on]
-            depth_a = depth_a[goes_on] + (
-                np.interp(z[goes_on], edges, absorbed) - np.interp(position[2], edges, absorbed)
-            ) / direction[2]
+            depth_a = (
+                depth_a[goes_on]
+                + (np.interp(z[goes_on], edges, absorbed) - np.interp(position[2], edges, absorbed)) / direction[2]
+            )
             length = length[goes_on] + step
             position = position + step * direction
             position[2] = z[goes_on]

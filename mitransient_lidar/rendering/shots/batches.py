@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import raise_if_out_of_memory
-from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
+from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray, require_memory
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accumulators import Light
@@ -23,12 +23,12 @@ from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, reach_of_maps
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.probe import land_of_shots
+from mitransient_lidar.transport.probe import gaps, land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
@@ -209,8 +209,10 @@ class ReceivedShots:
     errors: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def joined(cls, several: Sequence[ReceivedShots]) -> ReceivedShots:
-        """Return the light of all shots of several batches."""
+    def joined(cls, several: Sequence[ReceivedShots], order: IntArray | None = None) -> ReceivedShots:
+        """Return the light of all shots of several batches, in an order."""
+        if order is not None:
+            several = [cls.joined(several)._in_order(order)]
         whole, parts, derivatives = (
             tuple(np.concatenate(arrays) for arrays in zip(*(getattr(one, name) for one in several), strict=True))
             for name in ("whole", "parts", "derivatives")
@@ -218,6 +220,12 @@ class ReceivedShots:
         passes, errors = (np.concatenate([getattr(one, name) for one in several]) for name in ("passes", "errors"))
         lost, missed = (sum(getattr(one, name) for one in several) for name in ("lost", "missed"))
         return cls(whole, lost, passes, parts, derivatives, missed, errors)
+
+    def _in_order(self, order: IntArray) -> ReceivedShots:
+        """Return the shots in another order."""
+        some = (self.whole, self.parts, self.derivatives)
+        whole, parts, changes = (tuple(each[order] for each in arrays) for arrays in some)
+        return ReceivedShots(whole, self.lost, self.passes[order], parts, changes, self.missed, self.errors)
 
 
 class ShotBatches:
@@ -262,14 +270,12 @@ class ShotBatches:
         self._aim = np.array(aim) - self._frame_origin
         self._goal, self._window, in_turn = goal, window, passes if goal is None else _PASSES_FOR_ERROR
         self._seconds = math.inf
-        waves = [sea for sea in lidar.seas if np.isfinite(sea.sea.cell_size)]
-        level = [sea for sea in lidar.seas if np.isinf(sea.sea.cell_size)]
+        with_maps = isinstance(renderer, LightMapRenderer)
+        waves = [sea for sea in lidar.seas if with_maps or np.isfinite(sea.sea.cell_size)]
+        level = [sea for sea in lidar.seas if not with_maps and np.isinf(sea.sea.cell_size)]
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
-        self._seas = [SeaPatches(shape) for shape in (lidar.seas if isinstance(renderer, LightMapRenderer) else waves)]
-        if isinstance(renderer, LightMapRenderer):
-            going = list(companions)
-        self._mitsuba_scene = lidar.mitsuba_scene
+        self._seas = [SeaPatches(shape) for shape in waves]
         self._going, self._fixed = (
             scene_of_shapes(shapes, lidar.groups) if shapes else None for shapes in (going, fixed)
         )
@@ -285,7 +291,7 @@ class ShotBatches:
     def at(self, shots: ShotPoses) -> Callable[[int], PassRenderer]:
         """Return a function that returns the renderer of shots, each several times."""
         if isinstance(self._renderer, LightMapRenderer):
-            return self._maps_at(self._renderer, shots)
+            return self._over_maps(self._renderer, shots)
         parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
         for sea in self._seas:
             positions = sea.move(shots.places, shots.times_s)
@@ -311,27 +317,31 @@ class ShotBatches:
         placed = self._renderer.of_shots(scene_of(1), len(shots))
         return lambda copies: placed.repeated(scene_of(copies), copies)
 
-    def _maps_at(self, renderer: LightMapRenderer, shots: ShotPoses) -> Callable[[int], PassRenderer]:
-        """Return as `at` a renderer of light maps, over heights of the sea instead of a mesh."""
-        lidar, (sea,) = renderer.scene, self._seas
-        heights = sea.heights(shots.places, shots.times_s)
-        parts = [(self._going, None)] if self._going is not None else []
-        parts += [(self._fixed, shots.places - self._frame_origin)] if self._fixed is not None else []
+    def _over_maps(self, renderer: LightMapRenderer, shots: ShotPoses) -> Callable[[int], PassRenderer]:
+        """Return as `at` a renderer of light maps, which has heights of the sea instead of a mesh."""
+        lidar, sea = renderer.scene, self._seas[0]
+        heights, corners = sea.heights(shots.places, shots.times_s)
+        places = shots.places - self._frame_origin
+        parts = [(scene, at) for scene, at in ((self._going, None), (self._fixed, places)) if scene is not None]
 
         def renderer_of(copies: int) -> PassRenderer:
             all_shots = shots.repeated(copies)
-            moved = tuple(all_shots.scene_part(shapes, None if places is None else np.repeat(places, copies, axis=0), self._aim) for shapes, places in parts)
-            waves = all_shots.scene_part(self._mitsuba_scene, np.repeat(shots.places, copies, axis=0), self._aim)
-            receiver, transmitter = all_shots.receiver, all_shots.transmitter
-            placed = replace(lidar, parts=moved, receiver_poses=receiver, transmitter_poses=transmitter)
-            fields = HeightFields.of_patches(
-                *(np.repeat(each, copies, axis=0) for each in heights),
-                sea.sea.cell_size if np.isfinite(sea.sea.cell_size) else 1.0,
-                sea.sea.wind_direction,
-                waves.displacement,
-                waves.turn,
+            moved, waves = (
+                [
+                    all_shots.scene_part(scene, None if at is None else np.repeat(at, copies, axis=0), self._aim)
+                    for scene, at in some
+                ]
+                for some in (parts, [(lidar.mitsuba_scene, shots.places)])
             )
-            return renderer.over(placed, fields)
+            placed = replace(
+                lidar,
+                parts=tuple(moved),
+                receiver_poses=all_shots.receiver,
+                transmitter_poses=all_shots.transmitter,
+            )
+            patches, low = (np.repeat(each, copies, axis=0) for each in (heights, corners))
+            fields = HeightFields.of_patches(patches, low, sea.cell_size, sea.wind_direction, waves[0])
+            return renderer.over(placed, fields, copies)
 
         return renderer_of
 
@@ -405,6 +415,13 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
     """Return the relative standard errors of the bins that count, none before the second pass."""
     power = light.whole.power
     return np.zeros(0) if window is None or power.count < 2 else window.relative_errors(power.mean, power.stderr)
+
+
+def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
+    """Return which shots of a scene that suits light maps are so far from its targets that it has no part in them."""
+    places = poses.places - lidar.frame_origin[:2]
+    apart = [gaps(places, target) > reach_of_maps(lidar, -float(target.bbox().min.z)) for target in lidar.targets]
+    return np.all(apart, axis=0) if apart else np.ones(len(poses), dtype=bool)
 
 
 def share_for_error(error: float) -> float:

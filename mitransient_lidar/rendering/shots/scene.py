@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches
+    from mitransient_lidar.transport.paths.passes import PassRenderer
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Parameters of the scene that shots replace, and those that they replace to move the target.
@@ -44,6 +45,8 @@ class ShotScene:
         As of `series.render_shots`.
     check
         Whether to tell the time bins, and to check the scene.
+    light
+        As of `series.render_shots`.
 
     Attributes
     ----------
@@ -93,13 +96,7 @@ class ShotScene:
         axis = own.axis if axis is None else _checked_axis(axis, own.axis)
         if check:
             self.session.tell_axis(axis, own.record_end)
-        if light == "maps":
-            from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-            from mitransient_lidar.transport.paths.path_classes import PathClasses
-
-            renderer = LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())
-        else:
-            renderer = self._integrator.prepare(*loaded, axis=axis)
+        renderer = self._prepare(axis, light)
         renderer = renderer.by_origin() if components else renderer
         self.parameters = path_parameters(renderer, derivatives)
         self._renderer = renderer.perturbed(perturbations(self.parameters)) if self.parameters else renderer
@@ -111,6 +108,18 @@ class ShotScene:
         if check:
             check_scene(renderer.probe)
         self._described = describe_scene(renderer.probe, self.window, self._renderer.focusing)
+
+    def _prepare(self, axis: TimeAxis, light: str) -> PassRenderer:
+        """Return the renderer of the scene's own shot."""
+        loaded = self.session.scene, self.session.sensor
+        if light == "maps":
+            from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+            from mitransient_lidar.transport.paths.path_classes import PathClasses
+            from mitransient_lidar.transport.scene_parts import find_lidar_scene
+
+            return LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())
+        renderer: PassRenderer = self._integrator.prepare(*loaded, axis=axis)
+        return renderer
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""

@@ -12,6 +12,7 @@ import numpy as np
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.rng import starts
+from mitransient_lidar.transport.scene import ScenePart
 
 #: Steps towards the point where a ray meets the sea: each shortens the distance by slope times tangent of the angle.
 _STEPS = 6
@@ -55,8 +56,7 @@ class HeightFields:
         corners: FloatArray,
         cell: float,
         wind_direction: float,
-        displacement: mi.Vector3f,
-        turn: mi.Vector2f | None,
+        part: ScenePart,
     ) -> Self:
         """Return the fields of patches.
 
@@ -68,16 +68,16 @@ class HeightFields:
             Side of a cell [m].
         wind_direction
             Direction of the first axis of the ripples [rad].
-        displacement, turn
-            As of `transport.scene.ScenePart`, of each shot.
+        part
+            Displacement and turn of each shot.
         """
         shots, lines, _ = heights.shape
         low = mi.Vector2f(*(aligned(mi.Float, column.astype(np.float32)) for column in corners.T))
         wind = opaque(float(np.cos(wind_direction))), opaque(float(np.sin(wind_direction)))
         values = aligned(mi.Float, heights.astype(np.float32))
         sizes = opaque_index(lines), opaque(1 / cell)
-        turn = mi.Vector2f(1, 0) if turn is None else turn
-        return cls(values, *sizes, wind, low, displacement, turn, starts(shots, lines * lines))
+        turn = mi.Vector2f(1, 0) if part.turn is None else part.turn
+        return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines))
 
     def meet(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """Return where rays that go down meet the sea, on the faces that its mesh has; `active` in valid ones."""
@@ -88,9 +88,10 @@ class HeightFields:
         u = (cos * x - sin * y + self.displacement.x - self.low.x) * self.per_metre
         v = (sin * x + cos * y + self.displacement.y - self.low.y) * self.per_metre
         per_height = self.per_metre / direction.z
-        du, dv = (cos * direction.x - sin * direction.y) * per_height, (
-            sin * direction.x + cos * direction.y
-        ) * per_height
+        du, dv = (
+            (cos * direction.x - sin * direction.y) * per_height,
+            (sin * direction.x + cos * direction.y) * per_height,
+        )
         height, slope = mi.Float(0), mi.Vector2f(0)
         for _ in range(_STEPS):
             height, slope = self._at(u + du * height, v + dv * height)

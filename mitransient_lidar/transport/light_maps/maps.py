@@ -1,0 +1,179 @@
+"""Maps of the light of the beam on horizontal planes below the sea, of each shot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.scene import LidarScene
+
+#: Cells on each side of a map, and its half width over the standard deviation of the beam.
+_CELLS, _SPREADS = 48, 4.0
+
+#: Half width of a map for refraction by waves, over the depth.
+_WIDTH_PER_DEPTH = 0.15
+
+#: Units of energy [1 over that emitted], and of energy times length [1/m], in the integer sums of a map.
+_ENERGY_UNITS, _LENGTH_UNITS = 2.0**26, 2.0**20
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Horizontal planes at equal distances, the first at the mean sea level, and the maps on them.
+
+    Attributes
+    ----------
+    depths
+        Depths [m], 0 first.
+    half
+        Half widths of the maps [m].
+    absorbed, scattered
+        Optical depths of absorption and scattering along the receiver's axis [1].
+    """
+
+    depths: FloatArray
+    half: FloatArray
+    absorbed: FloatArray
+    scattered: FloatArray
+
+    @classmethod
+    def of_scene(cls, scene: LidarScene, deepest: float, count: int) -> Planes:
+        """Return planes down to a depth [m]."""
+        depths, pose = np.linspace(0, deepest, count), scene.receiver.pose
+        slant = -float(pose.axis[2])
+        spread = scene.transmitter.widest_angular_spread * pose.ground_range / slant
+        column, down = scene.required_water.column, -float(refract_level(pose.axis, scene.refractive_index)[2])
+        ends = np.append(column.layer_tops[1:], np.inf)
+        lengths = (np.clip(depths[:, None], column.layer_tops, ends) - column.layer_tops) / down
+        optical = lengths @ column.absorption, lengths @ column.scattering
+        return cls(depths, _SPREADS * spread + _WIDTH_PER_DEPTH * depths, *optical)
+
+
+class LightMaps:
+    """Energy and optical length of the beam of each shot in the cells of planes.
+
+    Cells are counted from where the transmitter's axis, refracted by a level sea, meets the plane. Energies are kept
+    relative to the absorption along the receiver's axis, with and without those that scattering turns.
+
+    Parameters
+    ----------
+    scene
+        Scene of several shots, each `copies` times in turn, that share a map.
+    """
+
+    def __init__(self, scene: LidarScene, planes: Planes, shots: int, copies: int) -> None:
+        self.count, self._copies = planes.depths.size, copies
+        self._step = opaque(float(planes.depths[1]))
+        self._half, self._absorbed, self._scattered = (
+            aligned(mi.Float, each.astype(np.float32)) for each in (planes.half, planes.absorbed, planes.scattered)
+        )
+        pose = scene.transmitter_poses or scene.transmitter.pose
+        axes, origins = (np.broadcast_to(each, (shots, 3)) for each in (pose.axis, pose.origin))
+        entries = origins - axes * (origins[:, 2] / axes[:, 2])[:, None]
+        below = np.array([refract_level(axis, scene.refractive_index) for axis in axes])
+        tilts = below[:, :2] / -below[:, 2:]
+        self._entry, self._tilt = (
+            mi.Vector2f(*(aligned(mi.Float, column.astype(np.float32)) for column in each.T))
+            for each in (entries[:, :2], tilts)
+        )
+        # Relative lengths, as of `RelativePose`.
+        ranges = np.linalg.norm(scene.receiver.pose.nearby_point() - origins, axis=1) - pose.delay
+        to_entry = np.linalg.norm(entries - origins, axis=1) - ranges
+        self._to_entry = aligned(mi.Float, to_entry.astype(np.float32))
+        self._per_depth = aligned(mi.Float, (scene.group_index / -below[:, 2]).astype(np.float32))
+        size = shots // copies * self.count * _CELLS**2
+        self._energy, self._clear = (dr.zeros(mi.UInt32, size) for _ in range(2))
+        self._length = dr.zeros(mi.Int32, size)
+
+    def depth_of(self, plane: mi.UInt32) -> mi.Float:
+        """Return the depth of planes [m]."""
+        return mi.Float(plane) * self._step
+
+    def plane_at(self, depth: mi.Float, u: mi.Float) -> mi.UInt32:
+        """Return one of the two planes about a depth [m], in proportion to the distances, by uniform numbers."""
+        return dr.minimum(mi.UInt32(dr.maximum(depth / self._step, 0) + u), self.count - 1)
+
+    def _cell(self, lanes: Lanes, plane: mi.UInt32, place: mi.Point3f, depth: mi.Float) -> tuple[mi.UInt32, mi.Bool]:
+        """Return the cell of a place [m] that is seen from the axis at a depth [m], and whether a map has it."""
+        entry, tilt = lanes.pick(self._entry), lanes.pick(self._tilt)
+        per_metre = 0.5 * _CELLS / dr.gather(mi.Float, self._half, plane)
+        i = (place.x - entry.x - tilt.x * depth) * per_metre + 0.5 * _CELLS
+        j = (place.y - entry.y - tilt.y * depth) * per_metre + 0.5 * _CELLS
+        inside = (i >= 0) & (j >= 0) & (i < _CELLS) & (j < _CELLS)
+        cell = mi.UInt32(dr.select(inside, j, 0)) * _CELLS + mi.UInt32(dr.select(inside, i, 0))
+        return (lanes.shot // self._copies * self.count + plane) * _CELLS**2 + cell, inside
+
+    def add(
+        self,
+        lanes: Lanes,
+        plane: mi.UInt32,
+        place: mi.Point3f,
+        energy: mi.Float,
+        depths: tuple[mi.Float, mi.Float],
+        length: mi.Float,
+        active: mi.Bool,
+    ) -> None:
+        """Add rays of the beam to planes.
+
+        Parameters
+        ----------
+        lanes, plane, place
+            Lanes, numbers of planes, and where rays meet them [m].
+        energy
+            Energies over that emitted, before the water.
+        depths
+            Optical depths of absorption and scattering up to there.
+        length
+            Relative optical lengths up to there [m].
+        active
+            Which rays there are.
+        """
+        cell, inside = self._cell(lanes, plane, place, self.depth_of(plane))
+        own = (dr.gather(mi.Float, each, plane) for each in (self._absorbed, self._scattered))
+        absorbed, scattered = (before - after for before, after in zip(own, depths, strict=True))
+        later = length - lanes.pick(self._to_entry) - lanes.pick(self._per_depth) * self.depth_of(plane)
+        kept = energy * dr.exp(absorbed)
+        clear = kept * dr.exp(scattered)
+        active &= inside
+        dr.scatter_add(self._energy, mi.UInt32(kept * _ENERGY_UNITS), cell, active)
+        dr.scatter_add(self._clear, mi.UInt32(clear * _ENERGY_UNITS), cell, active)
+        dr.scatter_add(self._length, mi.Int32(clear * later * _LENGTH_UNITS), cell, active)
+
+    def look_up(
+        self, lanes: Lanes, place: mi.Point3f, depth: mi.Float, u: mi.Float, *, scattered: bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return light of the beam at places and depths [m], in one of the two planes about them.
+
+        Returns
+        -------
+        energy
+            Energy through a horizontal area over that emitted [1/m^2]: of light that no event has turned, or with
+            `scattered` as if none turned it.
+        length
+            Mean relative optical length of unscattered light [m].
+        """
+        plane = self.plane_at(depth, u)
+        cell, inside = self._cell(lanes, plane, place, depth)
+        clear = mi.Float(dr.gather(mi.UInt32, self._clear, cell, inside))
+        moment = mi.Float(dr.gather(mi.Int32, self._length, cell, inside))
+        later = moment / dr.maximum(clear, 1) * (_ENERGY_UNITS / _LENGTH_UNITS)
+        energy = mi.Float(dr.gather(mi.UInt32, self._energy, cell, inside)) if scattered else clear
+        density = (0.5 * _CELLS) ** 2 / _ENERGY_UNITS / dr.square(dr.gather(mi.Float, self._half, plane))
+        # Optical depths of the axis at the depth itself, above the mean sea level continued.
+        at = dr.minimum(depth / self._step, self.count - 1)
+        low = dr.minimum(mi.UInt32(dr.maximum(at, 0)), self.count - 2)
+
+        def between(values: mi.Float) -> mi.Float:
+            first, second = (dr.gather(mi.Float, values, low + more) for more in (0, 1))
+            return dr.lerp(first, second, at - mi.Float(low))
+
+        lost = between(self._absorbed) if scattered else between(self._absorbed) + between(self._scattered)
+        length = later + lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth
+        return dr.select(inside, energy * density * dr.exp(-lost), 0), length
