@@ -114,6 +114,10 @@ class SeaShape(Protocol):
     def time_s(self) -> float:
         """Time of the waves [s]."""
 
+    @property
+    def footprint_size(self) -> float:
+        """Side of the fine patch [m], without an automatic margin for scattered light."""
+
     def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
 

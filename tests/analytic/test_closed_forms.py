@@ -20,6 +20,7 @@ from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_average_particle
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -242,6 +243,28 @@ def test_surface_of_measured_slopes(lidar_scene, passes, wind, angle, wind_from_
     expected = ratio * surface_energy(system, (along, across), np.radians(angle), bearing)
     samples = passes(scene, 6).sum(axis=(1, 2))
     significance.assert_equal(samples, expected, error=1e-3, bias=3e-3)
+
+
+@pytest.mark.parametrize(
+    "case", [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in ("mast", "chi"))], indirect=True
+)
+def test_column_and_bottom_by_maps(lidar_scene, case):
+    """As the next test, by maps of the beam: a wrong n^2, pi, cosine or absorption is far outside."""
+    scene = lidar_scene(
+        **case.scene,
+        sea={"slope_variance": "2e-5"},
+        water={**case.water, **case.indices},
+        bottom=case.depth,
+        rho=REFLECTANCE,
+    )
+    renderer = LightMapRenderer(find_lidar_scene(scene, scene.sensors()[0]), PathClasses(2)).scaled(8)
+    energy = np.array([renderer.render_pass(seed).histogram.energy() for seed in range(16)]).reshape(16, 4, 2, 3, -1)
+    bottom = per_pixel(bottom_energy_per_bin, case, case.column, case.depth, REFLECTANCE)
+    lit = bottom > 0.05 * bottom.max()
+    significance.assert_equal(energy[:, :, 0, 0][:, lit], bottom[lit], error=0.01, bias=5e-3)
+    backscatter = per_pixel(column_energy_per_bin, case, case.column, case.backward, case.depth)
+    seen = (backscatter > 0.01 * backscatter.max()) & (case.edges[1:] < case.edges[:-1][bottom.any(axis=0)].min())
+    significance.assert_equal(energy[:, :, 0, 1][:, seen], backscatter[seen], error=0.01, bias=5e-3)
 
 
 @both_in(CASES)

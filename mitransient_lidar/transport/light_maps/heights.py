@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index, opaque_vector
 from mitransient_lidar.transport.rng import starts
-from mitransient_lidar.transport.scene import ScenePart
+from mitransient_lidar.transport.scene import LidarScene, ScenePart
 
 #: Steps towards the point where a ray meets the sea: each shortens the distance by slope times tangent of the angle.
 _STEPS = 6
@@ -78,6 +78,15 @@ class HeightFields:
         sizes = opaque_index(lines), opaque(1 / cell)
         turn = mi.Vector2f(1, 0) if part.turn is None else part.turn
         return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines))
+
+    @classmethod
+    def about(cls, scene: LidarScene) -> Self:
+        """Return the field about the place of a scene's own shot."""
+        (sea,), pose = scene.seas, scene.receiver.pose
+        place = pose.in_scene(pose.ground_point())[None, :2]
+        heights, corners = sea.sea.height_patches(place, sea.footprint_size, [sea.sea])
+        part = ScenePart(scene.mitsuba_scene, opaque_vector(scene.frame_origin))
+        return cls.of_patches(heights, corners, sea.sea.line_distance, sea.sea.wind_direction, part)
 
     def meet(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """Return where rays that go down meet the sea, on the faces that its mesh has; `active` in valid ones."""

@@ -21,7 +21,7 @@ _CELLS, _SPREADS = 48, 4.0
 _WIDTH_PER_DEPTH = 0.15
 
 #: Units of energy [1 over that emitted], and of energy times length [1/m], in the integer sums of a map.
-_ENERGY_UNITS, _LENGTH_UNITS = 2.0**26, 2.0**20
+_ENERGY_UNITS, _LENGTH_UNITS = 2.0**26, 2.0**24
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,10 @@ class Planes:
         optical = lengths @ column.absorption, lengths @ column.scattering
         return cls(depths, _SPREADS * spread + _WIDTH_PER_DEPTH * depths, *optical)
 
+    def cell(self, depth: FloatArray) -> FloatArray:
+        """Return the side of cells at depths [m]."""
+        return np.asarray(2 / _CELLS * np.interp(depth, self.depths, self.half))
+
 
 class LightMaps:
     """Energy and optical length of the beam of each shot in the cells of planes.
@@ -79,9 +83,10 @@ class LightMaps:
         entries = origins - axes * (origins[:, 2] / axes[:, 2])[:, None]
         below = np.array([refract_level(axis, scene.refractive_index) for axis in axes])
         tilts = below[:, :2] / -below[:, 2:]
-        self._entry, self._tilt = (
+        # Along level water light is later by the horizontal part of the axis in the air [1].
+        self._entry, self._tilt, self._later = (
             mi.Vector2f(*(aligned(mi.Float, column.astype(np.float32)) for column in each.T))
-            for each in (entries[:, :2], tilts)
+            for each in (entries[:, :2], tilts, axes[:, :2])
         )
         # Relative lengths, as of `RelativePose`.
         ranges = np.linalg.norm(scene.receiver.pose.nearby_point() - origins, axis=1) - pose.delay
@@ -100,15 +105,22 @@ class LightMaps:
         """Return one of the two planes about a depth [m], in proportion to the distances, by uniform numbers."""
         return dr.minimum(mi.UInt32(dr.maximum(depth / self._step, 0) + u), self.count - 1)
 
-    def _cell(self, lanes: Lanes, plane: mi.UInt32, place: mi.Point3f, depth: mi.Float) -> tuple[mi.UInt32, mi.Bool]:
-        """Return the cell of a place [m] that is seen from the axis at a depth [m], and whether a map has it."""
-        entry, tilt = lanes.pick(self._entry), lanes.pick(self._tilt)
+    def _cell(
+        self, lanes: Lanes, plane: mi.UInt32, place: mi.Point3f, depth: mi.Float
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float]:
+        """Return the cell of a place [m] at a depth [m], whether a map has it, and its relative length in level water.
+
+        The place is seen from the axis at its depth.
+        """
+        beside = mi.Vector2f(place.x, place.y) - lanes.pick(self._entry) - lanes.pick(self._tilt) * depth
         per_metre = 0.5 * _CELLS / dr.gather(mi.Float, self._half, plane)
-        i = (place.x - entry.x - tilt.x * depth) * per_metre + 0.5 * _CELLS
-        j = (place.y - entry.y - tilt.y * depth) * per_metre + 0.5 * _CELLS
+        i, j = beside.x * per_metre + 0.5 * _CELLS, beside.y * per_metre + 0.5 * _CELLS
         inside = (i >= 0) & (j >= 0) & (i < _CELLS) & (j < _CELLS)
         cell = mi.UInt32(dr.select(inside, j, 0)) * _CELLS + mi.UInt32(dr.select(inside, i, 0))
-        return (lanes.shot // self._copies * self.count + plane) * _CELLS**2 + cell, inside
+        level = (
+            lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth + dr.dot(beside, lanes.pick(self._later))
+        )
+        return (lanes.shot // self._copies * self.count + plane) * _CELLS**2 + cell, inside, level
 
     def add(
         self,
@@ -135,16 +147,15 @@ class LightMaps:
         active
             Which rays there are.
         """
-        cell, inside = self._cell(lanes, plane, place, self.depth_of(plane))
+        cell, inside, level = self._cell(lanes, plane, place, self.depth_of(plane))
         own = (dr.gather(mi.Float, each, plane) for each in (self._absorbed, self._scattered))
         absorbed, scattered = (before - after for before, after in zip(own, depths, strict=True))
-        later = length - lanes.pick(self._to_entry) - lanes.pick(self._per_depth) * self.depth_of(plane)
         kept = energy * dr.exp(absorbed)
         clear = kept * dr.exp(scattered)
         active &= inside
         dr.scatter_add(self._energy, mi.UInt32(kept * _ENERGY_UNITS), cell, active)
         dr.scatter_add(self._clear, mi.UInt32(clear * _ENERGY_UNITS), cell, active)
-        dr.scatter_add(self._length, mi.Int32(clear * later * _LENGTH_UNITS), cell, active)
+        dr.scatter_add(self._length, mi.Int32(clear * (length - level) * _LENGTH_UNITS), cell, active)
 
     def look_up(
         self, lanes: Lanes, place: mi.Point3f, depth: mi.Float, u: mi.Float, *, scattered: bool
@@ -160,7 +171,7 @@ class LightMaps:
             Mean relative optical length of unscattered light [m].
         """
         plane = self.plane_at(depth, u)
-        cell, inside = self._cell(lanes, plane, place, depth)
+        cell, inside, level = self._cell(lanes, plane, place, depth)
         clear = mi.Float(dr.gather(mi.UInt32, self._clear, cell, inside))
         moment = mi.Float(dr.gather(mi.Int32, self._length, cell, inside))
         later = moment / dr.maximum(clear, 1) * (_ENERGY_UNITS / _LENGTH_UNITS)
@@ -175,5 +186,4 @@ class LightMaps:
             return dr.lerp(first, second, at - mi.Float(low))
 
         lost = between(self._absorbed) if scattered else between(self._absorbed) + between(self._scattered)
-        length = later + lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth
-        return dr.select(inside, energy * density * dr.exp(-lost), 0), length
+        return dr.select(inside, energy * density * dr.exp(-lost), 0), level + later

@@ -23,11 +23,11 @@ from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_
 from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
-from mitransient_lidar.transport.paths.ripple_focusing import Echo
+from mitransient_lidar.transport.paths.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import met_shape
+from mitransient_lidar.transport.solids import met_shape, scene_of_shapes
 
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
@@ -36,7 +36,7 @@ _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
 _RAYS, _BEAM_PER_VIEW, _GLINTS_PER_VIEW = 512, 2, 8
 
 #: Planes of maps below the mean sea level, and depths at which each ray looks up the light of the water.
-_PLANES, _DEPTHS = 16, 32
+_PLANES, _DEPTHS = 16, 16
 
 #: Paths of scattered light at each depth, and those that each ray looks up at the bottom.
 _PATHS, _PATHS_AT_BOTTOM = 2**12, 12
@@ -94,7 +94,7 @@ class _Seen:
 
 
 class LightMapRenderer(PassRenderer):
-    """Renders passes of shots over waves, water of one refractive index and a bottom; see `unsuited` and `over`.
+    """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
     Paths that change more than once between down and up are left out, and the sides and shadows of solids.
 
@@ -104,8 +104,6 @@ class LightMapRenderer(PassRenderer):
         If the scene is not suited.
     """
 
-    _sea: HeightFields
-
     def __init__(self, scene: LidarScene, classes: PathClasses) -> None:
         if (reason := unsuited(scene)) is not None:
             raise UserError(f"light = 'maps' is not for this scene: {reason}. Use light = 'merging'")
@@ -113,6 +111,8 @@ class LightMapRenderer(PassRenderer):
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
         self._planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
+        # Waves of the mesh enhance what cells average less than what meets at points.
+        self.focusing = RippleFocusing.of_scene(scene, self._planes.cell)
         column = water.column
         phases = [table_of(phase) for phase in water.phases.phases[: column.count]]
         spread = TwoWaySpread.of_column(column, phases, self._planes.depths[1:], cos_water, _PATHS)
@@ -125,6 +125,8 @@ class LightMapRenderer(PassRenderer):
         turned = [b * float(phase.eval_s(1.0)) for b, phase in zip(column.scattering, phases, strict=True)]
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
         self._ripples, self._copies = scene.surfaces[0].bsdf(), 1
+        self._sea = HeightFields.about(scene)
+        self._solids = scene_of_shapes(scene.solids, scene.groups) if scene.solids else None
 
     @property
     def path_count(self) -> int:
@@ -221,7 +223,9 @@ class LightMapRenderer(PassRenderer):
         ripple = _spaced(shots, lanes, _VIEW, 3)
         rays = self._enter(si, length, sample.weight, mi.TransportMode.Radiance, ripple)
         by_surface = length + moved.relative(moved.transmitter_pose).distance(si.p)
-        bed = moved.ray_intersect(mi.Ray3f(si.p, rays.direction), rays.active)
+        # Shots have the solids as parts of their own.
+        solids = moved if moved.parts or self._solids is None else self._solids
+        bed = solids.ray_intersect(mi.Ray3f(si.p, rays.direction), rays.active & (self._solids is not None))
         on_bed = rays.active & bed.is_valid()
         # Light comes down along the ray: the bottom turns what passes a horizontal area by its cosine over this one's.
         value = bed.bsdf().eval(mi.BSDFContext(), moved.on_shapes(bed), bed.wi, on_bed)[0]

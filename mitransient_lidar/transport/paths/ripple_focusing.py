@@ -88,8 +88,14 @@ class RippleFocusing:
         self._changes: list[mi.Float | None] = []
 
     @classmethod
-    def of_scene(cls, scene: LidarScene) -> RippleFocusing | None:
-        """Return the factors of a lidar above a sea whose spectrum is known; None for others."""
+    def of_scene(
+        cls, scene: LidarScene, cells: Callable[[FloatArray], FloatArray] | None = None
+    ) -> RippleFocusing | None:
+        """Return the factors of a lidar above a sea whose spectrum is known; None for others.
+
+        `cells` returns, for depths [m], the side of the cells within which light and view are at random places, so that
+        waves of the mesh enhance their product less; None where they meet at points.
+        """
         seas = scene.seas
         transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
         if scene.water is None or scene.submerged or len(seas) != 1 or receiver.axis[2] >= 0:
@@ -115,7 +121,15 @@ class RippleFocusing:
             between = (apart + disc) / (index * receiver.ground_range) * depths[:, None, None]
             moves = displacements(column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
             moved = np.abs(between + moves) / cos_water
-            true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)
+            of_drawn = moved
+            if cells is not None:
+                # The difference of two places in a cell.
+                x, y = rng.random((2, _SAMPLES)) - rng.random((2, _SAMPLES))
+                of_drawn = np.abs(between + moves + cells(depths)[:, None, None] * (x + 1j * y)) / cos_water
+            true, drawn = (
+                table.at(depths[:, None, None], by).mean(axis=-1)
+                for table, by in zip(tables, (moved, of_drawn), strict=True)
+            )
             return true, drawn
 
         column = scene.water.column
