@@ -12,6 +12,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
@@ -223,7 +224,16 @@ class OceanSurface(mi.Mesh):
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
-        return self._foamed(self._ripples(refractive_index, factor))
+        return self._foamed(self._ripples(refractive_index, (factor, factor)))
+
+    def rippled(self, refractive_index: float) -> mi.BSDF:
+        """Return the BSDF of a level sea, all of whose slopes are ripples."""
+        sea = self.sea
+        total = np.add(sea.resolved_variance, sea.ripple_variance)
+        along, across = (float(factor) for factor in total / sea.ripple_variance)
+        series = sea.slope_series
+        series = None if series is None else series.of_part(sea.ripple_variance, (float(total[0]), float(total[1])))
+        return self._ripples(refractive_index, (along, across), series)
 
     def _foamed(self, ripples: mi.BSDF) -> mi.BSDF:
         """Return the BSDF of ripples with foam on some faces: a white plate, from above and from below."""
@@ -233,15 +243,20 @@ class OceanSurface(mi.Mesh):
         foam, share = create_object("twosided", plate=plate), create_object("mesh_attribute", name=FOAM)
         return create_object("blendbsdf", weight=share, bsdf_0=ripples, bsdf_1=foam)
 
-    def _ripples(self, refractive_index: float, factor: float = 1.0) -> mi.BSDF:
-        """Return the BSDF of the ripples, with their variances times a factor."""
+    def _ripples(
+        self,
+        refractive_index: float,
+        factors: tuple[float, float] = (1.0, 1.0),
+        series: GramCharlierSeries | None = None,
+    ) -> mi.BSDF:
+        """Return the BSDF of the ripples, with their variances along and across the wind times factors."""
         indices = {"int_ior": refractive_index, "ext_ior": 1.0}
-        series = self.sea.slope_series
+        series = series or self.sea.slope_series
         if series is None:
-            alpha = (float(np.sqrt(factor)) * value for value in self._roughness())
+            alpha = (float(np.sqrt(factor)) * value for factor, value in zip(factors, self._roughness(), strict=True))
             roughness = dict(zip(("alpha_u", "alpha_v"), alpha, strict=True))
             return create_object("roughdielectric", distribution="beckmann", **roughness, **indices)
-        along, across = (factor * variance for variance in self.sea.ripple_variance)
+        along, across = (one * variance for one, variance in zip(factors, self.sea.ripple_variance, strict=True))
         return create_object(
             "gram_charlier_dielectric", variance_u=along, variance_v=across, **dataclasses.asdict(series), **indices
         )

@@ -124,6 +124,9 @@ class SeaShape(Protocol):
         Waves may follow depths of a bottom.
         """
 
+    def rippled(self, refractive_index: float) -> mi.BSDF:
+        """Return the BSDF of a level sea, all of whose slopes are ripples."""
+
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
 

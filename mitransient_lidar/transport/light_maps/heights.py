@@ -80,11 +80,12 @@ class HeightFields:
         return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines))
 
     @classmethod
-    def about(cls, scene: LidarScene) -> Self:
-        """Return the field about the place of a scene's own shot."""
+    def about(cls, scene: LidarScene, *, level: bool = False) -> Self:
+        """Return the field about the place of a scene's own shot, or one of a level sea there."""
         (sea,), pose = scene.seas, scene.receiver.pose
         place = pose.in_scene(pose.ground_point())[None, :2]
         heights, corners = sea.sea.height_patches(place, sea.footprint_size, [sea.sea])
+        heights = np.zeros((1, 3, 3)) if level else heights
         part = ScenePart(scene.mitsuba_scene, opaque_vector(scene.frame_origin))
         return cls.of_patches(heights, corners, sea.sea.line_distance, sea.sea.wind_direction, part)
 
@@ -109,8 +110,9 @@ class HeightFields:
         si.p = mi.Point3f(x + direction.x * height / direction.z, y + direction.y * height / direction.z, height)
         slope_x, slope_y = cos * slope.x + sin * slope.y, cos * slope.y - sin * slope.x
         si.n = mi.Normal3f(dr.normalize(mi.Vector3f(-slope_x, -slope_y, 1)))
-        along = mi.Vector3f(cos * self.wind[0] + sin * self.wind[1], cos * self.wind[1] - sin * self.wind[0], 0)
-        s = dr.normalize(along - si.n * dr.dot(si.n, along))
+        # Along the wind on the face, as the mesh's texture coordinates are.
+        wind_x, wind_y = cos * self.wind[0] + sin * self.wind[1], cos * self.wind[1] - sin * self.wind[0]
+        s = dr.normalize(mi.Vector3f(wind_x, wind_y, slope_x * wind_x + slope_y * wind_y))
         si.sh_frame = mi.Frame3f(s, dr.cross(si.n, s), si.n)
         si.wi = si.to_local(-direction)
         return si

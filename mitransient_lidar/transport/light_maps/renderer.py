@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
 from mitransient_lidar.transport.light_maps.heights import HeightFields
@@ -44,8 +45,14 @@ _PATHS, _PATHS_AT_BOTTOM = 2**12, 12
 #: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
 _LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
 
+#: Largest distance of laser and receiver over their range, and angle between their axes [rad].
+_APART = 0.05
+
 #: Largest mean number of scattering events on one way to the bottom, beyond which light arrives too late.
 _MOST_EVENTS = 8.0
+
+#: Distance beyond all waves that focus light [m].
+_FAR = 1e3
 
 #: Distance to the bottom of rays that meet none [m].
 _NO_BED = 1e6
@@ -98,21 +105,26 @@ class LightMapRenderer(PassRenderer):
 
     Paths that change more than once between down and up are left out, and the sides and shadows of solids.
 
+    Parameters
+    ----------
+    level
+        Whether the sea is level, with all of its slopes as ripples, as the mean over seas.
+
     Raises
     ------
     UserError
         If the scene is not suited.
     """
 
-    def __init__(self, scene: LidarScene, classes: PathClasses) -> None:
+    def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False) -> None:
         if (reason := unsuited(scene)) is not None:
-            raise UserError(f"light = 'maps' is not for this scene: {reason}. Use light = 'merging'")
+            raise UserError(f"light maps do not suit the scene: {reason}")
         super().__init__(scene, classes, _RAYS)
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
         self._planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
         # Waves of the mesh enhance what cells average less than what meets at points.
-        self.focusing = RippleFocusing.of_scene(scene, self._planes.cell)
+        self.focusing = RippleFocusing.of_scene(scene, _far_apart if level else self._planes.cell)
         column = water.column
         phases = [table_of(phase) for phase in water.phases.phases[: column.count]]
         spread = TwoWaySpread.of_column(column, phases, self._planes.depths[1:], cos_water, _PATHS)
@@ -124,8 +136,8 @@ class LightMapRenderer(PassRenderer):
         # Light that one event turns by 180 degrees [1/(m sr)].
         turned = [b * float(phase.eval_s(1.0)) for b, phase in zip(column.scattering, phases, strict=True)]
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
-        self._ripples, self._copies = scene.surfaces[0].bsdf(), 1
-        self._sea = HeightFields.about(scene)
+        self._ripples = scene.seas[0].rippled(scene.refractive_index) if level else scene.surfaces[0].bsdf()
+        self._sea, self._copies = HeightFields.about(scene, level=level), 1
         self._solids = scene_of_shapes(scene.solids, scene.groups) if scene.solids else None
 
     @property
@@ -318,6 +330,11 @@ def unsuited(scene: LidarScene) -> str | None:
     if scene.has_veils or scene.has_shared_gaps or scene.has_specular_or_dry_solids:
         return "solids are transparent, mirror-like, or reach the surface"
     events = _events(scene)
+    apart = (
+        np.linalg.norm(scene.receiver.pose.origin - scene.transmitter.pose.origin) / scene.receiver.pose.ground_range
+    )
+    if max(apart, np.linalg.norm(axis - scene.transmitter.pose.axis)) > _APART:
+        return "laser and receiver look from different places, or along different axes"
     if events > _MOST_EVENTS:
         return f"light scatters {events:.2g} times on its way to the bottom, more than {_MOST_EVENTS:g}"
     return None
@@ -330,6 +347,11 @@ def reach_of_maps(scene: LidarScene, depth: float) -> float:
     view = 0.5 * scene.receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])
     half = max(float(Planes.of_scene(scene, depth, 2).half[-1]), view)
     return half - depth * float(np.hypot(below[0], below[1]) / below[2])
+
+
+def _far_apart(depths: FloatArray) -> FloatArray:
+    """Return a distance at which waves enhance no light [m]."""
+    return np.full(depths.shape, _FAR)
 
 
 def _events(scene: LidarScene) -> float:

@@ -1,0 +1,146 @@
+"""Light looked up in maps of the beam against merging, over waves, and series and flights that use it.
+
+Closed forms of a level sea are in `test_closed_forms.py`, the spread by scattering in `test_two_way_spread.py`.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import significance
+import xarray as xr
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.renderer import FlightRenderer
+from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.rendering.shots.batches import ShotPoses, suits_maps
+from mitransient_lidar.rendering.shots.scene import ShotScene
+from mitransient_lidar.transport.light_maps.heights import HeightFields
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.probe import Probe
+from mitransient_lidar.transport.rng import Shots
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
+
+
+def lidar_of(params):
+    """Return the lidar of the default scene with other parameters, and the scene, which keeps it alive."""
+    session = open_scene("table1", params)
+    return find_lidar_scene(session.scene, session.sensor), session
+
+
+def test_rays_meet_the_faces_that_the_mesh_has():
+    """A wave of another place, a mirrored grid or the other diagonal differ by centimetres and degrees."""
+    lidar, _session = lidar_of({"wind_speed": 6, "off_nadir_deg": 30, "wind_direction_deg": 40})
+    lanes = Shots([0]).paths(4096)
+    sample = Probe(lidar).sampler.sample_shots(lanes, 4096, Shots([0]).streams(1, lanes))
+    start, _ = lidar.first_points(lidar.receiver.pose, sample.angles, sample.direction)
+    found = HeightFields.about(lidar).meet(start, sample.direction, mi.Bool(True))
+    wanted = lidar.mitsuba_scene.ray_intersect(mi.Ray3f(start, sample.direction))
+    # Rounding of the mesh's coordinates may move a ray to the next face.
+    assert np.mean(np.abs(np.array(found.t) - np.array(wanted.t)) < 2e-4) > 0.999
+    for name in ("s", "t", "n"):
+        own, other = (np.array(getattr(each.sh_frame, name)) for each in (found, wanted))
+        assert np.mean(np.abs(own - other).max(axis=0) < 2e-3) > 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("params", "passes"),
+    [
+        ({}, 12),
+        pytest.param({"wind_speed": 10, "bottom_depth": 6}, 12, marks=pytest.mark.long),
+        pytest.param({"attenuation": 0.8, "scattering": 0.6, "bottom_depth": 5}, 12, marks=pytest.mark.long),
+        pytest.param({"divergence_mrad": 1.5, "field_of_view_mrad": 6}, 24, marks=pytest.mark.long),
+        pytest.param({"attenuation": 0.2, "scattering": 0.05, "wind_speed": 6}, 12, marks=pytest.mark.long),
+    ],
+    ids=["table1", "waves", "turbid", "narrow", "clear"],
+)
+def test_maps_agree_with_merging(params, passes):
+    """Surface, water and bottom of each pixel, within 1.5 % of the mean and its errors; times of bottoms in 0.1 ns."""
+    lidar, session = lidar_of(params)
+    merging = session.scene.integrator().prepare(session.scene, session.sensor).by_origin()
+    maps = LightMapRenderer(lidar, PathClasses()).by_origin().scaled(8)
+
+    def energies(renderer, count):
+        shape = count, lidar.receiver.pixels.count, renderer.classes.count, -1
+        return np.array([renderer.render_pass(seed).histogram.energy() for seed in range(count)]).reshape(shape)
+
+    found, wanted = energies(maps, 12), energies(merging, passes)
+    for origin, error in ((1, 0.01), (2, 0.01)):
+        whole, other = (each[:, :, origin].sum(axis=-1) for each in (found, wanted))
+        significance.assert_same(whole, other, error=error, bias=0.015)
+    times = [
+        np.array([(one * lidar.axis.centres_ns).sum() / one.sum() for one in each[:, :, 2].sum(axis=1)])
+        for each in (found, wanted)
+    ]
+    (early, own), (late, others) = (significance.mean_and_error(each) for each in times)
+    assert abs(early - late) < 0.1 + significance.largest_z(12) * np.hypot(own, others)
+
+
+@pytest.mark.slow
+def test_shots_of_a_series_are_those_of_their_places():
+    """A shot among others has the light that it has alone but for its random numbers; calls repeat their bits."""
+    places = np.array([[3.0, -2.0], [40.0, 25.0]])
+    series = ShotScene("table1", {}, places, light="maps", check=False).batches(2, 1.0, None)
+    both, again = (series.render(ShotPoses(places), [1, 2]).whole[0] for _ in range(2))
+    np.testing.assert_array_equal(both, again)
+    lidar, _session = lidar_of({"aim_x": 40, "aim_y": 25})
+    alone = LightMapRenderer(lidar, PathClasses())
+    energy = np.array([alone.render_pass(seed).histogram.energy().sum() for seed in range(8)])
+    mean, error = significance.mean_and_error(energy)
+    # Two passes have half of the variance of one.
+    limit = significance.largest_z(8) * np.hypot(error, energy.std(ddof=1) / np.sqrt(2))
+    assert abs(both[1].sum() - mean) < limit
+    assert limit < 0.2 * mean
+
+
+@pytest.mark.slow
+def test_series_by_maps_are_rendered_again():
+    series = mitransient_lidar.render_shots("table1", positions=[[0, 0], [9, 9]], light="maps")
+    assert series.attrs["light"] == "maps"
+    xr.testing.assert_identical(mitransient_lidar.render(series)["waveform"], series["waveform"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"light": "paths"}, "light = 'paths' must be one of merging, maps"),
+        ({"light": "maps", "derivatives": "attenuation"}, "light = 'maps' has no derivatives"),
+        ({"light": "maps", "params": {"off_nadir_deg": 60}}, "light maps do not suit the scene: the receiver looks"),
+    ],
+)
+def test_what_maps_are_not_for(options, message):
+    with pytest.raises(UserError, match=message):
+        mitransient_lidar.render_shots("table1", **{"positions": [[0, 0]], **options})
+
+
+@pytest.mark.slow
+def test_shots_near_a_target_are_merged():
+    places = np.array([[-41.0, 60.0], [-45.0, 58.0], [-41.0, 80.0], [0.0, 0.0]])
+    scene = ShotScene("flight", {"cube_x": -41, "cube_y": 60}, places, light="maps", check=False)
+    np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [False, False, True, True])
+
+
+@pytest.mark.slow
+def test_flights_by_maps_find_the_same_bottoms():
+    """Depths of both ways to compute the light of 16 pulses differ by their errors, and not by 2 cm in the mean."""
+    shipped = FlightPlan.read("semi_arc")
+    given = {"scene": "flight", "instrument": "published_airborne", "still_sea": True}
+    given |= {"platform": shipped.platform, "scanner": shipped.scanner, "pulses": {"rate_hz": 100.0, "most": 16}}
+    echoes = {}
+    for light in ("merging", "maps"):
+        renderer, columns = FlightRenderer.of(FlightPlan.of_file({**given, "light": light}))
+        found = [
+            renderer.stacked(np.array(rows), {name: column[rows] for name, column in columns.items()})
+            for rows in renderer.batches(columns)
+        ]
+        names = ("echo_depth_m", "echo_depth_m_stderr")
+        echoes[light] = [np.concatenate([one[name].values for one in found])[:, :, 3] for name in names]
+    (depth, error), (other, own) = echoes["merging"], echoes["maps"]
+    seen = np.isfinite(depth) & np.isfinite(other)
+    assert seen.mean() > 0.95
+    z = ((other - depth) / np.hypot(error, own))[seen]
+    assert np.sum(z**2) < 1.5 * significance.largest_chi2(z.size)
+    assert abs(np.mean((other - depth)[seen])) < 0.02 + 4 * np.std((other - depth)[seen]) / np.sqrt(z.size)
