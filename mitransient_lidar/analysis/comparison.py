@@ -76,14 +76,18 @@ class Comparison:
 def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Return two results with time bins; where one has gates alone, those of both as bins at their middles.
 
+    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes.
+
     Raises
     ------
     UserError
-        If one has gates alone and the other has none.
+        If one has gates or a record alone and the other has none, or a record has a single shot.
     """
     results = first, second
     if all("impulse_response" in one for one in results):
         return results
+    if all("signal" in one and "time" in one["signal"].dims for one in results):
+        return _of_shots(first), _of_shots(second)
     names = {f"gate_energy{end}": f"impulse_response{end}" for end in ("", "_stderr")}
     found = []
     for stack in map(check_stack, results):
@@ -91,6 +95,17 @@ def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Datas
         power = {f"waveform{end}": bins[f"impulse_response{end}"] for end in ("", "_stderr")}
         found.append(bins.assign(power).swap_dims(gate="time").transpose(..., "time"))
     return found[0], found[1]
+
+
+def _of_shots(record: xr.Dataset) -> xr.Dataset:
+    """Return the mean signal of the shots of a record and its error as power and energy of bins."""
+    if record.sizes.get("shot", 1) < 2:
+        raise UserError("a record has 1 shot: both must have at least 2, whose spread gives the errors")
+    signal, count = record["signal"], record.sizes["shot"]
+    mean, error = signal.mean("shot", skipna=False), signal.std("shot", ddof=1, skipna=False) / np.sqrt(count)
+    names = ("waveform", "impulse_response")
+    bins = {name + end: one for name in names for end, one in (("", mean), ("_stderr", error))}
+    return record.drop_vars([*record.data_vars]).assign(bins).assign_attrs(passes=count)
 
 
 def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:

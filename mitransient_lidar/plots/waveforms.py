@@ -131,7 +131,9 @@ def _curves(dataset: xr.Dataset) -> _Curves:
     if {*values.dims} - {"shot"} not in ({"pixel", "time"}, {"row", "column", "time"}):
         allowed = "(pixel, time) or (row, column, time)"
         raise UserError(f"{name} has the dimensions {values.dims}: it must be over {allowed}")
-    error = dataset["signal_deviation" if recorded else "waveform_stderr"]
+    error = dataset.get("signal_deviation" if recorded else "waveform_stderr")
+    if error is None:  # of a lidar's waveforms, where the spread of the shots is that of the ground
+        error = xr.zeros_like(values)
     if "pixel" not in values.dims:
         # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
         values, error = (one.sum(("row", "column")).expand_dims("pixel", -2) for one in (values, 0 * error))

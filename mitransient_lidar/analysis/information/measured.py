@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import os
 from collections import Counter
@@ -22,11 +23,15 @@ from mitransient_lidar.core.validation import FloatArray, positive, shown
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, waveform_receiver
+from mitransient_lidar.results import waveform_files
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 
+logger = logging.getLogger(__name__)
+
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
+_FEWEST_DARK = 4  # samples before the surface that the level of a recorded waveform needs
 _SATURATED = 1e-3  # probability of saturation above which a sample is left out
 
 
@@ -139,7 +144,8 @@ def with_waveforms(source: Given) -> Given:
     UserError
         If it is another dataset, or its file cannot be read.
     """
-    if isinstance(source, (str, os.PathLike)) and Path(source).suffix.lower() not in (".nc", ".exr", ""):
+    is_path = isinstance(source, (str, os.PathLike)) and not waveform_files.is_waveform_file(source)
+    if is_path and Path(source).suffix.lower() not in (".nc", ".exr", ""):
         return source
     return results.dataset_of("source", source, "waveforms", "signals")
 
@@ -157,7 +163,8 @@ def measured(
     source
         A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
         averaged; its EXR or NetCDF file; or a CSV file with the column ``time_ns``, one column for each pixel in any
-        unit, and optionally columns ``NAME_stderr`` with their standard errors.
+        unit, and optionally columns ``NAME_stderr`` with their standard errors. Waveforms of LAS, LAZ and PulseWaves
+        files (`results.waveform_files`) are such a table: their mean, less the level before the surface.
     noise
         Standard deviation of every sample of waveforms, above 0 and in their unit, instead of their own.
     receiver
@@ -173,6 +180,9 @@ def measured(
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
+    if isinstance(source, xr.Dataset) and waveform_files.FILE in source.attrs:
+        table = _with_noise(_of_file(source), given)
+        return table if receiver is None else _behind(table, waveform_receiver(receiver))
     if isinstance(source, xr.Dataset) and "signal" in source:
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")
@@ -353,6 +363,31 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
         shots=shots,
         render_variance=of_render,
     )
+
+
+def _of_file(dataset: xr.Dataset) -> Measured:
+    """Return the mean of the waveforms of a file, less its level in the first half before the surface, by pixel.
+
+    Times of a single waveform are those after the pulse, where the file has them.
+    """
+    signal = dataset["signal"].mean("shot", keep_attrs=True)
+    times, values = _times(dataset), _by_pixel(signal, ("pixel", "time"))
+    surface, shots = dataset["surface_time"], int(dataset.sizes["shot"])
+    spread, width = float(surface.std("shot").max()), float(dataset.attrs["bin_width_ns"])
+    if spread > width:
+        logger.warning(
+            "the first returns of %d waveforms spread by %.2g ns, and so does their mean: waveforms = N:N+1 is one of "
+            "them",
+            shots,
+            spread,
+        )
+    early = float(np.nan_to_num(surface.min().item(), nan=0.2 * times[-1]))
+    before = max(np.count_nonzero(times < 0.5 * early), _FEWEST_DARK)
+    values = values - values[:, :before].mean(axis=1, keepdims=True)
+    start = np.unique(dataset["sample_start_ns"].values)
+    times = times + (start[0] if start.size == 1 and np.isfinite(start[0]) else 0.0)
+    template = signal.reset_coords(drop=True).copy(data=values).assign_coords(time=times)
+    return Measured(values, None, times, np.ones(1), template, calibrated=False, shots=shots)
 
 
 def _behind(table: Measured, receiver: ReceiverChannels) -> Measured:
