@@ -12,6 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.gate_stack import check_stack
 from mitransient_lidar.results.sum_errors import SumErrors
+from mitransient_lidar.results.waveform_files import placed_in_time
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -101,6 +102,7 @@ def _of_shots(record: xr.Dataset) -> xr.Dataset:
     """Return the mean signal of the shots of a record and its error as power and energy of bins."""
     if record.sizes.get("shot", 1) < 2:
         raise UserError("a record has 1 shot: both must have at least 2, whose spread gives the errors")
+    record = placed_in_time(record)
     signal, count = record["signal"], record.sizes["shot"]
     mean, error = signal.mean("shot", skipna=False), signal.std("shot", ddof=1, skipna=False) / np.sqrt(count)
     names = ("waveform", "impulse_response")
@@ -126,7 +128,8 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     shapes = [_by_pixel(result, "impulse_response").shape for result in results]
     if shapes[0] != shapes[1] or not np.allclose(times[0], times[1]):
         described = " and ".join(f"{pixels} pixels x {bins} bins" for pixels, bins in shapes)
-        raise UserError(f"the results have {described}: they must have the same pixels and time bins")
+        other = ", at different times" if shapes[0] == shapes[1] else ""
+        raise UserError(f"the results have {described}{other}: they must have the same pixels and time bins")
     angles = [
         np.ravel([result[name].values for name in _ANGLES]) for result in results if {*_ANGLES} <= {*result.coords}
     ]

@@ -36,6 +36,7 @@ _USUAL = {"refractive_index": 1.34, "group_index": 1.364}
 _LAS, _PULSE_WAVES = (".las", ".laz"), (".pls", ".wvs")
 _IN_WATER = 0.9  # of the speed of light, below which the way of a waveform is that in water
 _EARLY = 0.05  # share of the surfaces that may come before the time at which the quiet part ends
+_SAME_START = 0.05  # of a sample, by which the starts of waveforms at one place may differ
 _JOINED: dict[str, Any] = {"join": "outer", "combine_attrs": "override", "fill_value": {"saturated": 0}}
 
 
@@ -154,6 +155,14 @@ def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any
     side = -np.arange(len(shots), dtype=np.float64)
     found = xr.concat(shots, "pixel", **_JOINED).transpose("shot", "pixel", "time")
     return _with_medians(found.assign_coords(angle_x=("pixel", 0 * side), angle_y=("pixel", side)))
+
+
+def placed_in_time(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with times after the pulse, if they are known and the same for all waveforms of this module."""
+    start = dataset["sample_start_ns"].values if FILE in dataset.attrs else np.array([np.nan])
+    if not np.ptp(start) < _SAME_START * dataset.attrs["bin_width_ns"]:  # NaN where a time is unknown
+        return dataset
+    return dataset.assign_coords(time=dataset["time"] + np.median(start)).assign_attrs(time_start_ns=np.median(start))
 
 
 def check_measurable(dataset: xr.Dataset) -> None:

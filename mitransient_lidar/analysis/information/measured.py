@@ -368,8 +368,9 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
 def _of_file(dataset: xr.Dataset) -> Measured:
     """Return the mean of the waveforms of a file, less its level in the first half before the surface, by pixel.
 
-    Times of a single waveform are those after the pulse, where the file has them.
+    Times are those after the pulse, if all waveforms have the same.
     """
+    dataset = waveform_files.placed_in_time(dataset)
     signal = dataset["signal"].mean("shot", keep_attrs=True)
     times, values = _times(dataset), _by_pixel(signal, ("pixel", "time"))
     surface, shots = dataset["surface_time"], int(dataset.sizes["shot"])
@@ -381,12 +382,9 @@ def _of_file(dataset: xr.Dataset) -> Measured:
             shots,
             spread,
         )
-    early = float(np.nan_to_num(surface.min().item(), nan=0.2 * times[-1]))
-    before = max(np.count_nonzero(times < 0.5 * early), _FEWEST_DARK)
+    before = max(int(np.nan_to_num(0.5 * surface.min().item() / width)), _FEWEST_DARK)
     values = values - values[:, :before].mean(axis=1, keepdims=True)
-    start = np.unique(dataset["sample_start_ns"].values)
-    times = times + (start[0] if start.size == 1 and np.isfinite(start[0]) else 0.0)
-    template = signal.reset_coords(drop=True).copy(data=values).assign_coords(time=times)
+    template = signal.reset_coords(drop=True).copy(data=values)
     return Measured(values, None, times, np.ones(1), template, calibrated=False, shots=shots)
 
 
