@@ -82,7 +82,8 @@ def write_las(
         *(b"LASF", 1, (1 << 1 if internal else 1 << 2), b"", 1, 4, b"TEST", b"TEST", 1, 2026, 375, first, 1),
         *(point_format, length, legacy, legacy, 0, 0, 0, 0),
         *(1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0, *[0.0] * 6),
-        *(waves_at if internal else 0, 0, 0, len(returns), len(returns), *[0] * 14),
+        *((waves_at, waves_at, 1) if internal else (0, 0, 0)),
+        *(len(returns), len(returns), *[0] * 14),
     )
     waves = struct.pack("<H16sHQ32s", 0, b"LASF_Spec", 65535, at - 60, b"") + b"".join(data)
     path.write_bytes(header + vlr + points + (waves if internal else b""))

@@ -178,7 +178,8 @@ def check_measurable(dataset: xr.Dataset) -> None:
     of_lines = (("surface_time", "sea_level"), ("off_nadir", "off_nadir_deg"))
     lacking += [stated for name, stated in of_lines if not np.isfinite(dataset[name].values).all()]
     if lacking:
-        raise UserError(f"{dataset.attrs[FILE]} does not state {' and '.join(lacking)}: give the numbers with lidar")
+        what = " and ".join(lacking)
+        raise UserError(f"{dataset.attrs[FILE]} does not state {what}: give them with lidar (--lidar NAME=VALUE)")
 
 
 def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known: Mapping[str, float]) -> xr.Dataset:

@@ -35,19 +35,10 @@ class _Descriptor(NamedTuple):
 
 
 def las_blocks(path: Path, first: int, end: int | None, field: str | None, size: int) -> Iterator[WaveformBlock]:
-    """Yield the waveforms of a file, each once however many returns refer to it, in the order of its points.
+    """Yield the waveforms from `first` to before `end` of a file, each once, in the order of its points.
 
-    Parameters
-    ----------
-    path
-        File of point format 4, 5, 9 or 10.
-    first, end
-        First waveform, and the one after the last; None for the last of the file.
-    field
-        Field of the points that is the channel; by default the scanner channel, of formats 4 and 5 the user data.
-        ``descriptor`` is the index of the wave packet descriptor.
-    size
-        Most points that are read at a time.
+    At most `size` points are in memory. The channel is a `field` of the points; ``descriptor`` is the index of the wave
+    packet descriptor.
 
     Raises
     ------
@@ -60,7 +51,8 @@ def las_blocks(path: Path, first: int, end: int | None, field: str | None, size:
     damaged = f"{path} is damaged, or is not a LAS or LAZ file."
     with open_file(path) as file:
         with damaged_file(damaged):
-            reader = laspy.LasReader(file, closefd=False)
+            # The packets are an extended record, which would be read as a whole.
+            reader = laspy.LasReader(file, closefd=False, read_evlrs=False)
         kind = reader.header.point_format
         if kind.id not in _CHANNELS:
             raise UserError(f"{path} has point format {kind.id}, without waveforms: it must be 4, 5, 9 or 10")
@@ -70,16 +62,20 @@ def las_blocks(path: Path, first: int, end: int | None, field: str | None, size:
         with damaged_file(damaged):
             descriptors = {
                 record.record_id - _FIRST_RECORD + 1: _Descriptor(*_DESCRIPTOR.unpack_from(record.record_data_bytes()))
-                for record in [*reader.header.vlrs, *(reader.evlrs or [])]
+                for record in reader.header.vlrs
                 if record.user_id.rstrip("\0") == "LASF_Spec" and _FIRST_RECORD <= record.record_id <= _LAST_RECORD
             }
         seen, count, chunks = [np.empty(0, np.uint64)], 0, reader.chunk_iterator(size)
+        left = reader.header.point_count
         with _packets(path, reader.header) as packets:
             while end is None or count < end:
                 with damaged_file(damaged):
                     points = next(chunks, None)
+                if (0 if points is None else len(points)) < min(size, left):
+                    raise UserError(f"{path} is cut: it ends before the last of its {reader.header.point_count} points")
                 if points is None:
                     break
+                left -= len(points)
                 rows = _first_returns(points, seen)
                 numbers = count + np.arange(rows.size)
                 count += rows.size

@@ -60,16 +60,9 @@ class _Descriptor(NamedTuple):
 
 
 def pulse_blocks(path: Path, first: int, end: int | None, size: int) -> Iterator[WaveformBlock]:
-    """Yield the returning waveforms of pulses, one for each segment; the channel is that of the sampling.
+    """Yield the returning waveforms of the pulses from `first` to before `end` of a file .pls, one for each segment.
 
-    Parameters
-    ----------
-    path
-        File .pls.
-    first, end
-        First pulse, and the one after the last; None for the last of the file.
-    size
-        Most pulses that are read at a time.
+    At most `size` pulses are in memory. The channel is that of the sampling.
 
     Raises
     ------
@@ -164,15 +157,22 @@ def _segments(
 
 def _descriptors(path: Path, file: BufferedReader, after: int, count: int, appended: int) -> dict[int, _Descriptor]:
     """Return the pulse descriptors of a file by their index, from the records before and after the pulses."""
-    records = []
-    file.seek(after)
+    records, size = [], file.seek(0, os.SEEK_END)
+    end = size
+
+    def heading(at: int) -> tuple[bytes, int, int]:
+        file.seek(at)
+        user, kind, _, length, _ = _RECORD.unpack(file.read(_RECORD.size))
+        if not 0 <= length <= size:
+            raise ValueError(length)
+        return user, kind, length
+
     for _ in range(count):
-        user, kind, _, length, _ = _RECORD.unpack(file.read(_RECORD.size))
+        user, kind, length = heading(after)
         records.append((user, kind, file.read(length)))
-    end = file.seek(0, os.SEEK_END)
+        after = file.tell()
     while appended:  # each behind its contents; a negative number is unknown
-        file.seek(end - _RECORD.size)
-        user, kind, _, length, _ = _RECORD.unpack(file.read(_RECORD.size))
+        user, kind, length = heading(end - _RECORD.size)
         if kind == _LAST_RECORD:
             break
         end = file.seek(end - _RECORD.size - length)

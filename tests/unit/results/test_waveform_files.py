@@ -197,6 +197,7 @@ WRONG_LAS = {
         "bad.wdz has compressed waveforms, which are not read: ",
     ),
     "cut": (lambda path: cut(path.with_suffix(".wdp"), 5), "bad.wdp is cut: the samples of waveform 2 of .* 5 bytes"),
+    "cut points": (lambda path: cut(path, 59 * 2), "bad.las is cut: it ends before the last of its 6 points"),
     "damaged": (lambda path: cut(path, path.stat().st_size - 200), "bad.las is damaged, or is not a LAS or LAZ file"),
     "offset": (
         lambda path: las_with(path, shift=2000),
@@ -350,7 +351,7 @@ def test_commands_take_files(tmp_path):
         assert shown.exit_code == 0, shown.stderr
         assert (tmp_path / target).stat().st_size > 1000
     for options, message in (
-        ((), "sea.las does not state pulse_fwhm_ns and altitude: give the numbers with lidar"),
+        ((), "sea.las does not state pulse_fwhm_ns and altitude: give them with lidar (--lidar"),
         (("--waveforms", "3-9"), "--waveforms 3-9 is not of the form FIRST:END"),
         (("--waveforms", "90:"), "has no waveform from number 90 to the last one"),
         (("--lidar", "altitude"), "--lidar altitude is not of the form name=value"),
