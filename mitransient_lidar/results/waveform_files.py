@@ -154,15 +154,17 @@ def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any
     shots = [one.assign_coords(shot=channels[0]["shot"]) for one in channels]
     side = -np.arange(len(shots), dtype=np.float64)
     found = xr.concat(shots, "pixel", **_JOINED).transpose("shot", "pixel", "time")
-    return _with_medians(found.assign_coords(angle_x=("pixel", 0 * side), angle_y=("pixel", side)))
+    found.attrs |= _early_surface(found["surface_time"].values)
+    return found.assign_coords(angle_x=("pixel", 0 * side), angle_y=("pixel", side))
 
 
 def placed_in_time(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with times after the pulse, if they are known and the same for all waveforms of this module."""
-    start = dataset["sample_start_ns"].values if FILE in dataset.attrs else np.array([np.nan])
-    if not np.ptp(start) < _SAME_START * dataset.attrs["bin_width_ns"]:  # NaN where a time is unknown
+    """Return a dataset with times after the pulse, if these are those of a file, known and alike for all waveforms."""
+    start = dataset["sample_start_ns"].values if FILE in dataset.attrs else np.empty(0)
+    if not start.size or not np.ptp(start) < _SAME_START * dataset.attrs["bin_width_ns"]:  # NaN where unknown
         return dataset
-    return dataset.assign_coords(time=dataset["time"] + np.median(start)).assign_attrs(time_start_ns=np.median(start))
+    first = float(np.median(start))
+    return dataset.assign_coords(time=dataset["time"] + first).assign_attrs(time_start_ns=first)
 
 
 def check_measurable(dataset: xr.Dataset) -> None:
@@ -193,13 +195,13 @@ def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known
         surface = (level - place[:, 2]) / step[:, 2]
     off_nadir = np.where(speed > 0, off_nadir, np.radians(values.get("off_nadir_deg", np.nan)))
     surface = np.where(np.isfinite(surface), surface, block.return_ns[rows])
-    height = place[:, 2] - first * step[:, 2] - level
+    typical = {"off_nadir_deg": np.degrees(off_nadir), "altitude": place[:, 2] - first * step[:, 2] - level}
     by_level = refraction.surface_time_ns(values.get("altitude", np.nan), off_nadir) - surface + 0 * level
     water = np.cos(refraction.snell(off_nadir, values["refractive_index"]))
     zero = np.zeros(rows.size)
     lines = {
         **{"sight_x": zero, "sight_y": zero, "off_nadir": np.degrees(off_nadir), "beam_share": zero * np.nan},
-        **{"surface_time": surface + 0.5 * width, "surface_spread": zero, "scanner_height": height},
+        **{"surface_time": surface + 0.5 * width, "surface_spread": zero},
         "depth_per_ns": 0.5e-9 * C0 / values["group_index"] * water,
         "sample_start_ns": np.where(np.isfinite(first), first, by_level) - 0.5 * width,
     }
@@ -215,20 +217,14 @@ def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known
     }
     attributes = {
         **{"title": f"Waveforms of {path.name}", "history": step_of_history("read"), FILE: str(path)},
-        **{"time_start_ns": 0.0, "bin_width_ns": width},
+        **{"time_start_ns": 0.0, "bin_width_ns": width, **_early_surface(lines["surface_time"])},
+        **{name: float(np.nanmedian(one)) for name, one in typical.items() if np.isfinite(one).any()},
         **{name: value for name, value in values.items() if name != "sea_level"},
     }
     variables = {name: (("shot", "pixel", "time"), one[:, np.newaxis]) for name, one in data.items()}
-    found = xr.Dataset(variables, coords, attributes)
-    return _with_medians(label(found, "flight", signal="V" if block.gain else "1"))
+    return label(xr.Dataset(variables, coords, attributes), "flight", signal="V" if block.gain else "1")
 
 
-def _with_medians(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with the early surface, typical angle and height of its waveforms, unless they are stated."""
-    about = (("surface_time_ns", "surface_time", _EARLY), ("off_nadir_deg", "off_nadir", 0.5))
-    found = {}
-    for attribute, name, share in (*about, ("altitude", "scanner_height", 0.5)):
-        if np.isfinite(dataset[name].values).any():
-            found[attribute] = float(np.nanquantile(dataset[name].values, share))
-    early = {"surface_time_ns": found["surface_time_ns"]} if "surface_time_ns" in found else {}
-    return dataset.assign_attrs({**found, **dataset.attrs, **early})
+def _early_surface(times: np.ndarray[Any, Any]) -> dict[str, float]:
+    """Return the attribute of a surface that few others come before, if it is known."""
+    return {"surface_time_ns": float(np.nanquantile(times, _EARLY))} if np.isfinite(times).any() else {}
