@@ -56,6 +56,8 @@ def test_las_samples_come_back_to_the_bit(tmp_path, point_format, bits, internal
         np.testing.assert_array_equal(found["shot"], range(7))
         np.testing.assert_array_equal(found["time"], (np.arange(SAMPLES) + 0.5) * 0.5)
         np.testing.assert_array_equal(found["gps_time"], np.arange(7) / 1e3)
+        # That of the earliest return, which is not the first one in the file.
+        np.testing.assert_allclose(found["surface_time"], 9.25)
         assert found["signal"].attrs["units"] == "V"
         assert found.attrs["bin_width_ns"] == 0.5
 
@@ -179,6 +181,8 @@ def test_pulse_waves(tmp_path, appended):
     np.testing.assert_allclose(segments["sample_start_ns"].values[:, 0], starts)
     with pytest.raises(UserError, match=r"has samples 0\.5 and 1 ns apart: choose one channel"):
         read_waveforms(tmp_path / "one.pls")
+    with pytest.raises(UserError, match=r"has no waveform of channel 0"):  # that of the outgoing pulse
+        read_waveforms(tmp_path / "one.pls", channel=0)
 
 
 def las_with(path, packets=None, **options):
@@ -308,8 +312,8 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
 WATER = {"altitude": 300.0, "pulse_fwhm_ns": 4.0, "group_index": 1.364, "refractive_index": 1.34, "sea_level": 0.0}
 
 
-def water_file(path, depth=3.0, count=24):
-    """Write waveforms of a sea of a depth seen at nadir; return the time between the echoes [ns]."""
+def water_file(path, depth=3.0, count=24, channels=1):
+    """Write waveforms of a sea of a depth, seen at nadir; return the time between the echoes [ns]."""
     rng, time = np.random.default_rng(5), 0.5 * np.arange(240)
     delay = 2e9 * depth * 1.364 / C0
     down = (0.0, 0.0, AIR)
@@ -319,17 +323,18 @@ def water_file(path, depth=3.0, count=24):
         echoes = 900 * np.exp(-4 * np.log(2) * ((time - surface) / 4) ** 2)
         echoes += 400 * np.exp(-4 * np.log(2) * ((time - surface - delay) / 4) ** 2)
         signal.append(np.rint(120 + echoes + rng.normal(0, 3, time.size)).astype(int).tolist())
-        returns.append(Return(shot, (0, 0, 0), 1000 * surface, down, gps_time=shot / 1e3))
+        pulse, channel = divmod(shot, channels)
+        returns.append(Return(shot, (0, 0, 0), 1000 * surface, down, gps_time=pulse / 1e3, channel=channel))
     write_las(path, returns, Packets(signal, gain=1e-3, offset=-0.1))
     return delay
 
 
 def test_echoes_of_a_file(tmp_path):
-    """Depths of a known sea; the rows of a command are those of the function, part by part."""
-    delay = water_file(tmp_path / "sea.las")
+    """Depths of a known sea; the rows of a command are those of the function, part by part: here channel by channel."""
+    delay = water_file(tmp_path / "sea.las", channels=2)
     found = mitransient_lidar.echoes(read_waveforms(tmp_path / "sea.las", lidar=WATER))
-    bottom, surface = (found["time_ns"].sel(echo=name).values[:, 0] for name in ("bottom", "surface"))
-    error = found["time_ns_stderr"].sel(echo="bottom").values[:, 0]
+    bottom, surface = (found["time_ns"].sel(echo=name).values for name in ("bottom", "surface"))
+    error = found["time_ns_stderr"].sel(echo="bottom").values
     assert abs(np.mean(bottom - surface) - delay) < 0.05
     assert np.std(bottom - surface) < 3 * np.median(error)
     np.testing.assert_allclose(found["depth_m"].sel(echo="bottom"), 3.0, atol=0.08)
@@ -337,8 +342,7 @@ def test_echoes_of_a_file(tmp_path):
     written = run("echoes", tmp_path / "sea.las", *options, "--csv", tmp_path / "out.csv", "--no-table")
     assert written.exit_code == 0, written.stderr
     rows = (tmp_path / "out.csv").read_text().splitlines()
-    assert rows[0].startswith("shot,pixel,")
-    assert len(rows) == 1 + found["time_ns"].size
+    assert [row.startswith("shot,pixel,") for row in rows] == [True] + [False] * found["time_ns"].size
 
 
 def test_commands_take_files(tmp_path):
