@@ -65,7 +65,7 @@ def waveform_selection(
     limits = None
     if waveforms is not None:
         ends = [end.strip() for end in waveforms.split(":")]
-        if len(ends) != 2 or not all(end.isdigit() or not end for end in ends):
+        if len(ends) != 2 or not all(end.isdecimal() or not end for end in ends):
             raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END.")
         limits = int(ends[0] or 0), int(ends[1]) if ends[1] else None
     known = dict(name_and_value("--lidar", text) for text in lidar or [])
