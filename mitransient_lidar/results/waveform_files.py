@@ -6,6 +6,7 @@ number of a waveform as its shot. As in flights, ``time`` counts from the start 
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -26,6 +27,8 @@ from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.results.attributes import check_attributes, step_of_history
 from mitransient_lidar.results.variables import label
 
+_LOG = logging.getLogger(__name__)
+
 FILE = "waveform_file"  #: Attribute with the name of the file, by which datasets of this module are known.
 #: What a user may state about lidar and sea, which files do not, with usual values of the indices.
 STATED = (
@@ -36,6 +39,7 @@ _USUAL = {"refractive_index": 1.34, "group_index": 1.364}
 _LAS, _PULSE_WAVES = (".las", ".laz"), (".pls", ".wvs")
 _IN_WATER = 0.9  # of the speed of light, below which the way of a waveform is that in water
 _EARLY = 0.05  # share of the surfaces that may come before the time at which the quiet part ends
+_FEWEST_DARK = 4  # samples before the surface that the level of a waveform needs
 _SAME_START = 0.05  # of a sample, by which the starts of waveforms at one place may differ
 _JOINED: dict[str, Any] = {"join": "outer", "combine_attrs": "override", "fill_value": {"saturated": 0}}
 
@@ -165,6 +169,24 @@ def placed_in_time(dataset: xr.Dataset) -> xr.Dataset:
         return dataset
     first = float(np.median(start))
     return dataset.assign_coords(time=dataset["time"] + first).assign_attrs(time_start_ns=first)
+
+
+def mean_above_dark(dataset: xr.Dataset) -> xr.DataArray:
+    """Return the mean of the waveforms of this module, less its level in the first half before the surface, by pixel.
+
+    Times are those after the pulse, if all waveforms have the same.
+    """
+    signal = placed_in_time(dataset)["signal"].mean("shot", keep_attrs=True).reset_coords(drop=True)
+    surface, width = dataset["surface_time"], float(dataset.attrs["bin_width_ns"])
+    if (spread := float(surface.std("shot").max())) > width:
+        _LOG.warning(
+            "the first returns of %d waveforms spread by %.2g ns, and so does their mean: waveforms = N:N+1 is one of "
+            "them",
+            dataset.sizes["shot"],
+            spread,
+        )
+    before = max(int(np.nan_to_num(0.5 * surface.min().item() / width)), _FEWEST_DARK)
+    return (signal - signal.isel(time=slice(before)).mean("time")).assign_attrs(signal.attrs)
 
 
 def check_measurable(dataset: xr.Dataset) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import logging
 import math
 import os
 from collections import Counter
@@ -27,11 +26,8 @@ from mitransient_lidar.results import waveform_files
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 
-logger = logging.getLogger(__name__)
-
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
-_FEWEST_DARK = 4  # samples before the surface that the level of a recorded waveform needs
 _SATURATED = 1e-3  # probability of saturation above which a sample is left out
 
 
@@ -180,15 +176,13 @@ def measured(
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
-    if isinstance(source, xr.Dataset) and waveform_files.FILE in source.attrs:
-        table = _with_noise(_of_file(source), given)
-        return table if receiver is None else _behind(table, waveform_receiver(receiver))
-    if isinstance(source, xr.Dataset) and "signal" in source:
+    recorded = isinstance(source, xr.Dataset) and waveform_files.FILE in source.attrs
+    if isinstance(source, xr.Dataset) and "signal" in source and not recorded:
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")
         return _of_signal(source, receiver)
-    if not isinstance(source, xr.Dataset):
-        table = _with_noise(_read_csv(Path(source)), given)
+    if recorded or not isinstance(source, xr.Dataset):
+        table = _with_noise(_of_file(source) if isinstance(source, xr.Dataset) else _read_csv(Path(source)), given)
         return table if receiver is None else _behind(table, waveform_receiver(receiver))
     if receiver is not None:
         raise UserError("receiver is that of a signal or a table, and these waveforms are light [W]: leave it out")
@@ -366,26 +360,9 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
 
 
 def _of_file(dataset: xr.Dataset) -> Measured:
-    """Return the mean of the waveforms of a file, less its level in the first half before the surface, by pixel.
-
-    Times are those after the pulse, if all waveforms have the same.
-    """
-    dataset = waveform_files.placed_in_time(dataset)
-    signal = dataset["signal"].mean("shot", keep_attrs=True)
-    times, values = _times(dataset), _by_pixel(signal, ("pixel", "time"))
-    surface, shots = dataset["surface_time"], int(dataset.sizes["shot"])
-    spread, width = float(surface.std("shot").max()), float(dataset.attrs["bin_width_ns"])
-    if spread > width:
-        logger.warning(
-            "the first returns of %d waveforms spread by %.2g ns, and so does their mean: waveforms = N:N+1 is one of "
-            "them",
-            shots,
-            spread,
-        )
-    before = max(int(np.nan_to_num(0.5 * surface.min().item() / width)), _FEWEST_DARK)
-    values = values - values[:, :before].mean(axis=1, keepdims=True)
-    template = signal.reset_coords(drop=True).copy(data=values)
-    return Measured(values, None, times, np.ones(1), template, calibrated=False, shots=shots)
+    """Return the mean of waveforms that a lidar has recorded."""
+    mean, shots = waveform_files.mean_above_dark(dataset), int(dataset.sizes["shot"])
+    return Measured(mean.values, None, mean["time"].values, np.ones(1), mean, calibrated=False, shots=shots)
 
 
 def _behind(table: Measured, receiver: ReceiverChannels) -> Measured:

@@ -375,6 +375,7 @@ def test_fits_get_the_mean_above_the_dark_level(tmp_path, caplog):
     found = measured(dataset)
     dark = dataset["signal"].values[:, 0, :40]
     assert not found.calibrated
+    assert found.template.attrs["units"] == "V"
     assert found.shots == 24
     assert abs(found.values[0, :40].mean()) < 5 * dark.std() / np.sqrt(dark.size)
     assert found.values.max() == pytest.approx(0.9, rel=0.1)
