@@ -52,6 +52,8 @@ except _UserError as _error:
 _variants.limit_threads()
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import xarray
 
     from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
@@ -76,6 +78,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shots.frames import render_frames
     from mitransient_lidar.rendering.shots.series import render_shots
+    from mitransient_lidar.results.waveform_files import waveform_chunks
     from mitransient_lidar.studies.bounds import bounds
     from mitransient_lidar.studies.depth_bias import depth_bias
     from mitransient_lidar.studies.detection import detect
@@ -119,6 +122,7 @@ _FUNCTIONS = {
     "tpu": ("studies.tpu", "tpu"),
     "view": ("plots.viewer", "view"),
     "water_of": ("physics.water.water_types", "water_of"),
+    "waveform_chunks": ("results.waveform_files", "waveform_chunks"),
 }
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
@@ -157,6 +161,7 @@ __all__ = [
     "tpu",
     "view",
     "water_of",
+    "waveform_chunks",
 ]
 
 
@@ -177,15 +182,23 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_FUNCTIONS})
 
 
-def open(path: str | os.PathLike[str]) -> xarray.Dataset:
-    """Read any file or folder that this package writes.
+def open(
+    path: str | os.PathLike[str],
+    *,
+    waveforms: tuple[int, int | None] | None = None,
+    channel: int | str | None = None,
+    lidar: Mapping[str, float] | None = None,
+) -> xarray.Dataset:
+    """Read any file or folder that this package writes, or waveforms that a lidar has recorded.
 
     Parameters
     ----------
     path : path
         An EXR or NetCDF file: waveforms of a render, gates, images by daylight, signals of a receiver, or a table of a
         study. Or a folder: the store of a campaign, whose arrays are read when they are needed, a flight, or a sequence
-        of gates.
+        of gates. Or a full-waveform LAS, LAZ or PulseWaves file.
+    waveforms, channel, lidar : optional
+        Of such a file, as of :func:`waveform_chunks`, which reads a file that is larger than the memory.
 
     Returns
     -------
@@ -207,7 +220,7 @@ def open(path: str | os.PathLike[str]) -> xarray.Dataset:
             from mitransient_lidar.campaigns.store import open_campaign
 
             return open_campaign(store)
-    return open_file(place)
+    return open_file(place, waveforms=waveforms, channel=channel, lidar=lidar)
 
 
 def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:

@@ -12,6 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.gate_stack import check_stack
 from mitransient_lidar.results.sum_errors import SumErrors
+from mitransient_lidar.results.waveform_files import placed_in_time
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -76,14 +77,18 @@ class Comparison:
 def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Return two results with time bins; where one has gates alone, those of both as bins at their middles.
 
+    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes.
+
     Raises
     ------
     UserError
-        If one has gates alone and the other has none.
+        If one has gates or a record alone and the other has none, or a record has a single shot.
     """
     results = first, second
     if all("impulse_response" in one for one in results):
         return results
+    if all("signal" in one and "time" in one["signal"].dims for one in results):
+        return _of_shots(first), _of_shots(second)
     names = {f"gate_energy{end}": f"impulse_response{end}" for end in ("", "_stderr")}
     found = []
     for stack in map(check_stack, results):
@@ -91,6 +96,18 @@ def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Datas
         power = {f"waveform{end}": bins[f"impulse_response{end}"] for end in ("", "_stderr")}
         found.append(bins.assign(power).swap_dims(gate="time").transpose(..., "time"))
     return found[0], found[1]
+
+
+def _of_shots(record: xr.Dataset) -> xr.Dataset:
+    """Return the mean signal of the shots of a record and its error as power and energy of bins."""
+    if record.sizes.get("shot", 1) < 2:
+        raise UserError("a record has 1 shot: both must have at least 2, whose spread gives the errors")
+    record = placed_in_time(record)
+    signal, count = record["signal"], record.sizes["shot"]
+    mean, error = signal.mean("shot", skipna=False), signal.std("shot", ddof=1, skipna=False) / np.sqrt(count)
+    names = ("waveform", "impulse_response")
+    bins = {name + end: one for name in names for end, one in (("", mean), ("_stderr", error))}
+    return record.drop_vars([*record.data_vars]).assign(bins).assign_attrs(passes=count)
 
 
 def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
@@ -111,7 +128,8 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     shapes = [_by_pixel(result, "impulse_response").shape for result in results]
     if shapes[0] != shapes[1] or not np.allclose(times[0], times[1]):
         described = " and ".join(f"{pixels} pixels x {bins} bins" for pixels, bins in shapes)
-        raise UserError(f"the results have {described}: they must have the same pixels and time bins")
+        other = ", at different times" if shapes[0] == shapes[1] else ""
+        raise UserError(f"the results have {described}{other}: they must have the same pixels and time bins")
     angles = [
         np.ravel([result[name].values for name in _ANGLES]) for result in results if {*_ANGLES} <= {*result.coords}
     ]

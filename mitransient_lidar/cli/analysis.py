@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
-from mitransient_lidar.cli.options import OUTPUT, Quiet
+from mitransient_lidar.cli.options import OUTPUT, Channel, Lidar, Quiet, Waveforms, waveform_selection
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.tables.written import write_csv
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from mitransient_lidar.results.files import Given
 
 _REFUSED = 1  # exit code of a fit that is refused
 
@@ -44,7 +50,12 @@ def _record(
 def _echoes(
     call: Call,
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="EXR or NetCDF file of a result, or NetCDF file of recorded shots; or waveforms in LAS, LAZ or "
+            "PulseWaves (.pls).",
+        ),
     ],
     table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
     output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
@@ -63,6 +74,9 @@ def _echoes(
         float | None,
         typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
     ] = None,
+    waveforms: Waveforms = None,
+    channel: Channel = None,
+    lidar: Lidar = None,
     quiet: Quiet = False,
 ) -> None:
     """Print and write the echoes."""
@@ -76,21 +90,32 @@ def _echoes(
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
     from mitransient_lidar import results
     from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
+    from mitransient_lidar.results.waveform_files import waveform_chunks
 
-    dataset = results.dataset_of("FILE", file, "waveforms", "signals")
-    instrument = str(dataset.attrs.get("instrument", ""))
-    corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
+    selection = waveform_selection(file, waveforms, channel, lidar)
+    parts = waveform_chunks(file, **selection) if selection else iter([file])
     estimators = call.arguments["estimators"] or ["gaussian"]
-    found = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
-    if corrections is not None:
-        found = depth_correction.correct_depths(found, corrections, wind_speed)
-    name_subject(file, dataset.attrs, quiet)
+
+    def measured(part: Given) -> xr.Dataset:
+        dataset = results.dataset_of("FILE", part, "waveforms", "signals")
+        instrument = str(dataset.attrs.get("instrument", ""))
+        corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
+        found: xr.Dataset = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
+        if corrections is not None:
+            found = depth_correction.correct_depths(found, corrections, wind_speed)
+        return found
+
+    first = measured(next(parts))
+    if not selection:
+        name_subject(file, first.attrs, quiet)
     if table:
-        typer.echo("\n".join(csv_tables.describe_echoes(found)))
+        typer.echo("\n".join(csv_tables.describe_echoes(first)))
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         with announced():
-            csv_tables.save_csv(found, output)
+            csv_tables.save_csv(itertools.chain([first], map(measured, parts)), output)
+    elif selection and next(parts, None) is not None:
+        typer.echo(f"these are the first {first.sizes['shot']} waveforms: write the echoes of all with --csv OUT")
 
 
 def _retrieve(
@@ -133,20 +158,27 @@ def _fit(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Result or recorded signal (.nc, .exr), or a CSV file with the column time_ns and one for each pixel.",
+            help="Result or recorded signal (.nc, .exr); a CSV file with the column time_ns and one for each pixel; or "
+            "waveforms in LAS, LAZ or PulseWaves (.pls), whose mean is fitted.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    waveforms: Waveforms = None,
+    channel: Channel = None,
+    lidar: Lidar = None,
     quiet: Quiet = False,
 ) -> None:
     """Fit, print and write."""
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))
+    from mitransient_lidar import results
     from mitransient_lidar.plots.studies.parameters import plot_fit
     from mitransient_lidar.studies import fit as study
 
+    selection = waveform_selection(file, waveforms, channel, lidar)
+    source = results.open(file, **selection) if selection else file
     with DeferredInterrupt(at_once=False):
-        fitted = call(file)
+        fitted = call(source)
         output.mkdir(parents=True, exist_ok=True)
         with announced():
             write_netcdf(fitted, targets[0])

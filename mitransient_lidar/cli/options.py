@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,6 +17,28 @@ Define = Annotated[
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 #: Default folder of the files that a command renders.
 OUTPUT = Path("output")
+#: Options of commands that read full-waveform files of lidars (`waveform_selection`).
+Waveforms = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FIRST:END",
+        help="Waveforms of a LAS or LAZ file, pulses of a PulseWaves file: from number FIRST, from 0, to before END.",
+    ),
+]
+Channel = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[FIELD=]N", help="Channel of such a file: a scanner channel, or the value of a FIELD of its points."
+    ),
+]
+Lidar = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="What such a file does not state: pulse_fwhm_ns, altitude above the sea [m], sea_level in the file's "
+        "heights [m], refractive_index, ... Repeatable.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 
 
@@ -29,6 +51,25 @@ def parameters(definitions: list[str] | None) -> dict[str, str]:
             raise UserError(f"-D {definition} is not of the form name=value.")
         params[name.strip()] = value.strip()
     return params
+
+
+def waveform_selection(
+    file: Path, waveforms: str | None, channel: str | None, lidar: list[str] | None
+) -> dict[str, Any]:
+    """Return the arguments of `results.waveform_files.waveform_chunks`; empty for files of other kinds."""
+    given = {"--waveforms": waveforms, "--channel": channel, "--lidar": lidar}
+    if file.suffix.lower() not in (".las", ".laz", ".pls", ".wvs"):
+        if named := [name for name, value in given.items() if value]:
+            raise UserError(f"{named[0]} is for LAS, LAZ and PulseWaves files, and {file} is none.")
+        return {}
+    limits = None
+    if waveforms is not None:
+        ends = [end.strip() for end in waveforms.split(":")]
+        if len(ends) != 2 or not all(end.isdecimal() or not end for end in ends):
+            raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END.")
+        limits = int(ends[0] or 0), int(ends[1]) if ends[1] else None
+    known = dict(name_and_value("--lidar", text) for text in lidar or [])
+    return {"waveforms": limits, "channel": channel, "lidar": known}
 
 
 def numbers(option: str, text: str) -> list[float]:

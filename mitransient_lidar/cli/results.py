@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix
 from mitransient_lidar.cli.generator import Command
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import DrawingOnly, Quiet
+from mitransient_lidar.cli.options import Channel, DrawingOnly, Lidar, Quiet, Waveforms, waveform_selection
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 
@@ -23,7 +23,12 @@ _DIFFERENT = 1
 
 def _view(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, a gate stack or recorded signals.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="EXR or NetCDF file of a result, a gate stack or recorded signals; or waveforms in LAS, LAZ or "
+            "PulseWaves (.pls).",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -44,12 +49,16 @@ def _view(
     layout: Annotated[
         bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
     ] = False,
+    waveforms: Waveforms = None,
+    channel: Channel = None,
+    lidar: Lidar = None,
     quiet: Quiet = False,
 ) -> None:
     """Show a result in the browser, or draw it."""
     is_page = output is None or output.suffix.lower() == ".html"
+    selection = waveform_selection(file, waveforms, channel, lidar)
     if not (plot or log or linear or components or layout) and is_page:
-        _show(file, output, shot, browser, quiet)
+        _show(file, output, shot, browser, quiet, selection)
         return
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
@@ -66,7 +75,8 @@ def _view(
     from mitransient_lidar.results.files import kinds_of
 
     of_gates = () if layout or components else ("gates", "frames")
-    dataset = results.dataset_of("FILE", file, "waveforms", "signals", *of_gates)
+    source = results.open(file, **selection) if selection else file
+    dataset = results.dataset_of("FILE", source, "waveforms", "signals", *of_gates)
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     with announced():
@@ -84,7 +94,9 @@ def _view(
         typer.echo("\n".join(axis_points(dataset)))
 
 
-def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quiet: bool) -> None:
+def _show(
+    file: Path, output: Path | None, shot: int | None, browser: bool, quiet: bool, selection: dict[str, Any]
+) -> None:
     """Write the page of a result, and open it in the browser."""
     if output is not None:
         check_suffix("--output", output, ".html")
@@ -92,7 +104,8 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
     from mitransient_lidar.plots.viewer import view as page_of
 
     with reporting(quiet):
-        dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates", "frames")
+        source = results.open(file, **selection) if selection else file
+        dataset = results.dataset_of("FILE", source, "waveforms", "signals", "gates", "frames")
         page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -113,18 +126,31 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
 
 
 def _compare(
-    first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
+    first: Annotated[
+        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result, or the record of shots, also LAS or .pls.")
+    ],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and bins or gates.")],
     output: DrawingOnly = None,
+    waveforms: Waveforms = None,
+    channel: Channel = None,
+    lidar: Lidar = None,
 ) -> None:
     """Compare and draw two results."""
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
     from mitransient_lidar.plots.comparison import plot_comparison
+    from mitransient_lidar.results.waveform_files import is_waveform_file
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
     check_figure(target)
-    given = (results.dataset_of(name, one, "result", "gates") for name, one in (("FILE", first), ("OTHER", second)))
+    recorded = [one for one in (first, second) if is_waveform_file(one)]
+    selection = waveform_selection(recorded[0] if recorded else first, waveforms, channel, lidar)
+    given = (
+        results.dataset_of(
+            name, results.open(one, **selection) if one in recorded else one, "result", "gates", "signals"
+        )
+        for name, one in (("FILE", first), ("OTHER", second))
+    )
     datasets = comparison.as_bins(*given)
     outcome = comparison.compare(*datasets)
     with announced():

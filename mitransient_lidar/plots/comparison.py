@@ -54,7 +54,7 @@ def plot_comparison(
     for level in (-outcome.limit, outcome.limit):
         lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
     largest = 1.5 * max(outcome.limit, outcome.largest)
-    lower.set(ylim=(-largest, largest), xlabel=drawing.TIME_LABEL, ylabel="difference\n(standard errors)")
+    lower.set(ylim=(-largest, largest), xlabel=drawing.time_label(first), ylabel="difference\n(standard errors)")
     for ax in (upper, lower):
         drawing.add_grid(ax)
     text = f"{outcome.bin_count} bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f} standard errors"

@@ -24,10 +24,12 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.waveform_files import FILE
 
 FilePath = str | os.PathLike[str]
 
 TIME_LABEL = "time since the pulse left the transmitter (ns)"
+_RECORD_TIME = "time since the start of each waveform (ns)"
 ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "to the left, angle_y (mrad)"
 
 #: Most pixels that a legend lists by name.
@@ -93,9 +95,14 @@ def si_prefix(largest: float) -> tuple[float, str]:
 
 
 def scene_name(attributes: Mapping[str, Any]) -> str:
-    """Return the name of the scene without the suffix of its file, and of its instrument; empty if unknown."""
-    names = Path(str(attributes.get("scene", ""))).stem, str(attributes.get("instrument", ""))
+    """Return the name of the scene or of recorded waveforms without suffix, and the instrument; empty if unknown."""
+    names = Path(str(attributes.get("scene", attributes.get(FILE, "")))).stem, str(attributes.get("instrument", ""))
     return ", ".join(filter(None, names))
+
+
+def time_label(dataset: xr.Dataset) -> str:
+    """Return what times of a dataset count from."""
+    return _RECORD_TIME if FILE in dataset.attrs and not dataset.attrs["time_start_ns"] else TIME_LABEL
 
 
 def titled(attributes: Mapping[str, Any], text: str) -> str:

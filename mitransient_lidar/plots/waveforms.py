@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
+from mitransient_lidar.results.waveform_files import FILE
 
 Scale = Literal["both", "linear", "log"]
 
@@ -62,7 +63,7 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
         _draw_waveforms(ax, dataset, curves, log=panel == "log")
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
-    axes[-1].set_xlabel(drawing.TIME_LABEL)
+    axes[-1].set_xlabel(drawing.time_label(dataset))
     _add_depth_axis(axes[0], dataset)
     figure.suptitle(_title(dataset), fontsize="large")
     return drawing.save(figure, path)
@@ -131,7 +132,9 @@ def _curves(dataset: xr.Dataset) -> _Curves:
     if {*values.dims} - {"shot"} not in ({"pixel", "time"}, {"row", "column", "time"}):
         allowed = "(pixel, time) or (row, column, time)"
         raise UserError(f"{name} has the dimensions {values.dims}: it must be over {allowed}")
-    error = dataset["signal_deviation" if recorded else "waveform_stderr"]
+    error = dataset.get("signal_deviation" if recorded else "waveform_stderr")
+    if error is None:  # of a lidar's waveforms, where the spread of the shots is that of the ground
+        error = xr.zeros_like(values)
     if "pixel" not in values.dims:
         # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
         values, error = (one.sum(("row", "column")).expand_dims("pixel", -2) for one in (values, 0 * error))
@@ -251,7 +254,7 @@ def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
     attributes = dataset.attrs
     error = None if "signal" in dataset else optional_number(attributes, "error_median")
     parts = [drawing.scene_name(attributes) or "received power"]
-    if "signal" in dataset:
+    if "signal" in dataset and FILE not in attributes:
         parts.append(f"receiver {attributes.get('receiver', 'custom')}")
     if "shot" in dataset.dims:
         parts.append(f"{shown} of {dataset.sizes['shot']} shots")

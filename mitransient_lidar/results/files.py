@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Union
+from typing import Any, Union
 
 import xarray as xr
 
@@ -16,7 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path, open_file, replacing
 from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.results import exr, image_files, netcdf, sum_errors
+from mitransient_lidar.results import exr, image_files, netcdf, sum_errors, waveform_files
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack, has_frames
@@ -39,10 +39,11 @@ _KINDS = {
 Given = Union["xr.Dataset", str, os.PathLike[str]]
 
 
-def open(path: str | os.PathLike[str]) -> xr.Dataset:
+def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
     """Read a dataset into memory from a file of `save`, or from a folder with a sequence of gates.
 
-    Waveforms over time of other programs are read from NetCDF-4 files, too. The content shows the format, not the name.
+    Waveforms over time of other programs are read from NetCDF-4 files, too. The content shows the format, not the name;
+    but .las, .laz, .pls and .wvs files are read by `waveform_files.read_waveforms`, with its `selection`.
 
     Raises
     ------
@@ -50,6 +51,10 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         If the file is missing, damaged, truncated, or not of this package, or its times or attributes are invalid.
     """
     path = checked_path("path", path)
+    if waveform_files.is_waveform_file(path):
+        return waveform_files.read_waveforms(path, **selection)
+    if given := [name for name, value in selection.items() if value is not None]:
+        raise UserError(f"{given[0]} is for LAS, LAZ and PulseWaves files, and {path} is none")
     foreign = False
     if path.is_dir() or is_exr(path):
         dataset = exr.read(path)

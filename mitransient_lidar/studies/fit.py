@@ -35,6 +35,7 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.rendering.options import MOST_PASSES
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
+from mitransient_lidar.results.waveform_files import FILE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -312,7 +313,7 @@ def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) 
     """Return the scene, or that of a result."""
     if scene is not None:
         return scene
-    if not attributes:
+    if not attributes or FILE in attributes:
         raise UserError("scene is missing: waveforms of a table do not hold theirs")
     return SceneSource.from_attributes(attributes)
 

@@ -22,6 +22,7 @@ from mitransient_lidar.core.validation import FloatArray, positive, shown
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, waveform_receiver
+from mitransient_lidar.results import waveform_files
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 
@@ -139,7 +140,8 @@ def with_waveforms(source: Given) -> Given:
     UserError
         If it is another dataset, or its file cannot be read.
     """
-    if isinstance(source, (str, os.PathLike)) and Path(source).suffix.lower() not in (".nc", ".exr", ""):
+    is_path = isinstance(source, (str, os.PathLike)) and not waveform_files.is_waveform_file(source)
+    if is_path and Path(source).suffix.lower() not in (".nc", ".exr", ""):
         return source
     return results.dataset_of("source", source, "waveforms", "signals")
 
@@ -157,7 +159,8 @@ def measured(
     source
         A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
         averaged; its EXR or NetCDF file; or a CSV file with the column ``time_ns``, one column for each pixel in any
-        unit, and optionally columns ``NAME_stderr`` with their standard errors.
+        unit, and optionally columns ``NAME_stderr`` with their standard errors. Waveforms of LAS, LAZ and PulseWaves
+        files (`results.waveform_files`) are such a table: their mean, less the level before the surface.
     noise
         Standard deviation of every sample of waveforms, above 0 and in their unit, instead of their own.
     receiver
@@ -173,12 +176,13 @@ def measured(
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
-    if isinstance(source, xr.Dataset) and "signal" in source:
+    recorded = isinstance(source, xr.Dataset) and waveform_files.FILE in source.attrs
+    if isinstance(source, xr.Dataset) and "signal" in source and not recorded:
         if given is not None:
             raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")
         return _of_signal(source, receiver)
-    if not isinstance(source, xr.Dataset):
-        table = _with_noise(_read_csv(Path(source)), given)
+    if recorded or not isinstance(source, xr.Dataset):
+        table = _with_noise(_of_file(source) if isinstance(source, xr.Dataset) else _read_csv(Path(source)), given)
         return table if receiver is None else _behind(table, waveform_receiver(receiver))
     if receiver is not None:
         raise UserError("receiver is that of a signal or a table, and these waveforms are light [W]: leave it out")
@@ -353,6 +357,12 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
         shots=shots,
         render_variance=of_render,
     )
+
+
+def _of_file(dataset: xr.Dataset) -> Measured:
+    """Return the mean of waveforms that a lidar has recorded."""
+    mean, shots = waveform_files.mean_above_dark(dataset), int(dataset.sizes["shot"])
+    return Measured(mean.values, None, mean["time"].values, np.ones(1), mean, calibrated=False, shots=shots)
 
 
 def _behind(table: Measured, receiver: ReceiverChannels) -> Measured:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,9 +66,12 @@ def echo_frame(table: xr.Dataset) -> pd.DataFrame:
     return frame[[*dims, *extra, *numbers, *known_as, "flags", "unknown_depth", *attenuation]]
 
 
-def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write or replace a CSV file of a table of `echo_table.extract`, with empty cells for unknown values."""
-    write_csv(echo_frame(table), path, digits=9)
+def save_csv(tables: xr.Dataset | Iterable[xr.Dataset], path: str | os.PathLike[str]) -> None:
+    """Write or replace a CSV file of one or more tables of `echo_table.extract`, with empty cells for unknown values.
+
+    Further tables add rows with the columns of the first one; one of them is in memory at a time.
+    """
+    write_csv(map(echo_frame, [tables] if isinstance(tables, xr.Dataset) else tables), path, digits=9)
 
 
 def describe_echoes(found: xr.Dataset) -> list[str]:

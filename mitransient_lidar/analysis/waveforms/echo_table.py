@@ -28,6 +28,7 @@ from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import flagged, label
+from mitransient_lidar.results.waveform_files import check_measurable
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
@@ -199,6 +200,7 @@ def extract(
     attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
     dataset = dataset_of("dataset", dataset, "waveforms", "signals")
+    check_measurable(dataset)
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
     if not names or (unknown := [name for name in names if name not in ESTIMATORS]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.core.files import replacing
@@ -45,8 +45,15 @@ def aligned_lines(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> l
     ]
 
 
-def write_csv(frame: pd.DataFrame, path: str | os.PathLike[str], digits: int | None = None, unknown: str = "") -> None:
+def write_csv(
+    frames: pd.DataFrame | Iterator[pd.DataFrame],
+    path: str | os.PathLike[str],
+    digits: int | None = None,
+    unknown: str = "",
+) -> None:
     """Write or replace a CSV file: numbers of so many digits, or all, and a word for NaN; no index.
+
+    Further frames add rows, under the columns of the first one.
 
     Raises
     ------
@@ -54,5 +61,17 @@ def write_csv(frame: pd.DataFrame, path: str | os.PathLike[str], digits: int | N
         If the file cannot be written.
     """
     form = None if digits is None else f"%.{digits}g"
-    with replacing(path) as temporary:
-        frame.to_csv(temporary, index=False, float_format=form, na_rep=unknown, lineterminator="\n", encoding="utf-8")
+    columns = None
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        for frame in frames if isinstance(frames, Iterator) else [frames]:
+            heading = columns is None
+            columns = frame.columns if heading else columns
+            frame.to_csv(
+                file,
+                columns=columns,
+                header=heading,
+                index=False,
+                float_format=form,
+                na_rep=unknown,
+                lineterminator="\n",
+            )

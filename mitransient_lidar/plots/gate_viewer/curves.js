@@ -139,7 +139,7 @@ class CurveView {
         svg("text", { x: this.x(tick), y: bottom + 18, "text-anchor": "middle" }, plain(tick, digits))
       );
     }
-    elements.push(name(bottom + 36, "time since the pulse left the transmitter (ns)"));
+    elements.push(name(bottom + 36, this.stack.time_label));
     if (!this.stack.depth_of_time) return elements;
     const [offset, slope] = this.stack.depth_of_time;
     const depths = linearTicks(offset + slope * this.first, offset + slope * this.last, this.width / 60);

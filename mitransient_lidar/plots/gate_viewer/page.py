@@ -106,7 +106,7 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     for note in notes:
         _LOG.warning("the page: %s", note)
     metadata = _metadata(gated, record, gates, waveforms) | {"notes": notes}
-    metadata |= _words(record if is_record else None, gated)
+    metadata |= _words(record if is_record else None, gated) | {"time_label": drawing.time_label(stack)}
     filled = {
         "policy": _POLICY,
         "title": html.escape(metadata["title"]),
