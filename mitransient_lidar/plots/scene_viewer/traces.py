@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -13,9 +13,11 @@ from matplotlib.colors import to_hex
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
-from mitransient_lidar.rendering.geometry.bundles import Bundle
-from mitransient_lidar.rendering.geometry.shapes import Relief, SceneGeometry, Solid
 from mitransient_lidar.results.variables import PointClass
+
+if TYPE_CHECKING:
+    from mitransient_lidar.rendering.geometry.bundles import Bundle
+    from mitransient_lidar.rendering.geometry.shapes import Relief, SceneGeometry, Solid
 
 #: Colours that colour-blind readers tell apart (Okabe and Ito 2008), of four pixels by their published names.
 _FOUR = ("#d55e00", "#009e73", "#0072b2", "#222222")
@@ -41,8 +43,7 @@ def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:
         yield _relief(relief, float(brightest))
     for solid in geometry.solids:
         yield _solid(solid)
-    step = -(-len(geometry.layers) // _MOST_LAYERS) or 1
-    for row in geometry.layers[::step]:
+    for row in _drawn_layers(geometry):
         yield _layer(row, geometry.box)
     pixels = [one for one in geometry.bundles if one.kind == "pixel"]
     colours = _FOUR if len(pixels) == 4 else [to_hex(one) for one in drawing.pixel_colours(len(pixels))]
@@ -74,9 +75,13 @@ def scene_notes(geometry: SceneGeometry) -> list[str]:
     for solid in geometry.solids:
         if solid.share < 1:
             notes.append(f"{solid.name}: a part of its triangles is drawn, {solid.share:.0%} of them.")
-    if (count := len(geometry.layers)) > _MOST_LAYERS:
-        notes.append(f"{_MOST_LAYERS} or fewer of {count} boundaries between layers are drawn.")
+    if (drawn := len(_drawn_layers(geometry))) < (count := len(geometry.layers)):
+        notes.append(f"{drawn} of {count} boundaries between layers are drawn.")
     return notes
+
+
+def _drawn_layers(geometry: SceneGeometry) -> FloatArray:
+    return geometry.layers[:: -(-len(geometry.layers) // _MOST_LAYERS) or 1]
 
 
 def point_traces(points: xr.Dataset) -> Iterator[dict[str, Any]]:
@@ -174,7 +179,7 @@ def _solid(solid: Solid) -> dict[str, Any]:
     text = f"{name}<br>height {low:.2f} to {high:.2f} m<br>{sides} m<br>reflectance {reflectance}"
     if not len(solid.faces):
         return _points(solid.points, mode="markers", marker={"size": 2, "color": _TARGET}, name=name, hovertext=text)
-    return _mesh(solid.points, solid.faces, text, name=name, color=_TARGET)
+    return _mesh(solid.points, solid.faces, text, name=name, color=_TARGET, lighting={"ambient": 0.8})
 
 
 def _layer(row: FloatArray, box: FloatArray) -> dict[str, Any]:
@@ -207,7 +212,7 @@ def _bundle(bundle: Bundle, colour: str) -> Iterator[dict[str, Any]]:
     yield _points(np.concatenate(lines), mode="lines", line=line, hovertext=text, hoverinfo="text", **group)
     if bundle.kind != "lines":
         points, faces = _walls(bundle)
-        yield _mesh(points, faces, text, color=colour, opacity=0.16, **group | {"showlegend": False})
+        yield _mesh(points, faces, text, color=colour, opacity=0.13, **group | {"showlegend": False})
 
 
 def _walls(bundle: Bundle) -> tuple[FloatArray, IntArray]:

@@ -22,11 +22,11 @@ _MOST_PIXELS, _MOST_LINES = 64, 17
 #: Length of rays that meet nothing under water, and depth of those from the air in a scene without solids [m].
 _REACH, _DEPTH = 20.0, 10.0
 
-#: Smallest sine below the horizon of rays that are followed.
-_SMALLEST_DESCENT = 1e-3
+#: Smallest sine below the horizon of rays that are followed, and displacement of those that meet edges [m].
+_SMALLEST_DESCENT, _ASIDE = 1e-3, (1e-4, 0.7e-4, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bundle:
     """Rays along the outlines of a beam or a pixel, refracted as by a level sea.
 
@@ -66,7 +66,8 @@ def bundles_of(scene: WaterScene, transmitter: Transmitter | None) -> list[Bundl
     pose, pixels = scene.receiver.pose, scene.receiver.pixels
     outlines = [("pixel", name, pose, lines) for name, lines in _regions(pixels)]
     if pixels.grid is not None and pixels.sides is not None:
-        outlines.append(("lines", "lines between pixels", pose, _lines(pixels)))
+        blocks = " × ".join(str(_step(count)) for count in pixels.grid)
+        outlines.append(("lines", f"lines between blocks of {blocks} pixels", pose, _lines(pixels)))
     if transmitter is not None:
         for share, lines in transmitter.profile.outlines():
             name = "rim of the beam" if share == 1 else f"beam, {100 * share:.0f} % of its peak irradiance"
@@ -96,14 +97,18 @@ def _regions(pixels: PixelArray) -> Iterator[tuple[str, list[FloatArray]]]:
     yield f"field of view of {pixels.count} pixels", [0.5 * sides * angles]
 
 
+def _step(count: int) -> int:
+    """Return the number of rows or columns of pixels between two lines."""
+    return -(-count // (_MOST_LINES - 1))
+
+
 def _lines(pixels: PixelArray) -> list[FloatArray]:
     """Return evenly chosen lines between the rows and the columns of an imager within its view [rad]."""
     assert pixels.grid is not None
     assert pixels.sides is not None
     edges, found = [], []
     for count, side in zip(pixels.grid, pixels.sides, strict=True):
-        step = -(-count // (_MOST_LINES - 1))
-        edges.append(side * (np.unique([*range(0, count, step), count]) / count - 0.5))
+        edges.append(side * (np.unique([*range(0, count, _step(count)), count]) / count - 0.5))
     for axis in (0, 1):
         along = np.linspace(edges[1 - axis][0], edges[1 - axis][-1], 65)
         for place in edges[axis]:
@@ -139,6 +144,9 @@ def traced(scene: WaterScene, pose: KernelPose, angles: FloatArray) -> FloatArra
 
     corners = [start, *(at(sea, z) for z in levels)]
     ends = first_along(scene, scene.solids, corners)
+    # Rays in single precision may pass between two triangles where they meet an edge: those beside them do not.
+    if (missed := np.isnan(ends[:, 0])).any():
+        ends[missed] = first_along(scene, scene.solids, [corner[missed] + _ASIDE for corner in corners])
     ends = np.where(np.isfinite(ends), ends, corners[-1])
     on_sea = first_along(scene, scene.surfaces, [start, at(LevelSea((1.0,)), trough)])
     corners[1], corners[-1] = np.where(np.isfinite(on_sea), on_sea, corners[1]), ends

@@ -45,9 +45,9 @@ class Relief:
 
 @dataclass(frozen=True)
 class Solid:
-    """Points of a target [m], (n, 3), its triangles (none of a shape known by points alone), and mean reflectance.
+    """Points of a target [m], (n, 3), its triangles, and its mean reflectance as seen from above.
 
-    `share` is that of the triangles that are kept.
+    A shape may be known by points alone. `share` is that of the triangles that are kept.
     """
 
     name: str
@@ -64,7 +64,7 @@ class SceneGeometry:
     Attributes
     ----------
     name
-        Name of the scene.
+        Name of the scene, and of its instrument.
     box
         Lowest and highest corner of the water about the footprints, shape (2, 3).
     lidar
@@ -124,21 +124,26 @@ def scene_geometry(loaded: LoadedScene) -> SceneGeometry:
     air = _AIR * (high[2] - low[2])
     box = np.stack([low, high]) + np.outer([-0.4 * air, air], [0, 0, 1]) + at
     solids = [_solid(scene, shape) for shape in drawn]
-    return SceneGeometry(loaded.name, box, lidar, reliefs, solids, _layers(scene, box), bundles)
+    instrument = loaded.source.instrument if loaded.source else None
+    name = f"{loaded.name}, {instrument}" if instrument else loaded.name
+    return SceneGeometry(name, box, lidar, reliefs, solids, _layers(scene, box), bundles)
 
 
 def _looked_at(scene: WaterScene, shape: mi.Shape, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return height [m] and reflectance of the highest point of a shape at places of the frame; NaN without one."""
+    """Return height [m] and diffuse reflectance of the highest point of a shape at places of the frame.
+
+    They are NaN where the shape is not; so are reflectances of what has no diffuse part, such as metal.
+    """
     low, high = box_of(shape)
     origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + 1.0)], axis=1)
     down = np.tile([0.0, 0.0, -1.0], (x.size, 1))
     ray = aligned_ray(origins, down, np.full(x.size, high[2] - low[2] + 2.0))
     hit = scene_of_shapes([shape], scene.groups).ray_intersect(ray)
     met = np.array(hit.is_valid())
-    value = np.array(hit.bsdf().eval_diffuse_reflectance(hit, hit.is_valid()), np.float64)[0]
-    found = (np.where(met, each, np.nan).reshape(x.shape) for each in (np.array(hit.p.z, np.float64), value))
-    height, reflectance = found
-    return height, reflectance
+    is_diffuse = met & np.array((hit.bsdf().flags() & mi.BSDFFlags.DiffuseReflection.value) > 0)
+    reflectance = np.array(hit.bsdf().eval_diffuse_reflectance(hit, hit.is_valid()), np.float64)[0]
+    height = np.where(met, np.array(hit.p.z, np.float64), np.nan)
+    return height.reshape(x.shape), np.where(is_diffuse, reflectance, np.nan).reshape(x.shape)
 
 
 def _relief(scene: WaterScene, shape: mi.Shape, low: FloatArray, high: FloatArray, is_sea: bool) -> Relief:
@@ -168,7 +173,7 @@ def _solid(scene: WaterScene, shape: mi.Shape) -> Solid:
     count = len(faces)
     if count > _MOST_FACES:
         faces, points = thinned(faces, points, _MOST_FACES)
-    return Solid(shape.id(), points + scene.frame_origin, faces, mean, len(faces) / max(count, 1))
+    return Solid(shape.id(), points + scene.frame_origin, faces, mean, len(faces) / count if count else 1.0)
 
 
 def thinned(faces: IntArray, points: FloatArray, most: int) -> tuple[IntArray, FloatArray]:

@@ -80,7 +80,7 @@ def test_a_page_holds_the_scene_with_names_and_numbers(geometry):
     layers = [one for one in data if one["name"].startswith("layer")]
     assert len(layers) == 10
     assert "0.9 /m above, 0.5 /m below" in layers[0]["hovertext"]
-    assert "12 or fewer of 30 boundaries between layers are drawn." in page
+    assert "10 of 30 boundaries between layers are drawn." in page
     assert "leaves: a part of its triangles is drawn, 25% of them." in page
     views = traces.scene_views(geometry)
     assert views["Water"] is geometry.box

@@ -78,6 +78,7 @@ def test_rays_bend_at_the_boundary_of_index_layers():
     assert geometry.layers == pytest.approx(np.array([[2.0, 0.6, 0.3]]))
 
 
+@pytest.mark.slow
 def test_rays_end_on_targets_and_reliefs_have_patches(lidar_scene):
     extra = {
         "ball": {"type": "sphere", "center": [1.0, 0.0, -4.0], "radius": 0.8},
@@ -146,3 +147,17 @@ def test_a_lidar_under_water_has_straight_rays(lidar_scene):
             cosine = -ways[:, 2] / np.linalg.norm(ways, axis=1)
             assert np.degrees(np.arccos(cosine)).max() < 5.0
             assert loop[-1, :, 2] == pytest.approx(-8.0, abs=1e-2)
+
+
+def test_an_imager_has_its_view_and_lines_between_its_pixels():
+    geometry = of_scene(layout="128x128")
+    kinds = [(one.kind, one.name) for one in geometry.bundles]
+    assert kinds[:2] == [
+        ("pixel", "field of view of 16384 pixels"),
+        ("lines", "lines between blocks of 8 × 8 pixels"),
+    ]
+    view, lines = geometry.bundles[:2]
+    # Those at the rim of the circle have no length.
+    assert len(lines.loops) == 2 * 15
+    # The lines end within the circle of the view.
+    assert lines.size(1) == pytest.approx(view.size(1), rel=0.02)
