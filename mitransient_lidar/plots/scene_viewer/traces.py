@@ -7,10 +7,12 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from matplotlib.colors import to_hex
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.sea.sea_mesh import grid_faces
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
 from mitransient_lidar.results.variables import PointClass
@@ -51,7 +53,7 @@ def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:
         colour = colours[pixels.index(bundle)] if bundle in pixels else _BEAM if bundle.kind == "beam" else _FOUR[3]
         yield from _bundle(bundle, colour)
     for name, place in geometry.lidar.items():
-        text = f"{name}, {place[2]:.4g} m above the mean sea level"
+        text = f"{name}<br>height {place[2]:.4g} m"
         marker = {"size": 5, "color": _BEAM if name == "laser" else _FOUR[3], "symbol": "diamond"}
         yield _points(place[None], mode="markers", marker=marker, name=name, hovertext=text, hoverinfo="text")
 
@@ -139,7 +141,7 @@ def _columns(points: FloatArray) -> dict[str, Any]:
     return dict(zip("xyz", points.astype(np.float32).T, strict=True))
 
 
-def _mesh(points: FloatArray, faces: IntArray, text: str, **style: Any) -> dict[str, Any]:
+def _mesh(points: FloatArray, faces: npt.NDArray[np.integer], text: str, **style: Any) -> dict[str, Any]:
     """Return a trace of triangles."""
     corners = dict(zip("ijk", faces.astype(np.uint16 if len(points) < 2**16 else np.uint32).T, strict=True))
     about = {"hoverinfo": "text", "hovertext": text, "showlegend": True, "flatshading": True}
@@ -184,10 +186,9 @@ def _solid(solid: Solid) -> dict[str, Any]:
 
 def _layer(row: FloatArray, box: FloatArray) -> dict[str, Any]:
     depth, above, below = row
-    corners = np.array([[x, y, -depth] for x in box[:, 0] for y in box[:, 1]])
+    corners = np.array([[x, y, -depth] for y in box[:, 1] for x in box[:, 0]])
     text = f"boundary of layers, {depth:.3g} m deep<br>attenuation {above:.3g} /m above, {below:.3g} /m below"
-    faces = np.array([[0, 1, 2], [1, 3, 2]])
-    return _mesh(corners, faces, text, name=f"layer below {depth:.3g} m", color=_LAYER, opacity=0.3)
+    return _mesh(corners, grid_faces(2, 2), text, name=f"layer below {depth:.3g} m", color=_LAYER, opacity=0.3)
 
 
 def _bundle(bundle: Bundle, colour: str) -> Iterator[dict[str, Any]]:
@@ -220,9 +221,7 @@ def _walls(bundle: Bundle) -> tuple[FloatArray, IntArray]:
     points, faces, first = [], [], 0
     for loop in bundle.loops:
         levels, count, _ = loop.shape
-        corner = (first + np.arange(levels - 1)[:, None] * count + np.arange(count - 1)).ravel()
-        faces += [np.stack([corner, corner + 1, corner + count], 1)]
-        faces += [np.stack([corner + 1, corner + count + 1, corner + count], 1)]
+        faces.append(grid_faces(levels, count).astype(np.int64) + first)
         points.append(loop.reshape(-1, 3))
         first += levels * count
     return np.concatenate(points), np.concatenate(faces)

@@ -67,7 +67,10 @@ def bundles_of(scene: WaterScene, transmitter: Transmitter | None) -> list[Bundl
     outlines = [("pixel", name, pose, lines) for name, lines in _regions(pixels)]
     if pixels.grid is not None and pixels.sides is not None:
         blocks = " × ".join(str(_step(count)) for count in pixels.grid)
-        outlines.append(("lines", f"lines between blocks of {blocks} pixels", pose, _lines(pixels)))
+        radius = 0.5 * pixels.field_of_view if pixels.field_of_view_shape == "circle" else np.inf
+        outlines.append(
+            ("lines", f"lines between blocks of {blocks} pixels", pose, _lines(pixels.grid, pixels.sides, radius))
+        )
     if transmitter is not None:
         for share, lines in transmitter.profile.outlines():
             name = "rim of the beam" if share == 1 else f"beam, {100 * share:.0f} % of its peak irradiance"
@@ -102,19 +105,18 @@ def _step(count: int) -> int:
     return -(-count // (_MOST_LINES - 1))
 
 
-def _lines(pixels: PixelArray) -> list[FloatArray]:
-    """Return evenly chosen lines between the rows and the columns of an imager within its view [rad]."""
-    assert pixels.grid is not None
-    assert pixels.sides is not None
-    edges, found = [], []
-    for count, side in zip(pixels.grid, pixels.sides, strict=True):
-        edges.append(side * (np.unique([*range(0, count, _step(count)), count]) / count - 0.5))
+def _lines(grid: tuple[int, int], sides: tuple[float, float], radius: float) -> list[FloatArray]:
+    """Return evenly chosen lines between the rows and the columns of an imager within a radius [rad]."""
+    edges = [
+        side * (np.unique([*range(0, count, _step(count)), count]) / count - 0.5)
+        for count, side in zip(grid, sides, strict=True)
+    ]
+    found = []
     for axis in (0, 1):
         along = np.linspace(edges[1 - axis][0], edges[1 - axis][-1], 65)
         for place in edges[axis]:
             line = np.stack([np.full_like(along, place), along][:: 1 - 2 * axis], axis=-1)
-            if pixels.field_of_view_shape == "circle":
-                line = line[np.hypot(*line.T) <= 0.5 * pixels.field_of_view]
+            line = line[np.hypot(*line.T) <= radius]
             found += [line] * (len(line) > 1)
     return found
 

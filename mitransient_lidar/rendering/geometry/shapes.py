@@ -10,6 +10,7 @@ import numpy as np
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene
+from mitransient_lidar.physics.sea.sea_mesh import grid_faces
 from mitransient_lidar.rendering.describe import SAMPLED_TICKS, surface_points
 from mitransient_lidar.rendering.geometry.bundles import Bundle, bundles_of
 from mitransient_lidar.transport.opaque import aligned_ray
@@ -150,10 +151,8 @@ def _relief(scene: WaterScene, shape: mi.Shape, low: FloatArray, high: FloatArra
     """Return the part of a shape within the box."""
     x, y = (np.linspace(low[axis], high[axis], _POINTS) for axis in (0, 1))
     z, reflectance = _looked_at(scene, shape, *np.meshgrid(x, y))
-    at = scene.frame_origin
-    return Relief(
-        shape.id(), is_sea, x + at[0], y + at[1], z + at[2], np.full_like(z, np.nan) if is_sea else reflectance
-    )
+    at, value = scene.frame_origin, np.nan if is_sea else reflectance
+    return Relief(shape.id(), is_sea, x + at[0], y + at[1], z + at[2], np.broadcast_to(value, z.shape))
 
 
 def _solid(scene: WaterScene, shape: mi.Shape) -> Solid:
@@ -167,9 +166,7 @@ def _solid(scene: WaterScene, shape: mi.Shape) -> Solid:
     if "faces" in known:
         faces = np.array(known["faces"]).astype(np.int64).reshape(-1, 3)
     elif len(points) == (SAMPLED_TICKS + 1) ** 2:
-        corner = (np.arange(SAMPLED_TICKS)[:, None] * (SAMPLED_TICKS + 1) + np.arange(SAMPLED_TICKS)).ravel()
-        up = corner + SAMPLED_TICKS + 1
-        faces = np.concatenate([np.stack([corner, corner + 1, up], 1), np.stack([corner + 1, up + 1, up], 1)])
+        faces = grid_faces(SAMPLED_TICKS + 1, SAMPLED_TICKS + 1).astype(np.int64)
     count = len(faces)
     if count > _MOST_FACES:
         faces, points = thinned(faces, points, _MOST_FACES)
