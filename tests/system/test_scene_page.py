@@ -1,5 +1,6 @@
 """Pages of scenes in a real browser: what they draw, their views and numbers, and their width on a phone."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,19 @@ def test_views_are_to_scale(page):
     assert per_metre(page) == pytest.approx([1, 1, 1], rel=1e-6)
     page.choose(**{"from": "0,-1,0"})
     page.wait("return document.getElementById('plot')._fullLayout.scene.camera.projection.type === 'orthographic'")
+
+
+def test_parts_are_listed_and_walls_left_out(page):
+    page.run("document.getElementById('parts').open = true")
+    rows = page.text("parts").splitlines()
+    bottom = next(row for row in rows if row.startswith("bottom"))
+    assert re.match(r"bottom height -[89] m, reflectance 0\.1", bottom)
+    count = "return document.getElementById('plot')._fullData.filter((one) => one.visible === true).length"
+    before = page.run(count)
+    page.run("document.querySelector('#filled input').click()")
+    page.wait(f"{count} < {before}")
+    # Those of the beam and of each pixel, or of an imager's view.
+    assert before - page.run(count) in (3, 6)
 
 
 def test_numbers_appear_where_one_points(page):

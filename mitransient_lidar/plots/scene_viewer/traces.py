@@ -42,7 +42,8 @@ def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:
     """Yield the traces of a scene."""
     brightest = max([0.5, *(np.nanmax(one.reflectance, initial=0.0) for one in geometry.reliefs)])
     for relief in geometry.reliefs:
-        yield _relief(relief, float(brightest))
+        if np.isfinite(relief.z).any():
+            yield _relief(relief, float(brightest))
     for solid in geometry.solids:
         yield _solid(solid)
     for row in _drawn_layers(geometry):
@@ -148,6 +149,15 @@ def _mesh(points: FloatArray, faces: npt.NDArray[np.integer], text: str, **style
     return {"type": "mesh3d", **_columns(points), **corners, **about, **style}
 
 
+def _span(values: FloatArray) -> str:
+    """Return the range of values as text."""
+    known = values[np.isfinite(values)]
+    ends = (float(known.min()), float(known.max())) if known.size else ()
+    # Adding 0 turns -0 into 0; equal ends are one.
+    texts = dict.fromkeys(f"{round(end, 3) + 0.0:.4g}" for end in ends)
+    return " to ".join(texts) or "unknown"
+
+
 def _relief(relief: Relief, brightest: float) -> dict[str, Any]:
     name = escape(relief.name) or ("sea surface" if relief.is_sea else "bottom")
     trace = {
@@ -157,6 +167,7 @@ def _relief(relief: Relief, brightest: float) -> dict[str, Any]:
         "showscale": False,
         "showlegend": True,
         "contours": {axis: {"highlight": False} for axis in "xyz"},
+        "hovertext": f"{name}<br>height {_span(relief.z)} m",
     }
     place = "x %{x:.2f} m, y %{y:.2f} m<br>"
     if relief.is_sea:
@@ -169,16 +180,16 @@ def _relief(relief: Relief, brightest: float) -> dict[str, Any]:
         "cmin": 0.0,
         "cmax": brightest,
         "lighting": {"ambient": 0.75, "diffuse": 0.4, "specular": 0.0},
+        "hovertext": f"{trace['hovertext']}<br>reflectance {_span(relief.reflectance)}",
         "hovertemplate": f"{name}<br>{place}height %{{z:.2f}} m<br>reflectance %{{surfacecolor:.3g}}<extra></extra>",
     }
 
 
 def _solid(solid: Solid) -> dict[str, Any]:
-    low, high = solid.points[:, 2].min(), solid.points[:, 2].max()
     sides = " × ".join(f"{side:.3g}" for side in np.ptp(solid.points, axis=0))
-    reflectance = "unknown" if np.isnan(solid.reflectance) else f"{solid.reflectance:.3g}"
+    reflectance = _span(np.array([solid.reflectance]))
     name = escape(solid.name) or "target"
-    text = f"{name}<br>height {low:.2f} to {high:.2f} m<br>{sides} m<br>reflectance {reflectance}"
+    text = f"{name}<br>height {_span(solid.points[:, 2])} m<br>{sides} m<br>reflectance {reflectance}"
     if not len(solid.faces):
         return _points(solid.points, mode="markers", marker={"size": 2, "color": _TARGET}, name=name, hovertext=text)
     return _mesh(solid.points, solid.faces, text, name=name, color=_TARGET, lighting={"ambient": 0.8})
@@ -199,7 +210,7 @@ def _bundle(bundle: Bundle, colour: str) -> Iterator[dict[str, Any]]:
     widths = " × ".join(f"{500 * angle:.3g}" for angle in bundle.angles)
     text = (
         f"{name}<br>half angles {widths} mrad<br>on the sea {sizes[0]} m<br>"
-        f"where it ends {sizes[1]} m, at a height of {end.min():.2f} to {end.max():.2f} m"
+        f"where it ends {sizes[1]} m, at a height of {_span(end)} m"
     )
     gap, lines = np.full((1, 3), np.nan), []
     for loop in bundle.loops:
@@ -213,7 +224,7 @@ def _bundle(bundle: Bundle, colour: str) -> Iterator[dict[str, Any]]:
     yield _points(np.concatenate(lines), mode="lines", line=line, hovertext=text, hoverinfo="text", **group)
     if bundle.kind != "lines":
         points, faces = _walls(bundle)
-        yield _mesh(points, faces, text, color=colour, opacity=0.13, **group | {"showlegend": False})
+        yield _mesh(points, faces, text, color=colour, opacity=0.13, meta="wall", **group | {"showlegend": False})
 
 
 def _walls(bundle: Bundle) -> tuple[FloatArray, IntArray]:

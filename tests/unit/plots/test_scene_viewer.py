@@ -64,13 +64,13 @@ def test_a_page_holds_the_scene_with_names_and_numbers(geometry):
     assert array(mud["z"]) == pytest.approx(geometry.reliefs[1].z, nan_ok=True)
     assert array(mud["surfacecolor"]) == pytest.approx(np.full((5, 5), 0.3))
     assert "surfacecolor" not in sea
-    assert "reflectance unknown" in named["leaves"]["hovertext"]
+    assert mud["hovertext"] == "&lt;b&gt;mud<br>height -4 m<br>reflectance 0.3"
+    assert named["leaves"]["hovertext"] == "leaves<br>height 0 to 1 m<br>1 × 1 × 1 m<br>reflectance unknown"
     pixel = [one for one in data if one["name"] == "pixel only"]
     assert [one["type"] for one in pixel] == ["scatter3d", "mesh3d"]
     # The footprint along x is 2 m on the sea and 3 m at the bottom, across it twice as much.
     assert pixel[0]["hovertext"] == (
-        "pixel only<br>half angles 10 × 20 mrad<br>on the sea 2 × 4 m<br>where it ends 3 × 6 m, at a height of -4.00 "
-        "to -4.00 m"
+        "pixel only<br>half angles 10 × 20 mrad<br>on the sea 2 × 4 m<br>where it ends 3 × 6 m, at a height of -4 m"
     )
     corners = np.stack([array(pixel[1][axis]) for axis in "xyz"], axis=1)
     triangles = corners[np.stack([array(pixel[1][axis]) for axis in "ijk"], axis=1)]
