@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.physics.water.profiles import read_profile
     from mitransient_lidar.physics.water.water_types import water_of
     from mitransient_lidar.plots.publication.figures import figures
-    from mitransient_lidar.plots.viewer import view
+    from mitransient_lidar.plots.viewer import view, view_points, view_scene
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shots.frames import render_frames
@@ -121,6 +121,8 @@ _FUNCTIONS = {
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
     "tpu": ("studies.tpu", "tpu"),
     "view": ("plots.viewer", "view"),
+    "view_points": ("plots.viewer", "view_points"),
+    "view_scene": ("plots.viewer", "view_scene"),
     "water_of": ("physics.water.water_types", "water_of"),
     "waveform_chunks": ("results.waveform_files", "waveform_chunks"),
 }
@@ -160,6 +162,8 @@ __all__ = [
     "scene_parameters",
     "tpu",
     "view",
+    "view_points",
+    "view_scene",
     "water_of",
     "waveform_chunks",
 ]

@@ -19,6 +19,8 @@ from mitransient_lidar.core.files import check_encodable, together
 if TYPE_CHECKING:
     import xarray as xr
 
+    from mitransient_lidar.plots.viewer import View
+
 
 def check_targets(folder: Path, targets: list[Path], source: str = "", option: str = "-o") -> None:
     """Check that files can be written into a folder, without creating it, and that none must be kept.
@@ -91,6 +93,14 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced():
         save(dataset, path)
+
+
+def write_page(page: View, path: Path | None) -> Path:
+    """Write a page, by default to a temporary file, print its path and return it."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with announced():
+        return page.save(path)
 
 
 #: Largest size of a page [MB].

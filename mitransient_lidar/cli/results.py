@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix
+from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix, write_page
 from mitransient_lidar.cli.generator import Command
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import Channel, DrawingOnly, Lidar, Quiet, Waveforms, waveform_selection
+from mitransient_lidar.cli.options import (
+    Channel,
+    Define,
+    DrawingOnly,
+    Lidar,
+    Quiet,
+    Waveforms,
+    parameters,
+    waveform_selection,
+)
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 
@@ -26,8 +35,8 @@ def _view(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="EXR or NetCDF file of a result, a gate stack or recorded signals; or waveforms in LAS, LAZ or "
-            "PulseWaves (.pls).",
+            help="EXR or NetCDF file of a result, a gate stack or recorded signals; XML file or name of a scene; LAS "
+            "file, folder or store of a flight; waveforms in PulseWaves (.pls) or, with --waveforms, LAS or LAZ.",
         ),
     ],
     output: Annotated[
@@ -52,13 +61,21 @@ def _view(
     waveforms: Waveforms = None,
     channel: Channel = None,
     lidar: Lidar = None,
+    define: Define = None,
     quiet: Quiet = False,
 ) -> None:
-    """Show a result in the browser, or draw it."""
+    """Show a result, a scene or the points of a flight in the browser, or draw a result."""
     is_page = output is None or output.suffix.lower() == ".html"
     selection = waveform_selection(file, waveforms, channel, lidar)
-    if not (plot or log or linear or components or layout) and is_page:
-        _show(file, output, shot, browser, quiet, selection)
+    others = {"--plot": plot, "--log": log, "--linear": linear, "--components": components, "--layout": layout}
+    is_points = file.is_dir() or (file.suffix.lower() in (".las", ".laz") and not selection)
+    if is_scene := names_scene(file) or is_points:
+        for option in [name for name, given in {**others, "--shot": shot is not None}.items() if given]:
+            raise UserError(f"{option} needs a result: {file} is a scene or points.")
+    if define and not names_scene(file):
+        raise UserError(f"-D needs a scene: {file} is none.")
+    if is_scene or (not any(others.values()) and is_page):
+        _show(file, output, shot, browser, define, quiet, selection)
         return
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
@@ -94,23 +111,38 @@ def _view(
         typer.echo("\n".join(axis_points(dataset)))
 
 
+def names_scene(file: Path) -> bool:
+    """Return whether an argument is the name of a shipped scene, or the path of an XML file."""
+    from mitransient_lidar.loading.catalogue import scene_names
+
+    return file.suffix.lower() == ".xml" or str(file) in scene_names()
+
+
 def _show(
-    file: Path, output: Path | None, shot: int | None, browser: bool, quiet: bool, selection: dict[str, Any]
+    file: Path,
+    output: Path | None,
+    shot: int | None,
+    browser: bool,
+    define: list[str] | None,
+    quiet: bool,
+    selection: dict[str, Any],
 ) -> None:
-    """Write the page of a result, and open it in the browser."""
+    """Write the page of a result, a scene or points, and open it in the browser."""
     if output is not None:
         check_suffix("--output", output, ".html")
     from mitransient_lidar import results
-    from mitransient_lidar.plots.viewer import view as page_of
+    from mitransient_lidar.plots import viewer
 
     with reporting(quiet):
-        source = results.open(file, **selection) if selection else file
-        dataset = results.dataset_of("FILE", source, "waveforms", "signals", "gates", "frames")
-        page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
-    if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    with announced():
-        path = page.save(output)
+        if names_scene(file):
+            page = viewer.view_scene(str(file), parameters(define))
+        elif file.is_dir() or (file.suffix.lower() in (".las", ".laz") and not selection):
+            page = viewer.view_points(file)
+        else:
+            source = results.open(file, **selection) if selection else file
+            dataset = results.dataset_of("FILE", source, "waveforms", "signals", "gates", "frames")
+            page = viewer.view(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
+    path = write_page(page, output)
     if browser and not webbrowser.open(path.resolve().as_uri()):
         typer.echo("no browser was found: open the page in one.", err=True)
 
@@ -169,13 +201,15 @@ COMMANDS = {
         "Analyse results",
         "",
         _view,
-        """Show a result in the browser, or draw its waveforms or layout.
+        """Show a result, a scene or the points of a flight in the browser, or draw a result's waveforms or layout.
 
-        The page is a map of the pixels at each time, and the waveforms of those that are clicked; it needs no network.
-        Gates are shown where FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a
-        drawing as --output, a PNG, PDF or SVG file is written instead, by default in the folder of FILE. Both print the
-        path. With --layout, the command also prints where the axes of receiver and laser, refracted by a level sea,
-        meet the sea level, targets' depths and the bottom: x, y, z.
+        The page of a scene has sea, bottom, targets, beam and pixels in three dimensions, to scale; that of a flight or
+        LAS file its points by class, with errors of their heights. The page of a result is a map of the pixels at each
+        time, and the waveforms of those that are clicked. Pages need no network. Gates are shown where FILE has them,
+        of frames of a camera their mean. With --plot, --components, --layout or a drawing as --output, a PNG, PDF or
+        SVG file is written instead, by default in FILE's folder. Both print the path. With --layout, the command also
+        prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths and
+        the bottom: x, y, z.
         """,
     ),
     "compare": Command(

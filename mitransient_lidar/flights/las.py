@@ -19,7 +19,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing, together
+from mitransient_lidar.core.files import open_file, replacing, together
 from mitransient_lidar.core.validation import finite_array, integer, positive
 from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
 from mitransient_lidar.flights.poses.times import ADJUSTMENT_S
@@ -129,10 +129,29 @@ def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chu
     return count
 
 
-def _checked(path: str | os.PathLike[str], *suffixes: str) -> Path:
+def read_las(path: Path) -> xr.Dataset:
+    """Return coordinates [m], class and stated vertical error [m], if known, of the points of a LAS or LAZ file.
+
+    Variables over ``point``: ``x``, ``y``, ``z``, ``kind``, and ``vertical_uncertainty``.
+    """
+    import laspy
+
+    _checked(path, ".las", ".laz", doing="read")
+    try:
+        with open_file(path) as file:
+            found = laspy.read(file)
+    except (laspy.LaspyException, RuntimeError, ValueError) as error:
+        raise UserError(f"{path} is no LAS file, or damaged: {error}") from error
+    data = {name: np.array(found[name], np.float64) for name in "xyz"} | {"kind": np.array(found["classification"])}
+    if "vertical_uncertainty" in found.point_format.dimension_names:
+        data["vertical_uncertainty"] = np.array(found["vertical_uncertainty"], np.float64)
+    return xr.Dataset({name: ("point", values) for name, values in data.items()})
+
+
+def _checked(path: str | os.PathLike[str], *suffixes: str, doing: str = "write") -> Path:
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise UserError(f"cannot write {path}: its suffix must be {' or '.join(suffixes)}")
+        raise UserError(f"cannot {doing} {path}: its suffix must be {' or '.join(suffixes)}")
     return path
 
 

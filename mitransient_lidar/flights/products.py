@@ -21,7 +21,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, write_points, write_waveforms
+from mitransient_lidar.flights.las import MOST_CHANNELS, MOST_RETURNS, read_las, write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.positions import ECHOES, IN_AIR, fit_surface, numbered_returns, positions
@@ -200,6 +200,27 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     points = points.assign(_quality(points, echoes)).assign(_of_light(flown, points, echoes))
     points.attrs["merged_below_m"] = float(attributes["merged_below_m"])
     return label(points.assign(_truth(flown, plan, points)), "points")
+
+
+def read_points(path: Path) -> xr.Dataset:
+    """Return the points of a flight in a folder or store, or of a LAS or LAZ file.
+
+    Those of a store are as of `points_of`. Those of a file have ``x``, ``y``, ``z`` [m], ``kind`` and, if the file has
+    it, ``vertical_uncertainty`` [m].
+
+    Raises
+    ------
+    UserError
+        If nothing of these is there, or it has no points.
+    """
+    if path.is_dir():
+        flown = Flown.of(Store(path / "flight.zarr" if (path / "flight.zarr").is_dir() else path))
+        points = points_of(flown, flown.store.renderer().plan)
+    else:
+        points = read_las(path)
+    if not points.sizes["point"]:
+        raise UserError(f"{path} has no points")
+    return points
 
 
 def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:

@@ -14,13 +14,13 @@ from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.variables import PointClass
 
-#: Colour of the points of a class.
-_CLASSES = {
-    PointClass.GROUND: "#d8a038",
-    PointClass.UNCLASSIFIED: "#9467bd",
-    PointClass.SURFACE: "#1f77b4",
-    PointClass.BOTTOM: "#8c564b",
-    PointClass.OBJECT: "#d62728",
+#: Colour of the points of a class; colour-blind readers tell them apart (Okabe and Ito 2008).
+CLASS_COLOURS = {
+    PointClass.GROUND: "#e69f00",
+    PointClass.UNCLASSIFIED: "#cc79a7",
+    PointClass.SURFACE: "#56b4e9",
+    PointClass.BOTTOM: "#0072b2",
+    PointClass.OBJECT: "#d55e00",
     PointClass.NO_ECHO: "#999999",
 }
 
@@ -121,7 +121,7 @@ def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
     along = "x" if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else "y"
-    for kind, colour in _CLASSES.items():
+    for kind, colour in CLASS_COLOURS.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
             label = f"{kind.text} ({np.count_nonzero(chosen)})"

@@ -1,4 +1,4 @@
-"""Interactive view of a result: a page for a browser, and below the cell of a notebook."""
+"""Interactive views of results, scenes and points: pages for a browser, and below the cell of a notebook."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.files import checked_path, replacing
 from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.results.files import Given, dataset_of
@@ -21,7 +23,7 @@ _FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # of temporary pages
 
 
 class View:
-    """Page that shows a result, of `view`. A notebook shows it below the cell whose last value it is.
+    """Page of `view`, `view_scene` or `view_points`. A notebook shows it below the cell whose last value it is.
 
     Attributes
     ----------
@@ -100,3 +102,62 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
         waveforms = dataset_of("waveforms", waveforms, "waveforms")
     name = scene_name(result.attrs) or "result"
     return View(page_text(result, waveforms, limit_mb), name, height)
+
+
+def view_scene(
+    scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None, *, height: int = 640
+) -> View:
+    """Return a page that shows a scene in three dimensions to scale, which a notebook shows below the cell.
+
+    It shows the sea and the bottom as rays of the renderer meet them, targets, boundaries between layers of the water,
+    the beam, and the field of view of each pixel, all with their names and numbers.
+
+    Parameters
+    ----------
+    scene, params, instrument
+        As of `loading.scenes.open_scene`.
+    height : int
+        Height in a notebook [CSS pixels].
+
+    Raises
+    ------
+    UserError
+        As `open_scene`, and if the scene has no receiver.
+    """
+    from mitransient_lidar.loading.scenes import open_scene
+    from mitransient_lidar.plots.scene_viewer import traces
+    from mitransient_lidar.plots.scene_viewer.page import page_text
+    from mitransient_lidar.rendering.geometry.shapes import scene_geometry
+
+    geometry = scene_geometry(open_scene(scene, params, instrument))
+    about = traces.scene_views(geometry), traces.scene_notes(geometry)
+    return View(page_text(geometry.name, "scene", [*traces.scene_traces(geometry)], *about), geometry.name, height)
+
+
+def view_points(source: str | os.PathLike[str], *, height: int = 640) -> View:
+    """Return a page that shows the points of a flight in three dimensions, which a notebook shows below the cell.
+
+    Points have the colour of their class, and their heights with errors: against the truth in the store of a flight,
+    and as stated by the file.
+
+    Parameters
+    ----------
+    source : path
+        Folder or store (``flight.zarr``) of a flight, or a LAS or LAZ file of any program.
+    height : int
+        Height in a notebook [CSS pixels].
+
+    Raises
+    ------
+    UserError
+        If it is no such store or file, or has no points.
+    """
+    from mitransient_lidar.flights.products import read_points
+    from mitransient_lidar.plots.scene_viewer import traces
+    from mitransient_lidar.plots.scene_viewer.page import page_text
+
+    path = checked_path("source", source)
+    points = read_points(path)
+    name = path.parent.name if path.name == "flight.zarr" else path.stem
+    about = traces.point_views(points), traces.point_notes(points)
+    return View(page_text(name, "points", [*traces.point_traces(points)], *about), name, height)

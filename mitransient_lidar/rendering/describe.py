@@ -17,7 +17,7 @@ from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.transport.opaque import aligned_ray
 from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 
@@ -34,7 +34,7 @@ _TOLERANCE = 5e-4
 _MOST_SAMPLES = 1000
 
 #: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
-_SAMPLED, _TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
+_SAMPLED, SAMPLED_TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64
 
 
 def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
@@ -155,7 +155,7 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
     """Return name, heights and outlines of a target."""
-    sea, points, at = scene.level_sea, _surface_points(scene, target), scene.frame_origin[:2]
+    sea, points, at = scene.level_sea, surface_points(scene, target), scene.frame_origin[:2]
     seen = sea.crossing(scene.receiver.pose.origin, points)
     found = {
         "id": target.id(),
@@ -171,19 +171,19 @@ def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | N
     return found
 
 
-def _surface_points(scene: LidarScene, solid: mi.Shape) -> FloatArray:
+def surface_points(scene: WaterScene, solid: mi.Shape) -> FloatArray:
     """Return the corners of a mesh, or points all over another shape [m], shape (n, 3)."""
     known = mi.traverse(solid)
     if "vertex_positions" in known:
         return np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     if solid.class_name() not in _SAMPLED:
         box = solid.bbox()
-        origins, directions = box_rays(np.array(box.min), np.array(box.max), _TICKS)
+        origins, directions = box_rays(np.array(box.min), np.array(box.max), SAMPLED_TICKS)
         rays = aligned_ray(origins, directions, np.full(len(origins), np.inf))
         hit = scene_of_shapes([solid], scene.groups).ray_intersect(rays)
         points: FloatArray = np.array(hit.p, dtype=np.float64).T[np.array(hit.is_valid())]
         return points
-    ticks = np.linspace(0, 1, _TICKS + 1)
+    ticks = np.linspace(0, 1, SAMPLED_TICKS + 1)
     u, v = (mi.Float(g.ravel()) for g in np.meshgrid(ticks, ticks))
     return np.array(solid.sample_position(0.0, mi.Point2f(u, v)).p, dtype=np.float64).T
 

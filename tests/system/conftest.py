@@ -14,7 +14,9 @@ def browser():
 
     options = webdriver.ChromeOptions()
     options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
+    # Chromium's own renderer draws pages in three dimensions without a graphics processor.
+    drawing = ("--disable-gpu", "--enable-unsafe-swiftshader")
+    for argument in ("--headless=new", "--no-sandbox", *drawing, "--window-size=1280,800"):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     # A given path of the driver avoids a search and a download.

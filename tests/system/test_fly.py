@@ -16,10 +16,11 @@ from mitransient_lidar.campaigns.store import DONE, FAILED, Store
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.fly import STORE, fly
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.products import Flown, describe_points
+from mitransient_lidar.flights.products import Flown, describe_points, read_points
 from mitransient_lidar.flights.renderer import FlightRenderer
 from mitransient_lidar.loading.catalogue import folder_of_scenes
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.plots.scene_viewer.traces import point_traces
 from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
 from mitransient_lidar.results.variables import PointClass
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -94,6 +95,12 @@ def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed, tur
     away, across = np.sum(beside * ahead, axis=1), beside[:, 1] * ahead[:, 0] - beside[:, 0] * ahead[:, 1]
     for error in (*beside.T, away, across):
         assert_within(error, horizontal, bottom, points)
+    # The store alone gives the same points and their errors, as its page shows them.
+    again = read_points(tmp_path)
+    for name in ("x", "z", "kind", "true_z"):
+        assert again[name].values.tolist() == points[name].values.tolist()
+    drawn = next(one for one in point_traces(again) if one["name"].startswith("bottom"))
+    assert drawn["customdata"][:, 1] == pytest.approx(100 * above[kind == 40], rel=1e-3)
     # One gain in all batches, and in the attributes.
     assert np.unique(flown.values("gain")).tolist() == [flown.attributes["gain"]]
     assert len(np.unique(np.floor(flown.values("time_s") / 0.05 + 1e-6))) >= 2

@@ -90,12 +90,16 @@ def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_directio
     """
     east, north = np.meshgrid(x, y)
     vertices = np.stack([east, north, heights], axis=-1).reshape(-1, 3)
-    columns = len(x)
-    rows = columns * np.arange(len(y) - 1, dtype=np.uint32)
-    corner = (rows[:, None] + np.arange(columns - 1, dtype=np.uint32)).ravel()
+    cos, sin = np.cos(wind_direction), np.sin(wind_direction)
+    texcoords = np.stack([cos * east + sin * north, cos * north - sin * east], axis=-1).reshape(-1, 2)
+    return SeaMesh(vertices, grid_faces(len(y), len(x)), texcoords)
+
+
+def grid_faces(rows: int, columns: int) -> npt.NDArray[np.uint32]:
+    """Return the triangles of a grid of points in rows: indices of their corners, shape (faces, 3)."""
+    starts = columns * np.arange(rows - 1, dtype=np.uint32)
+    corner = (starts[:, None] + np.arange(columns - 1, dtype=np.uint32)).ravel()
     faces = np.empty((len(corner), 2, 3), dtype=np.uint32)
     faces[:, 0] = np.stack([corner, corner + 1, corner + columns], axis=-1)
     faces[:, 1] = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=-1)
-    cos, sin = np.cos(wind_direction), np.sin(wind_direction)
-    texcoords = np.stack([cos * east + sin * north, cos * north - sin * east], axis=-1).reshape(-1, 2)
-    return SeaMesh(vertices, faces.reshape(-1, 3), texcoords)
+    return faces.reshape(-1, 3)

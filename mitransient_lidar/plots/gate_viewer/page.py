@@ -38,7 +38,7 @@ _SCRIPTS = ("data", "image", "curves", "main")  # in the order in which they are
 _GATES = ("gate_energy", "gate_energy_stderr")
 _SIGHTS = ("surface_time", "depth_per_ns")  # coordinates of `geometry.LinesOfSight`
 _WAVEFORMS = ("waveform", "waveform_stderr")
-_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 _STRIP_ASPECT = 4.0  # at most, of pixels drawn side by side
 
 
@@ -108,7 +108,7 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     metadata = _metadata(gated, record, gates, waveforms) | {"notes": notes}
     metadata |= _words(record if is_record else None, gated) | {"time_label": drawing.time_label(stack)}
     filled = {
-        "policy": _POLICY,
+        "policy": POLICY,
         "title": html.escape(metadata["title"]),
         "kind": "waveforms" if is_record else "gate stack",
         "data": "\n".join(_data_elements(metadata, gates, waveforms)),

@@ -1,0 +1,1 @@
+"""Shapes, beam and pixels of a loaded scene as arrays in its three dimensions."""
