@@ -68,7 +68,9 @@ def _view(
     is_page = output is None or output.suffix.lower() == ".html"
     selection = waveform_selection(file, waveforms, channel, lidar)
     others = {"--plot": plot, "--log": log, "--linear": linear, "--components": components, "--layout": layout}
-    is_points = file.is_dir() or (file.suffix.lower() in (".las", ".laz") and not selection)
+    # A LAS file is one of points unless its waveforms are asked for.
+    if is_points := _is_points(file) and not (waveforms or channel or lidar):
+        selection = {}
     if is_scene := names_scene(file) or is_points:
         for option in [name for name, given in {**others, "--shot": shot is not None}.items() if given]:
             raise UserError(f"{option} needs a result: {file} is a scene or points.")
@@ -118,6 +120,11 @@ def names_scene(file: Path) -> bool:
     return file.suffix.lower() == ".xml" or str(file) in scene_names()
 
 
+def _is_points(file: Path) -> bool:
+    """Return whether a path is that of a flight, or of points."""
+    return file.is_dir() or file.suffix.lower() in (".las", ".laz")
+
+
 def _show(
     file: Path,
     output: Path | None,
@@ -136,7 +143,7 @@ def _show(
     with reporting(quiet):
         if names_scene(file):
             page = viewer.view_scene(str(file), parameters(define))
-        elif file.is_dir() or (file.suffix.lower() in (".las", ".laz") and not selection):
+        elif _is_points(file) and not selection:
             page = viewer.view_points(file)
         else:
             source = results.open(file, **selection) if selection else file
