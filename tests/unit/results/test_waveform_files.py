@@ -362,9 +362,9 @@ def test_commands_take_files(tmp_path):
     ):
         assert_refused(run("echoes", tmp_path / "sea.las", *options), message)
     (tmp_path / "sea.wdp").unlink()
-    for command in ("echoes", "view", "fit"):
-        free = ("--free", "attenuation", "--scene", "table1") if command == "fit" else ()
-        assert_refused(run(command, tmp_path / "sea.las", *free), "sea.las has its waveforms in sea.wdp")
+    free = ("--free", "attenuation", "--scene", "table1")
+    for command, *options in (("echoes",), ("view", "--channel", "0"), ("fit", *free)):
+        assert_refused(run(command, tmp_path / "sea.las", *options), "sea.las has its waveforms in sea.wdp")
     assert_refused(run("view", tmp_path / "sea.nc", "--channel", 1), "--channel is for LAS, LAZ and PulseWaves files")
 
 
