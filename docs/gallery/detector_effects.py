@@ -110,9 +110,8 @@ plt.show()
 
 # %%
 # **What to see.** The signal is clipped at 1 V for 53 ns. A tail changes the depth by millimetres and makes no false
-# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns, where they are taken for a bottom, and
-# hide the bottom that is there: behind ten times the gain in most records. Through a coupling capacitor the baseline
-# falls by 4 mV, or 42 mV behind ten times the gain, which moves the depth by 2 cm, makes the column seem to decay
-# faster, and gives the most false bottoms. An amplifier that is blind for 100 ns misses the bottom where the surface
-# overloads it. Energy changes the height of the echo and not its depth; trigger and clock add about 1 cm to depths
-# against the mean sea level.
+# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns: this light counts as a bottom in half of
+# the records without one, and reduces the depth by 3 to 4 cm. Through a coupling capacitor the baseline falls by 4 mV, or
+# 42 mV behind ten times the gain. This shifts the depth by 2 cm and makes the column seem to decay faster. An amplifier
+# that is blind for 100 ns misses the bottom where the surface overloads it. Energy changes the height of the echo and not
+# its depth; trigger and clock add about 1 cm to depths against the mean sea level.

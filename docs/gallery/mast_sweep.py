@@ -60,4 +60,4 @@ plt.show()
 # %%
 # **What to see.** The distance through the air, left, grows as the angle falls: 319 m from 30 m at 5.4 degrees. There
 # the echo is 67 000 times weaker than from 5 m at 30 degrees: less light enters the water, and beam and view are wider
-# than the plate. It still has 11 times as much light as the water about it, and 24 to 150 times elsewhere.
+# than the plate. It still has 11 times as much light as the water about it, and 26 to 150 times elsewhere.
