@@ -72,6 +72,12 @@ def test_files_that_commands_read_are_shipped_or_written(page: Path) -> None:
         made |= files
 
 
+def test_the_guides_list_the_example_files() -> None:
+    section = (ROOT / "docs" / "guide" / "index.md").read_text("utf-8").partition("## Files of the guides")[2]
+    names = set(re.findall(r"`([\w]+\.\w+)`", section))
+    assert names == set(catalogue.example_files())
+
+
 def test_example_files_are_those_of_the_text() -> None:
     for page, names in {
         "campaigns": ["bottoms.toml"],
