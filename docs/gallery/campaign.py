@@ -1,8 +1,8 @@
 """A campaign of labelled waveforms
 ================================
 
-A campaign renders a scene with many values of its parameters into one store, from which a classifier is trained or a
-method is tested. This one has 8 runs; the same lines make a hundred thousand, on a laptop or a cluster.
+A campaign renders a scene with many values of its parameters into one store, which trains a classifier or
+tests a method. This one has 8 runs; the same lines make a hundred thousand, on a laptop or a cluster.
 """
 
 import tempfile
@@ -14,8 +14,8 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# Parameters that vary are ranges, lists or expressions of others; ``fixed`` has the others. Each run is recorded by a
-# receiver, in whose noisy signal the echoes are sought.
+# Parameters that vary are ranges, lists or expressions of others; ``fixed`` has the others. A receiver records
+# each run, and the echoes are sought in its noisy signal.
 
 CAMPAIGN = {
     "scene": "table1",
@@ -59,5 +59,5 @@ plt.show()
 
 # %%
 # **What to see.** Left, four runs of the campaign: deep bottoms in turbid water are weak. Right, what the shipped
-# detector makes of all records: most depths are some centimetres to a decimetre too deep, as scattered light arrives
-# late. Bars are the errors that it states, one standard deviation of noise and method.
+# detector finds in all records: most depths are some centimetres to a decimetre too deep, as scattered light arrives
+# late. Bars are the stated errors, one standard deviation of noise and method.

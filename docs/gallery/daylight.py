@@ -1,8 +1,8 @@
 """The sea by daylight
 ===================
 
-Sun and sky shine through the same sea, into the same receiver. ``render_passive`` renders their radiance, and with the
-width of a filter the power that the lidar's detector has as background.
+Sun and sky shine through the same sea, into the same receiver. ``render_passive`` renders their radiance. With the
+width of a filter it also gives the background power on the lidar's detector.
 """
 
 import matplotlib.pyplot as plt

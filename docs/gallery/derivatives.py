@@ -1,8 +1,8 @@
-"""What a waveform says of water and bottom
-========================================
+"""Sensitivity of a waveform to water and bottom
+=============================================
 
-A render can differentiate every bin by parameters of the scene, from the same paths. Where the derivatives differ in
-shape, a record tells the parameters apart.
+A render can differentiate every bin with respect to scene parameters, from the same paths. If the derivatives differ in
+shape, a record can determine the parameters separately.
 """
 
 import matplotlib.pyplot as plt
@@ -37,7 +37,7 @@ plt.show()
 
 # %%
 # A check in closed form: light that returns from the bottom has travelled at least twice the slant path in the water,
-# so that 1 % more of c takes about 2 c d / cos(theta) percent of it, with theta the angle in the water.
+# so that 1 % more c removes about 2 c d / cos(theta) percent of it, with theta the angle in the water.
 
 cosine = np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)
 peak = power.sel(time=slice(1480, None)).idxmax("time")
@@ -46,7 +46,7 @@ print(f"1 % more attenuation at the bottom: {0.3 * float(at_peak.sel(parameter='
 print(f"by the slant path alone: {-2 * 0.3 * 8 / cosine:+.2f} %")
 
 # %%
-# **What to see.** Attenuation takes more light the later it comes. Scattering at fixed c replaces absorption: light
-# that is scattered forward stays in view. Backscattering raises the whole column and takes a little from the bottom,
-# whose echo alone depends on its reflectance. The four curves differ in shape: a record can tell the parameters
-# apart.
+# **What to see.** Attenuation removes more light the later it arrives. Scattering at fixed c replaces absorption:
+# forward-scattered light stays in view. Backscattering raises the whole column and weakens the bottom echo a little.
+# Only the bottom echo depends on the reflectance. The four curves differ in shape: a record can determine the
+# parameters separately.

@@ -1,8 +1,8 @@
-"""Which receiver knows most?
-==========================
+"""Comparing receivers by Cramér–Rao bounds
+========================================
 
-The Cramer-Rao bound is the smallest standard deviation that any unbiased estimate from one shot can have. It compares
-designs before anybody writes an estimator.
+The Cramér–Rao bound is the smallest standard deviation that any unbiased estimate from one shot can have. It compares
+designs without an estimator.
 """
 
 import matplotlib.pyplot as plt
@@ -27,7 +27,7 @@ found = mitransient_lidar.bounds(
 )
 
 # %%
-# Bounds relative to those of the single pixel.
+# Bounds relative to the bounds of the single pixel.
 
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
 place = np.arange(len(NAMES))
@@ -41,5 +41,5 @@ axis.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.1
 plt.show()
 
 # %%
-# **What to see.** The strips across the range know attenuation and scattering better than 2x2 pixels, and these
-# better than one pixel. For the reflectance of the bottom the layout matters little.
+# **What to see.** The strips across the range determine attenuation and scattering better than 2x2 pixels, and 2x2
+# pixels better than one pixel. For the bottom reflectance the layout matters little.

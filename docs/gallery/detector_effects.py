@@ -1,8 +1,8 @@
-"""What a photomultiplier adds to an echo
-======================================
+"""Detector effects on an echo
+===========================
 
-Delayed charge, a baseline that sinks, a blind amplifier and the jitter of a shot, each at a typical size: what becomes
-of a bottom at 15 m, and how often a bottom is found where none can be seen.
+A photomultiplier adds delayed charge, a sinking baseline, a blind amplifier and the jitter of a shot. This script shows
+their effect on a bottom at 15 m, each at a typical size, and how often they cause a false bottom.
 """
 
 import logging
@@ -18,7 +18,7 @@ from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 logging.disable(logging.WARNING)  # of saturated surface echoes, which are intended here
 
 # %%
-# One pixel over a bottom at 15 m, and over one at 40 m that is too faint to be seen.
+# One pixel over a bottom at 15 m, and over a bottom at 40 m that is too faint to be seen.
 
 options = {"layout": "1x1", "time_start_ns": 1370, "bin_count": 400}
 near, far = (
@@ -27,8 +27,9 @@ near, far = (
 )
 
 # %%
-# A tail of 1e-3 of the surface's peak with a decay time of 300 ns holds 1e-3 times 300 ns over the echo's duration (its
-# energy over its peak) of the charge. Ions arrive at the cathode 150 ns late, with 2 % of the charge.
+# A tail of 1e-3 of the surface's peak with a decay time of 300 ns contains this share of the charge: 1e-3 times 300 ns
+# divided by the echo's duration (its energy over its peak). Ions arrive at the cathode 150 ns late, with 2 % of the
+# charge.
 
 light = near.waveform.isel(pixel=0)
 duration = float(light.sum() / light.max())
@@ -110,9 +111,8 @@ plt.show()
 
 # %%
 # **What to see.** The signal is clipped at 1 V for 53 ns. A tail changes the depth by millimetres and makes no false
-# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns, where they are taken for a bottom, and
-# hide the bottom that is there: behind ten times the gain in most records. Through a coupling capacitor the baseline
-# falls by 4 mV, or 42 mV behind ten times the gain, which moves the depth by 2 cm, makes the column seem to decay
-# faster, and gives the most false bottoms. An amplifier that is blind for 100 ns misses the bottom where the surface
-# overloads it. Energy changes the height of the echo and not its depth; trigger and clock add about 1 cm to depths
-# against the mean sea level.
+# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns: this light counts as a bottom in half
+# of the records without one, and reduces the depth by 3 to 4 cm. Through a coupling capacitor the baseline falls by 4
+# mV, or 42 mV behind ten times the gain. This shifts the depth by 2 cm and makes the column seem to decay faster. An
+# amplifier that is blind for 100 ns misses the bottom where the surface overloads it. Energy changes the height of the
+# echo and not its depth; trigger and clock add about 1 cm to depths against the mean sea level.

@@ -2,7 +2,7 @@
 ===============================================
 
 A narrow receiver loses light that is scattered even a little: its column decays almost with the beam attenuation c. A
-wide one keeps that light in view, and its column decays with about the absorption.
+wide receiver keeps this light in view, and its column decays with about the absorption.
 """
 
 import matplotlib.pyplot as plt

@@ -1,8 +1,8 @@
 """Fit the water and the bottom to a waveform
 ==========================================
 
-``fit`` varies parameters of a scene until its waveform is the measured one: weighted least squares with the derivatives
-of the renders, and errors of the parameters.
+``fit`` varies parameters of a scene until its waveform matches the measured waveform, by weighted least squares with
+the derivatives of the renders. It also states the errors of the parameters.
 """
 
 import matplotlib.pyplot as plt
@@ -18,7 +18,7 @@ shot = mitransient_lidar.render("table1", params={**SCENE, **TRUTH}, passes=8, s
 data = mitransient_lidar.record(shot, "apd", gain="auto", seed=1)
 
 # %%
-# The fit begins at the values of the scene, 0.3 1/m and 0.1. It stays at few passes here, and states what that adds to
+# The fit begins at the values of the scene, 0.3 1/m and 0.1. It uses few passes here, and states what they add to
 # the errors.
 
 fitted = mitransient_lidar.fit(
@@ -46,6 +46,6 @@ lower.set(xlabel="time (ns)", ylabel="residual / error")
 plt.show()
 
 # %%
-# **What to see.** The fit goes through the record from the surface to the bottom, where the residuals are those of
+# **What to see.** The fit goes through the record from the surface to the bottom, where the residuals are
 # noise, most within two standard deviations. Before and after, the noise is less than a step of the digitiser: the
 # record is constant, and so is its difference from the fit.

@@ -65,4 +65,4 @@ plt.show()
 # %%
 # **What to see.** Left, the points on the sea, and those on the bottom, which lie outside them, as the beams go on
 # outwards in the water. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3 degrees
-# towards the east. About a fifth of the pulses find no bottom.
+# towards the east. About one pulse in twelve finds no bottom.

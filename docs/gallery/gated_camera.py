@@ -20,8 +20,8 @@ frames = mitransient_lidar.record(stack, "icmos", shots=64, seed=1)
 print(f"{frames.sizes['frame']} frames, {frames.signal.dtype}; largest SNR of a pixel: {float(frames.snr.max()):.2f}")
 
 # %%
-# The gate with the mine's echo (above) and that with its shadow on the sand (below): photons of the light without
-# noise, one frame, and the mean of all frames.
+# The gate with the mine's echo (above) and the gate with its shadow on the sand (below): photons of the light
+# without noise, one frame, and the mean of all frames.
 
 photon = 6.626e-34 * 2.998e8 / 532e-9  # J
 half = 0.5 * float(stack.attrs["scene.field_of_view_mrad"])
@@ -67,4 +67,4 @@ plt.show()
 # %%
 # **What to see.** A pixel has less than one photoelectron, so that a frame alone is mostly dark; the mean of 64 frames
 # shows the mine and, deeper, its shadow on the sand. The weights are negative there: the filter counts missing light.
-# So all gates together detect more than the best one alone.
+# Thus all gates together detect more than the best single gate.

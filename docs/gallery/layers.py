@@ -52,4 +52,4 @@ plt.show()
 # %%
 # **What to see.** Above and below the boundary the power decays evenly, below more slowly. At the boundary it falls
 # to half, as the lower water scatters less, and this is a peak of the decay: first in the near pixels (blue, black),
-# four nanoseconds later in the far ones. The peak of the single pixel lies between, and is lower and wider.
+# four nanoseconds later in the far pixels. The peak of the single pixel lies between, and is lower and wider.

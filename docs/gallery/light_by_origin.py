@@ -34,5 +34,5 @@ print(f"sum of the parts over all: {float(energy.sum()) / total:.6f}")
 
 # %%
 # **What to see.** The surface echo is lower than the light of the water that begins at the same time. The echo of the
-# target stands on the water column; behind it, rare paths make a noisy tail. The light of the water ends at the bottom,
-# and that of the bottom comes until long after its echo, scattered on its way.
+# target stands on the water column; behind it, rare paths make a noisy tail. The light of the water ends at the bottom.
+# The light of the bottom arrives until long after its echo, scattered on its way.

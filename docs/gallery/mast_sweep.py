@@ -1,5 +1,5 @@
-"""A lidar on masts of other heights and angles
-============================================
+"""Mast lidars of several heights and angles
+=========================================
 
 Figure 3 of the publication sketches a mast lidar at several heights and angles of incidence on the sea. Here each of
 these geometries is rendered over the target of its figure 4, a square metre 1 m below the surface.
@@ -16,7 +16,7 @@ INDEX, DEPTH = 1.34, 1.0
 # %%
 # The plate is turned to face the refracted light, and stands where the axis meets it below a level sea. Its echo is
 # compared with the water's light within 5 ns of it. The sea has its slopes, but no waves that hide parts of it: with
-# them a render holds for one sea only (``spectrum`` = ``elfouhaily``).
+# waves a render is valid for one sea only (``spectrum`` = ``elfouhaily``).
 
 
 def render(height, grazing_deg):
@@ -60,4 +60,4 @@ plt.show()
 # %%
 # **What to see.** The distance through the air, left, grows as the angle falls: 319 m from 30 m at 5.4 degrees. There
 # the echo is 67 000 times weaker than from 5 m at 30 degrees: less light enters the water, and beam and view are wider
-# than the plate. It still has 11 times as much light as the water about it, and 24 to 150 times elsewhere.
+# than the plate. It still has 11 times as much light as the water about it, and 26 to 150 times elsewhere.

@@ -53,8 +53,8 @@ with tempfile.TemporaryDirectory() as folder:
     }
 
 # %%
-# Integrals over the sphere, by the trapezoidal rule in fine steps: that of the table, by which it is divided, and the
-# share of the backward hemisphere.
+# Integrals over the sphere, by the trapezoidal rule in fine steps: the integral of the table, which normalises it, and
+# the share of the backward hemisphere.
 
 theta = np.radians(np.geomspace(1e-3, 180, 20001))
 sine = 2 * np.pi * np.sin(theta) * np.exp(np.interp(np.log(theta), np.log(np.radians(angle)), np.log(value)))
@@ -75,6 +75,6 @@ right.legend(frameon=False, fontsize="small")
 plt.show()
 
 # %%
-# **What to see.** Left the table, over four decades. Right, the column with it has only 0.6 of the light of that with
-# the Fournier-Forand function, though both have nearly the same bb/b: a lidar sees the function near 180 degrees,
-# where the table is low. The bottom echoes, which take forward scattering alone, are nearly the same.
+# **What to see.** Left the table, over four decades. Right, the column with the table has only 0.6 times the light of
+# the column with the Fournier-Forand function. Both have nearly the same bb/b, but a lidar sees the function near 180
+# degrees, where the table is low. The bottom echoes, which involve forward scattering alone, are nearly the same.

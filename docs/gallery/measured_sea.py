@@ -40,7 +40,7 @@ def scene(file, aim_x):
 
 
 # %%
-# Two shots: on the face towards the lidar, which looks towards +x, and on the one behind the crest.
+# Two shots: on the face towards the lidar, which looks towards +x, and on the face behind the crest.
 
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "sea.npz"
@@ -70,6 +70,6 @@ plt.show()
 
 # %%
 # **What to see.** From the face that is turned towards it (blue) the lidar receives a surface echo a thousand times
-# brighter than the water; from the one that is turned away (orange) none can be seen beside the water. Column and
+# brighter than the water. The face that is turned away (orange) has no visible surface echo. Column and
 # bottom are nearly the same, and the bottom echo comes half a nanosecond earlier through the face that is turned
 # away.

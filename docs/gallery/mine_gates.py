@@ -44,7 +44,7 @@ plt.show()
 print(f"shallowest echo {np.nanmin(depth):.2f} m, median {np.nanmedian(depth):.2f} m")
 
 # %%
-# **What to see.** Gates before the sphere show its top, then its disc in front of dark water. At 6.6 m there is
-# nothing but water. Deeper gates open on the plate (left), then on the sand, on which the sphere is a shadow. The
-# image of depths has the top of the sphere at 5.5 m, the plate just above the sand, and no depth (white) in some
+# **What to see.** Gates before the sphere show its top, then its disc in front of dark water. At 6.6 m only
+# water is visible. Deeper gates open on the plate (left), then on the sand, on which the sphere is a shadow. The
+# depth image shows the top of the sphere at 5.5 m, the plate just above the sand, and no depth (white) in some
 # pixels at the edge, which the beam hardly lights.

@@ -42,6 +42,6 @@ plt.show()
 
 # %%
 # **What to see.** The narrow beam has a surface echo, and a bottom echo that is half as high again and narrower: the
-# wide beam's footprint, seen at 20 degrees, stretches both. Deep in the water the columns agree, as the view holds
-# all of both beams. The bottom echo of the narrow beam is wider than its pulse of 2 ns, 0.2 m on this axis, since the
+# wide beam's footprint, seen at 20 degrees, stretches both. Deep in the water the columns agree, as the view contains
+# both beams. The bottom echo of the narrow beam is wider than its pulse of 2 ns, 0.2 m on this axis, since the
 # water has spread it.

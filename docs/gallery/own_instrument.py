@@ -2,7 +2,7 @@
 ========================================
 
 Laser and optics are parameters of a scene; detector, amplifier and digitiser are a TOML file. Both together are an
-instrument, as the `shipped ones <../guide/instruments.html>`_ are.
+instrument, like the `shipped instruments <../guide/instruments.html>`_.
 """
 
 import tempfile
@@ -33,7 +33,7 @@ shot = mitransient_lidar.render("table1", params={**instrument, **water}, passes
 print(f"standard error of a bin (median): {100 * shot.error_median:.1f} %")
 
 # %%
-# The receiver: a preset, and what differs from it. With ``gain = "auto"`` the amplifier has the largest gain up to 1
+# The receiver: a preset, and the differences from it. With ``gain = "auto"`` the amplifier has the largest gain up to 1
 # at which nothing saturates.
 
 RECEIVER = """

@@ -12,8 +12,8 @@ import mitransient_lidar
 from mitransient_lidar.plots.drawing import pixel_colours
 
 # %%
-# A layout is one parameter of the scene. The sea is that of a wind of 3 m/s and the same in all three renders, as are
-# the passes: eight with a sixteenth of the usual number of paths.
+# A layout is one parameter of the scene. All three renders have the same sea, with a wind of 3 m/s, and the same
+# passes: eight with a sixteenth of the usual number of paths.
 
 shots = {
     layout: mitransient_lidar.render("table1", params={"layout": layout}, passes=8, pass_share=1 / 16, seed=1)
@@ -33,7 +33,7 @@ axes[0].set_ylabel("power (µW)")
 plt.show()
 
 # %%
-# The pixels share one circle, so that their energies add up to that of the single pixel within the errors of the two
+# The pixels share one circle, so that their energies add up to the energy of the single pixel within the errors of both
 # renders. Errors of pixels are added, as the pixels of one render share their photons.
 
 single = shots["1x1"].impulse_response
@@ -46,6 +46,6 @@ for layout in ("2x2", "1x4"):
     print(f"    highest bins of the bottom echo (ns): {peak.values}")
 
 # %%
-# **What to see.** Near pixels (blue, black) receive surface and bottom before the far ones: their range is shorter. The
-# strips separate the echoes of the bottom further than the squares, and the outer strips, which are smaller, receive
-# less. The single pixel has the sum of all, with a longer rise of its bottom echo.
+# **What to see.** Near pixels (blue, black) receive surface and bottom before the far pixels: their range is shorter.
+# The strips separate the echoes of the bottom further than the squares, and the outer strips, which are smaller,
+# receive less. The single pixel has the sum of all, with a longer rise of its bottom echo.

@@ -1,8 +1,8 @@
 """Light by its number of scatterings
 ==================================
 
-Lidar equations often take each echo as scattered once. In turbid water most of the light has been scattered several
-times, by small angles and once by a large one.
+Many lidar equations assume that each echo is scattered once. In turbid water most of the light has been scattered
+several times: by small angles, and once by a large angle.
 """
 
 import matplotlib.pyplot as plt
@@ -18,7 +18,7 @@ found = mitransient_lidar.scattering_orders(
 )
 
 # %%
-# The last order holds all higher ones.
+# The last order contains all higher orders.
 
 waveform = found.waveform.isel(pixel=0).sum("reversals")
 total = waveform.sum("order")
@@ -41,5 +41,5 @@ for when, name in ((1429, "1 m"), (1458, "4 m"), (1477, "the bottom")):
 # %%
 # **What to see.** Light without scattering is the surface echo, and a trace of the bottom. Light scattered once is
 # the brightest part just below the surface and decays with c; each further order begins later and decays more slowly.
-# From 4 m on most light has been scattered six times or more, and so has four fifths of the bottom echo: the whole
-# decays far more slowly than c.
+# From 4 m on most light, and four fifths of the bottom echo, have been scattered six times or more. The sum decays far
+# more slowly than c.

@@ -56,7 +56,7 @@ right.legend(frameon=False, title="correction")
 plt.show()
 
 # %%
-# **What to see.** The retrieved slopes follow the true ones, which are averages over the beam's footprint. Depths
+# **What to see.** The retrieved slopes follow the true slopes, which are averages over the beam's footprint. Depths
 # through a level sea at its mean height (squares) scatter with the waves; corrected by the slope and the height of
 # the sea (circles) they scatter less, and lie some centimetres too deep, as scattered light arrives late. Bars are
 # stated standard errors.

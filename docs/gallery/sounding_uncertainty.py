@@ -11,7 +11,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# One wind and one water, and few places of the sea: a table for a survey takes more, as the guide of uncertainties has.
+# One wind and one water, and few places of the sea: a table for a survey needs more, as in the guide.
 
 found = mitransient_lidar.tpu(
     "riegl_vq840g",
@@ -43,6 +43,6 @@ axis.legend(frameon=False, loc="lower right")
 plt.show()
 
 # %%
-# **What to see.** Corrected depths stay below the strictest order of S-44, exclusive, at all three depths; measured
-# ones exceed it at 9 m, by their bias. At 3 and 6 m the error of the height of the sea, by default 5 cm (one standard
-# deviation, 9.8 cm at 95 %), is most of it, which no table corrects.
+# **What to see.** Corrected depths stay below the strictest order of S-44, exclusive, at all three depths; uncorrected
+# depths exceed it at 9 m, by their bias. At 3 and 6 m the height error of the sea dominates, by default 5 cm (one
+# standard deviation, 9.8 cm at 95 %). No table corrects it.

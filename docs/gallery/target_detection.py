@@ -1,8 +1,8 @@
 """Detection of a target with several pixels
 =========================================
 
-Pixels that look past a target receive only backscatter. To weight pixels by echo over backscatter detects better than
-to add them, which is what one large pixel does.
+Pixels that look past a target receive only backscatter. Weighting pixels by echo over backscatter detects better than
+adding them, which one large pixel does.
 """
 
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ from mitransient_lidar.plots.drawing import pixel_colours
 
 # %%
 # A square target of 1.5 m at 8 m, in the published scenes with 2x2 pixels and with four strips; with ``components`` the
-# light of the target is apart from that of water and bottom.
+# light of the target is separate from the light of water and bottom.
 
 options = {"components": True, "passes": 8, "pass_share": 1 / 4, "seed": 1}
 shots = {
@@ -48,6 +48,6 @@ plt.show()
 
 # %%
 # **What to see.** Solid lines are the target, dotted ones all other light; the gate of the echo is grey. Of 2x2
-# pixels the near ones (blue, black, one above the other) have nearly all of the echo. Of the strips the nearest
+# pixels the near pixels (blue, black, one above the other) have nearly all of the echo. Of the strips the nearest
 # (black) has less of the echo than blue, but the best contrast, as little water is in its view at that time. Far
 # pixels add backscatter and no echo to a sum.

@@ -36,8 +36,8 @@ axis.legend(frameon=False)
 plt.show()
 
 # %%
-# From left to right: the surface comes first; the near pixels (blue, black) receive it 4 ns before the far ones, as
-# their range is shorter. It is no spike: at this angle few facets reflect to the lidar, so that a weak surface echo
+# From left to right: the surface comes first; the near pixels (blue, black) receive it 4 ns before the far pixels, as
+# their range is shorter. It is no spike: at this angle few facets reflect to the lidar, and the weak surface echo
 # merges with the backscatter of the water behind it. The straight line is the water column, steeper with more
 # attenuation. At 8 m the bottom echo rises above it. Bands of one standard error are drawn, too thin to
 # see before the last nanoseconds.
@@ -89,8 +89,8 @@ columns = ["time_ns", "time_ns_stderr", "depth_m", "depth_m_stderr", "width_ns",
 print(first[columns].reset_coords(drop=True).to_dataframe().round(3).to_string())
 
 # %%
-# The flag 1 of the surfaces says that their echoes are weaker than three of their errors: at 3 m/s and 20 degrees most
-# facets reflect past the receiver. Their times are those at which the column begins.
+# The flag 1 of the surfaces means that their echoes are weaker than three of their errors: at 3 m/s and 20 degrees most
+# facets reflect past the receiver. Their times are the starts of the column.
 #
 # Are the stated errors correct? Compare them with the spread over the 200 shots.
 
@@ -118,7 +118,7 @@ plt.show()
 # same in every shot: it does not appear in the spread, and averaging shots does not remove it.
 #
 # The groups also differ from the dashed line by centimetres: the waves over each pixel refract the beam and are
-# higher or lower than the mean sea, which the depth axis does not know.
+# higher or lower than the mean sea, which the depth axis does not include.
 #
 # 4. Retrieve
 # -----------

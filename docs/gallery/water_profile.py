@@ -51,4 +51,4 @@ plt.show()
 # %%
 # **What to see.** The backscatter rises between 3 and 5 m, where the turbid water begins, and then falls more steeply
 # than above. The bottom echo at 8 m follows. The layers (grey) follow the profile. The pulse of 5 ns, and the
-# beam of 10 mrad at 20 degrees, make the rise of the waveform longer than that of the profile.
+# beam of 10 mrad at 20 degrees, make the rise of the waveform longer than the rise of the profile.

@@ -58,11 +58,13 @@ def _show(
 
 
 def _copy(
-    name: Name,
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Shipped scene, or file of a guide or flight, e.g. bottoms.toml.")
+    ],
     destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder, or path of the new file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Copy a scene to a self-contained file to edit, and print its path."""
+    """Copy a scene or an example file to edit, with the data that it names, and print its path."""
     from mitransient_lidar.loading import catalogue
 
     typer.echo(catalogue.copy_scene(name, destination, overwrite))
@@ -154,7 +156,7 @@ SCENES = {
         and numbers; it needs no network. view NAME opens it in the browser.
         """,
     ),
-    "copy": Command("Commands", "", _copy, "Copy a scene to a self-contained file to edit, and print its path."),
+    "copy": Command("Commands", "", _copy, "Copy a scene or an example file to edit."),
     "instruments": Command(
         "Commands",
         "",

@@ -71,6 +71,12 @@ def scene_parameters(name: str | os.PathLike[str], *, by_id: bool = False) -> di
     return values_of(read_document(scene_path(name)), by_id=by_id)
 
 
+def example_files() -> dict[str, Path]:
+    """Return the files of the guides and the shipped flights, by their names."""
+    folders = (folder_of_scenes() / "examples", folder_of_scenes() / "flights")
+    return {path.name: path for folder in folders for path in sorted(folder.glob("*.*"))}
+
+
 def copy_scene(
     name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".", overwrite: bool = False
 ) -> Path:
@@ -79,7 +85,7 @@ def copy_scene(
     Parameters
     ----------
     name : str or path
-        As in `scene_path`.
+        As in `scene_path`, or the name of a file in `example_files`.
     destination : path
         Folder, or path of the new file, which is returned.
     overwrite : bool
@@ -90,8 +96,8 @@ def copy_scene(
     UserError
         If there is no such scene, a file exists already, or one cannot be read or written. No file is written then.
     """
-    source = scene_path(name)
-    text = read_document(source).text
+    source = example_files().get(str(name)) or scene_path(name)
+    text = read_document(source).text if source.suffix == ".xml" else read_text(source)
     destination = Path(destination)
     target = destination / source.name if destination.is_dir() else destination
     neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)

@@ -22,7 +22,7 @@ from mitransient_lidar.rendering.shots.series import render_shots
 
 pytestmark = pytest.mark.long
 
-SURVEY = (Path(__file__).parents[2] / "docs" / "guide" / "survey_lidar.xml").read_text("utf-8")
+SURVEY = (Path(__file__).parents[2] / "scenes" / "examples" / "survey_lidar.xml").read_text("utf-8")
 WATERS = {"jerlov": "1C", "petzold": "coastal", "kd": "0.15"}
 BOTTOMS = {"level": 0, "rises": 10, "falls": -10}
 PLATE = """<shape type="rectangle" id="plate"><transform name="to_world"><scale value="100"/>

@@ -47,7 +47,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     """
     params, scene = {"wind_speed": 6, "bottom_slope_deg": 4}, tmp_path / "inclined.xml"
     slopes = '<float name="slope_x_deg" value="5"/> <float name="slope_y_deg" value="-3"/>'
-    level = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
+    level = Path("scenes/examples/survey_lidar.xml").read_text("utf-8")
     scene.write_text(level.replace('<medium type="layered_water"', slopes + '<medium type="layered_water"'), "utf-8")
     shots = [((17.3, -42.1), 130.0, 16.0, 290.0, 9.0), ((-50.4, 30.2), -77.0, 13.8, 312.0, -8.0)]
     given = [looking(*shot) for shot in shots]
@@ -117,7 +117,7 @@ def test_poses_over_a_plume_give_what_single_shots_do():
 def test_patches_of_the_bottom_lie_where_shots_see_them(tmp_path):
     """Both look at the edge of a bright patch, the second one turned, which had lost most of its light."""
     scene, passes = tmp_path / "patch.xml", 16
-    text = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
+    text = Path("scenes/examples/survey_lidar.xml").read_text("utf-8")
     bright = '<shape type="seabed" id="patched"><float name="depth" value="5.9"/><float name="cell_size" value="1"/>'
     bright += '<string name="patches" value="-12 5 3 0.9"/></shape>'
     scene.write_text(text.replace("</scene>", bright + "</scene>"), "utf-8")
@@ -142,7 +142,7 @@ def test_patches_of_the_bottom_lie_where_shots_see_them(tmp_path):
 def test_heights_of_shots_are_those_at_their_places(depth, slope):
     """Of the sea, and of a bottom below all troughs or one that rises above the sea, in the last of several passes."""
     params = {"wind_speed": 6, "bottom_depth": depth, "bottom_slope_deg": slope}
-    renderer = prepared("docs/guide/survey_lidar.xml", params, "lidar_merging")
+    renderer = prepared("scenes/examples/survey_lidar.xml", params, "lidar_merging")
     places, copies, points = PLACES[:2], 3, 1000
     batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, None, [])
     heights, region = batches.at(ShotPoses(places))(copies).layout.cells.heights, renderer.layout.patches.region
@@ -151,7 +151,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
     x, y = (np.random.default_rng(1).uniform(region.low[axis], region.high[axis], points) for axis in (0, 1))
     for number, place in enumerate(places):
         aim = {"aim_x": place[0], "aim_y": place[1]}
-        alone = prepared("docs/guide/survey_lidar.xml", params | aim, "lidar_merging").scene
+        alone = prepared("scenes/examples/survey_lidar.xml", params | aim, "lidar_merging").scene
         down = mi.Ray3f(mi.Point3f(mi.Float(x + place[0]), mi.Float(y + place[1]), 5.0), mi.Vector3f(0, 0, -1))
         sea = alone.ray_intersect(down)
         bed = alone.ray_intersect(alone.spawn_ray(sea, down.d))

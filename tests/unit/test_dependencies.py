@@ -35,7 +35,8 @@ def imported(*folders):
 
 
 def test_the_package_imports_what_it_declares_and_nothing_else():
-    assert imported("mitransient_lidar", "plugins", "scenes") == declared("movie") - NOT_IMPORTED
+    """The scripts among the example files of `scenes` name what they need besides."""
+    assert imported("mitransient_lidar", "plugins") == declared("movie") - NOT_IMPORTED
 
 
 def test_the_tests_import_what_their_extra_declares_and_nothing_else():

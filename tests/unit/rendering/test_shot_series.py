@@ -177,7 +177,7 @@ def test_shots_at_given_places(rendered, tmp_path):
 @pytest.mark.slow
 def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
     """The bottom lies 10 m deeper at x = -57 m: 9.4 ns of each metre, and a quarter more for scattered light."""
-    scene, slope = "docs/guide/survey_lidar.xml", {**PLANE, "bottom_slope_deg": 10}
+    scene, slope = "scenes/examples/survey_lidar.xml", {**PLANE, "bottom_slope_deg": 10}
     for places in ([(0, 0)], [(0, 0), (-57, 0)]):
         shot_series.render_shots(scene, slope, positions=places)
     flat, deep = rendered[0]["axis"], rendered[1]["axis"]

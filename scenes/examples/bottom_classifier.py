@@ -1,9 +1,8 @@
 """Train a classifier on a campaign to find bottom echoes, and hold it against the shipped detector.
 
-``python docs/guide/bottom_classifier.py bottoms.zarr -o bottom_classifier.png``, for the campaign of
-``docs/guide/campaigns.md``; needs scikit-learn. Waveforms without a bottom are the same ones less their bottom's part,
-recorded with noise of their own. Both methods are compared on runs that the classifier has never seen, at the same rate
-of false alarms.
+``python bottom_classifier.py bottoms.zarr -o bottom_classifier.png``, for the campaign of ``docs/guide/campaigns.md``;
+needs scikit-learn. Waveforms without a bottom are the same waveforms minus the bottom light, with noise of their own.
+Both methods are compared on runs that the classifier has never seen, at the same false-alarm rate.
 """
 
 from __future__ import annotations
