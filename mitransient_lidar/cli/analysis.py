@@ -15,14 +15,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.tables.written import write_csv
 
-_REFUSED = 1  # exit code of a fit that is refused
+_REFUSED = 1  # exit code of a refused fit
 
 
 def _record(
     call: Call,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: a shot, a series, or gates.")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
+        Path | None, typer.Option("-o", "--output", help="NetCDF file to write, by default FILE_recorded.nc.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -44,7 +44,7 @@ def _record(
 def _echoes(
     call: Call,
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF result, or NetCDF file with recorded shots.")
     ],
     table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
     output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
@@ -55,13 +55,13 @@ def _echoes(
         str | None,
         typer.Option(
             metavar="FILE",
-            help="Subtract the mean errors of a table of depth-bias from the depths; auto for the shipped one of the "
+            help="Subtract the mean errors in a depth-bias table from the depths; auto for the shipped table of the "
             "result's instrument.",
         ),
     ] = None,
     wind_speed: Annotated[
         float | None,
-        typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
+        typer.Option(help="Wind speed for the corrections [m/s] (at least 0), by default the scene's."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -100,7 +100,7 @@ def _retrieve(
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
+        Path | None, typer.Option(help="PNG, PDF or SVG file for a series: estimates against the truth.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -133,7 +133,7 @@ def _fit(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Result or recorded signal (.nc, .exr), or a CSV file with the column time_ns and one for each pixel.",
+            help="Result or recorded signal (.nc, .exr), or a CSV file with a column time_ns and one column per pixel.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
@@ -166,9 +166,9 @@ COMMANDS = {
         """Record the waveforms of a result with a receiver, or its gates with a camera.
 
         Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
-        is saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
-        gain or the filter is chosen so that nothing is saturated. Of a camera they are the digital numbers of frames,
-        with mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
+        is saturated. With a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
+        gain or the filter is chosen so that nothing saturates. A camera gives the digital numbers of frames, with the
+        mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
         """,
     ),
     "echoes": Command(
@@ -178,7 +178,7 @@ COMMANDS = {
         """Measure the echoes in the waveforms of a result.
 
         Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
-        are those by noise, of depths also by the method.
+        include noise, and for depths the method, too.
         """,
         defaults={"estimators": None},
     ),
@@ -189,20 +189,20 @@ COMMANDS = {
         """Retrieve slopes, bottom and water from a result.
 
         Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
-        FILE; of a series, those of each shot beside the truth.
+        FILE; for a series, those of each shot beside the truth.
         """,
     ),
     "fit": Command(
         "Analyse results",
         "studies.fit:fit",
         _fit,
-        """Fit parameters of a scene to waveforms.
+        """Fit scene parameters to waveforms.
 
         Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc
-        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times
-        the expected one is refused, or, where the noise is unknown, one that leaves 10 % of the squares of the samples:
-        it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it prints and writes
-        (exit code 130).
+        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit is refused if its chi-squared
+        exceeds 5 times the expected one, or, with unknown noise, if it leaves 10 % of the samples' sum of squares.
+        Refused fits are printed and written with exit code 1. Ctrl-C ends the fit at its last step, which is printed
+        and written (exit code 130).
         """,
     ),
 }

@@ -1,4 +1,4 @@
-"""Output files of the commands: checks before a render, figures with their data, and files of gate stacks."""
+"""Output files of the commands: checks before a render, figures with their data, and gate stack files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def check_targets(folder: Path, targets: list[Path], source: str = "", option: s
 
 
 def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
-    """Return name and text of a scene, or of that of a result of a command and then its attributes."""
+    """Return a scene's name and text; for a result its scene's, and its attributes. Refuse another command's result."""
     from mitransient_lidar.loading.catalogue import scene_path, scene_text
     from mitransient_lidar.loading.scene_source import SceneSource
     from mitransient_lidar.rendering import again
@@ -59,7 +59,7 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
 
 
 def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
-    """Check that a figure can be written, and files of its data beside it, of other suffixes."""
+    """Check that a figure can be written, and its data files beside it, with other suffixes."""
     if path is None:
         return
     from mitransient_lidar.plots.drawing import check_format
@@ -93,13 +93,13 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
         save(dataset, path)
 
 
-#: Largest size of a page [MB].
+#: Largest page size [MB].
 PAGE_MB = 200.0
 
 
 @dataclass(frozen=True)
 class GateFiles:
-    """Files of a gate stack in a folder, with the beginning of their names.
+    """Files of a gate stack in a folder, with the stem of their names.
 
     Kinds in addition to the EXR stack: ``drawings`` (of gates and depths), ``sequence``, ``tiff``, ``images`` (PNG),
     ``gif``, ``mp4``, ``html``.
@@ -111,7 +111,7 @@ class GateFiles:
 
     @classmethod
     def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
-        """Return the files of a gate stack, given the options for the kinds of file; refuse a movie without ffmpeg."""
+        """Return a gate stack's files, given the file kind options; refuse a movie without ffmpeg."""
         if wanted.get("mp4"):
             from mitransient_lidar.plots.gates.images import find_ffmpeg
 
@@ -127,14 +127,14 @@ class GateFiles:
         check_targets(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
-        """Return the paths of the files, without those of a sequence."""
+        """Return the file paths, without sequence files."""
         endings = ["_gates.exr", *(["_gates.png", "_depth.png"] if "drawings" in self.wanted else [])]
         endings += [f"_gates.{kind}" for kind in ("gif", "mp4", "html") if kind in self.wanted]
         endings += ["_gates.tif"] * ("tiff" in self.wanted)
         return [self.folder / f"{self.stem}{ending}" for ending in endings]
 
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
-        """Write the files and print their paths; `result` provides the waveforms of the page."""
+        """Write the files and print their paths; `result` provides the waveforms for the page."""
         from mitransient_lidar import results
         from mitransient_lidar.plots.gates import images
         from mitransient_lidar.plots.viewer import view
@@ -178,4 +178,4 @@ def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:
         raise
     except UserError as error:
         if not quiet:
-            typer.echo(f"no drawing of depths: {error}", err=True)
+            typer.echo(f"no depth drawing: {error}", err=True)

@@ -18,7 +18,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped sce
 
 
 def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
-    """Print rows of texts in columns."""
+    """Print text rows in columns."""
     typer.echo("\n".join(aligned_lines(rows, right)))
 
 
@@ -30,7 +30,7 @@ def list_scenes() -> None:
 
 
 def _show(name: Name) -> None:
-    """Print the XML of a scene, self-contained."""
+    """Print a scene's XML, self-contained."""
     from mitransient_lidar.loading.catalogue import scene_text
 
     typer.echo(scene_text(name), nl=False)
@@ -38,7 +38,7 @@ def _show(name: Name) -> None:
 
 def _copy(
     name: Name,
-    destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder, or path of the new file.")] = Path("."),
+    destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder or path for the new file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Copy a scene to a self-contained file to edit, and print its path."""
@@ -49,9 +49,11 @@ def _copy(
 
 def _instruments(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of an instrument.")] = None,
-    xml: Annotated[bool, typer.Option("--xml", help="Print XML of laser and receiver, to be included.")] = False,
+    xml: Annotated[
+        bool, typer.Option("--xml", help="Print the XML of laser and receiver, to include in a scene.")
+    ] = False,
 ) -> None:
-    """List the instruments, or print the parameters of one."""
+    """List the instruments, or print one instrument's parameters."""
     from mitransient_lidar.loading import instruments as shipped
 
     if name is None:
@@ -89,15 +91,15 @@ def _bench(
     call: Call,
     images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
     beams: Annotated[
-        bool, typer.Option("--beams", help="Compare beams of 0.1 to 20 mrad in all views instead.")
+        bool, typer.Option("--beams", help="Compare beams from 0.1 to 20 mrad in all views instead.")
     ] = False,
 ) -> None:
-    """Run one of the benchmarks."""
+    """Run one benchmark."""
     from mitransient_lidar.studies.bench import beams as narrow
     from mitransient_lidar.studies.bench import images as imagers
 
     if images and beams:
-        raise UserError("--images and --beams: give one of them")
+        raise UserError("--images and --beams are alternatives: give one of them")
     if images:
         imagers.run(json=call.arguments["json"])
     elif beams:
@@ -123,7 +125,7 @@ COMMANDS = {
 
 SCENES = {
     "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
-    "show": Command("Commands", "", _show, "Print the XML of a scene, self-contained."),
+    "show": Command("Commands", "", _show, "Print a scene's XML, self-contained."),
     "copy": Command("Commands", "", _copy, "Copy a scene to a self-contained file to edit, and print its path."),
     "instruments": Command(
         "Commands",

@@ -129,18 +129,18 @@ Scene = Annotated[Any, Option("Name of a shipped scene, or path of a Mitsuba XML
 SceneOrResult = Annotated[
     Any,
     Option(
-        "Name of a shipped scene, path of a Mitsuba XML file, or a result (.nc, .exr) to render again, with its own "
-        "options unless others are given",
+        "Name of a shipped scene, path of a Mitsuba XML file, or result (.nc, .exr) to render again with its own "
+        "options, unless others are given",
         form="SCENE",
         is_argument=True,
     ),
 ]
-Seed = Annotated[int, Option("Seed of the random numbers", 0, 2**53)]
+Seed = Annotated[int, Option("Random seed", 0, 2**53)]
 FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
-TargetId = Annotated[str, Option("Id of the shape that is the target")]
-BackgroundPower = Annotated[float, Option("Power of the daylight on each pixel", 0, unit="W")]
-Instrument = Annotated[str | None, Option("Instrument instead of the scene's lidar, from the list of instruments")]
-Sensor = Annotated[str | None, Option("Receiver of a scene that has several, by its id, instead of the first one")]
+TargetId = Annotated[str, Option("Id of the target's shape")]
+BackgroundPower = Annotated[float, Option("Daylight power on each pixel", 0, unit="W")]
+Instrument = Annotated[str | None, Option("Instrument that replaces the scene's lidar, as listed by instruments")]
+Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
 
 #: Beginning of the meaning of a receiver.
 RECEIVERS = (

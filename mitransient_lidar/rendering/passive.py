@@ -71,14 +71,17 @@ def render_passive(
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
-    passes: Annotated[int | Sequence[int] | None, Option("Stop after this many passes", 2, MOST_PASSES)] = None,
+    passes: Annotated[
+        int | Sequence[int] | None,
+        Option("Stop after this many passes, by default at the target error", 2, MOST_PASSES),
+    ] = None,
     seed: SignedSeed = None,
-    frames: Annotated[int, Option("Number of frames of an animation, 1 by default", 1, MOST_FRAMES)] = 1,
+    frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
-        float, Option("Time between frames, 0.1 by default", 0, unit="s", above=True, flag="--frame-step")
+        float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")
     ] = 0.1,
     filter_width_nm: Annotated[
-        float | None, positive_option("Width of the receiver's filter, for the power of the daylight", "nm")
+        float | None, positive_option("Width of the receiver's filter, for the daylight power", "nm")
     ] = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,

@@ -51,7 +51,7 @@ def render(
     *,
     instrument: Instrument = None,
     sensor: Sensor = None,
-    integrator: Annotated[Any, Option("Integrator to use instead of the scene's")] = None,
+    integrator: Annotated[Any, Option("Integrator, by default the scene's")] = None,
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,

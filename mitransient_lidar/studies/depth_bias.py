@@ -57,7 +57,7 @@ Records = Annotated[int, Option("Records with noise of each place", 1, 10_000)]
 SeaTime = Annotated[
     float | None, positive_option("Render no sea after this many seconds; those left out are NaN in the table")
 ]
-SeaSeed = Annotated[int, Option("Seed of the random numbers", 0, 2**31)]
+SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 
 #: Wavelength of their tables [nm].
 _WAVELENGTH = 532.0
@@ -93,7 +93,7 @@ def depth_bias(
     params: Mapping[str, Any] | None = None,
     *,
     angles_deg: Annotated[
-        Numbers | None, rising("Angles from nadir; the instrument's and 5 more by default", "degrees", flag="--angles")
+        Numbers | None, rising("Angles from nadir; by default the instrument's and 5 more", "degrees", flag="--angles")
     ] = None,
     winds: Winds = (0.0, 3.0, 6.0),
     ripples: Annotated[Numbers, rising("Winds whose ripples level seas have", "m/s", above=True)] = (3.0, 6.0),

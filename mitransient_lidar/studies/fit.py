@@ -56,10 +56,10 @@ def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
         str | os.PathLike[str] | Model | None,
-        Option("Name or XML file of the scene; by default that of the result"),
+        Option("Name or XML file of the scene, by default the result's scene"),
     ] = None,
     free: Annotated[
-        Sequence[str], Option("Free parameters of the scene, and bandwidth_mhz of a receiver", form="NAME,NAME,...")
+        Sequence[str], Option("Free scene parameters, and bandwidth_mhz for a receiver", form="NAME,NAME,...")
     ] = (),
     *,
     params: Mapping[str, Any] | None = None,
@@ -72,10 +72,10 @@ def fit(
     ] = None,
     free_scale: Annotated[
         bool | None,
-        Option("Fit the scale of the waveforms, as by default of CSV files", flag="--free-scale/--fixed-scale"),
+        Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale"),
     ] = None,
     free_time: Annotated[
-        bool | None, Option("Fit the time offset, as by default of CSV files", flag="--free-time/--fixed-time")
+        bool | None, Option("Fit a time offset, by default for CSV files alone", flag="--free-time/--fixed-time")
     ] = None,
     noise: Annotated[
         float | None, positive_option("Standard deviation of every sample, in the unit of the waveforms")
@@ -83,19 +83,19 @@ def fit(
     receiver: Annotated[
         str | os.PathLike[str] | ReceiverChain | None,
         Option(
-            "Receiver of a signal, by default the one that it names. Of a CSV file, the one whose response and noise "
-            "the model gets: a preset, an instrument or a .toml file"
+            "Receiver whose response and noise the model gets: a preset, an instrument or a .toml file. By default "
+            "the receiver that the signal names"
         ),
     ] = None,
     scale_errors: Annotated[bool, Option("Multiply the covariance by the reduced chi-squared")] = False,
     passes: Annotated[
-        int | None, Option("Passes of each render, by default by the errors of the waveforms", 2, MOST_PASSES)
+        int | None, Option("Passes per render, by default as many as the waveform errors need", 2, MOST_PASSES)
     ] = None,
     max_time: Annotated[
         float | None, positive_option("Try no step after this many seconds, so that the fit may not converge")
     ] = None,
     seed: Annotated[
-        int | None, Option("Seed of all renders, by default not that of the result", -(2**63), 2**63 - 1)
+        int | None, Option("Seed of all renders, by default 1, or for a result its own plus 1", -(2**63), 2**63 - 1)
     ] = None,
     most_renders: Annotated[int, Option("Renders after which the fit ends without convergence", 2, 10_000)] = 60,
     progress: ProgressCallback | None = None,

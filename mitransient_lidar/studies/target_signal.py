@@ -52,7 +52,7 @@ def target_signal(
             "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more"
         ),
     ] = None,
-    seed: Annotated[int, Option("Seed of the random numbers", -(2**63), 2**63 - 1)] = 0,
+    seed: Annotated[int, Option("Random seed", -(2**63), 2**63 - 1)] = 0,
     integrator: Any = None,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,

@@ -48,10 +48,10 @@ def tpu(
     params: Mapping[str, Any] | None = None,
     *,
     altitudes: Annotated[
-        Numbers | None, rising("Heights of the lidar above the sea; the instrument's by default", "m", above=True)
+        Numbers | None, rising("Lidar heights above the sea; by default the instrument's", "m", above=True)
     ] = None,
     angles_deg: Annotated[
-        Numbers | None, rising("Angles from nadir; the instrument's by default", "degrees", flag="--angles")
+        Numbers | None, rising("Angles from nadir; by default the instrument's", "degrees", flag="--angles")
     ] = None,
     winds: Winds = WINDS,
     waters: Waters = WATERS,

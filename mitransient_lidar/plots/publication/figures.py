@@ -71,13 +71,13 @@ class Publication:
 @alone
 def figures(
     names: Annotated[
-        Sequence[str] | None, Option("Figures, as fig09; all by default", form="[NAME]...", is_argument=True)
+        Sequence[str] | None, Option("Figures, such as fig09; by default all", form="[NAME]...", is_argument=True)
     ] = None,
     output: str | os.PathLike[str] = "output/figures",
     *,
     target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
-    max_time: Annotated[float | None, positive_option("Begin no further figure after this many seconds")] = None,
-    seed: Annotated[int, Option("Seed of the random numbers", 0, 10**6)] = 0,
+    max_time: Annotated[float | None, positive_option("Begin no figure after this many seconds")] = None,
+    seed: Annotated[int, Option("Random seed", 0, 10**6)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
     """Make the figures of the multipixel lidar model of FOI (Tulldahl 2006), and the table of its statements.

@@ -47,23 +47,24 @@ def render_frames(
     params: Mapping[str, Any] | None = None,
     *,
     pulse_rate_hz: Annotated[
-        float, Option("Pulses a second, 1000 by default", 0, unit="Hz", above=True, flag="--pulse-rate")
+        float, Option("Pulses per second, by default 1000", 0, unit="Hz", above=True, flag="--pulse-rate")
     ] = 1000.0,
-    frames: Annotated[int, Option("Number of frames, 1 by default", 1, 100_000)] = 1,
+    frames: Annotated[int, Option("Number of frames, by default 1", 1, 100_000)] = 1,
     gate_order: Annotated[
         str,
-        Option("Order of the gates of a frame: in_order (the default), random, or interleaved, pulse by pulse"),
+        Option("Order of a frame's gates: in_order (the default), random, or interleaved, pulse by pulse"),
     ] = "in_order",
     readout_s: Annotated[
-        float, Option("Time without pulses after each image; interleaved, each frame", 0, unit="s", flag="--readout")
+        float,
+        Option("Time without pulses after each image, or after each interleaved frame", 0, unit="s", flag="--readout"),
     ] = 0.0,
-    speed: Annotated[float, Option("Speed of the platform, with laser and receiver", 0, unit="m/s")] = 0.0,
+    speed: Annotated[float, Option("Platform speed", 0, unit="m/s")] = 0.0,
     heading_deg: Annotated[
-        float, Option("Its direction, from +y clockwise to +x", -360, 360, unit="degree", flag="--heading")
+        float, Option("Platform heading, from +y clockwise to +x", -360, 360, unit="degree", flag="--heading")
     ] = 0.0,
-    passes: Annotated[int, Option("Passes of each image, 4 by default", 2, 10_000)] = 4,
+    passes: Annotated[int, Option("Passes of each image, by default 4", 2, 10_000)] = 4,
     pass_share: PassShare = None,
-    max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], 2 by default")] = None,
+    max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], by default 2")] = None,
     seed: SignedSeed = None,
     integrator: Any = None,
     instrument: Instrument = None,

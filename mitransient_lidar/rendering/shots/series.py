@@ -74,22 +74,24 @@ def render_shots(
     scene: SceneOrResult,
     params: Mapping[str, Any] | None = None,
     *,
-    count: Annotated[int, Option("Number of shots at random places; 20 by default in the command", 2, 100_000)] = 200,
+    count: Annotated[int, Option("Number of shots at random locations; the command's default is 20", 2, 100_000)] = 200,
     positions: Annotated[
-        Any, Option("Place of a shot [m], instead of random ones. Repeatable", form="X,Y", flag="--at")
+        Any, Option("Location of a shot [m], instead of random ones. Repeatable", form="X,Y", flag="--at")
     ] = None,
-    move_target: Annotated[bool, Option("Keep the target's place relative to the aim of each shot")] = False,
+    move_target: Annotated[bool, Option("Move the target with the aim of each shot")] = False,
     passes: Annotated[
-        int | None, Option("Most passes of each shot, 8 by default, 400 with a target error", 2, 10_000)
+        int | None, Option("Most passes of each shot, by default 8, or 400 with a target error", 2, 10_000)
     ] = None,
     target_error: Annotated[
-        float | None, Option("Relative standard error of the median bin, instead of full passes", 0, 1, above=True)
+        float | None,
+        Option("Relative standard error of the median bin at which a shot ends, by default none", 0, 1, above=True),
     ] = None,
     max_time: Annotated[
-        float | None, positive_option("Stop before this many seconds for all shots, with fewer passes or shots")
+        float | None,
+        positive_option("Stop before this many seconds for all shots, with fewer passes or shots; by default no limit"),
     ] = None,
     pass_share: float | None = None,
-    seed: Annotated[int, Option("Seed of random places, 1 by default", 0, 2**53)] = 1,
+    seed: Annotated[int, Option("Seed of the random locations, by default 1", 0, 2**53)] = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
     shot_passes: npt.ArrayLike | None = None,
