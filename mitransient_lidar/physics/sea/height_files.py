@@ -1,4 +1,4 @@
-"""Files of heights: points of surveys, NetCDF by the CF conventions, and what values and positions of any file mean."""
+"""Height files: survey points, NetCDF by the CF conventions, and the meaning of values and positions in any file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNEVENNESS = 1e-3
 #: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
 _MOST_SCATTERED = 2 * 10**6
 
-#: Least share of the cells of a grid that have a point, if points are taken as one.
+#: Least share of grid cells with a point for points to count as a grid.
 _LEAST_SHARE = 0.25
 
 _X = Column("x", ("easting", "east", "e", "x coordinate", "point x"), METRES)
@@ -46,12 +46,12 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
 
-#: Attributes of a grid mapping.
+#: Grid mapping attributes.
 _GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
 
 
 def length_unit(name: str, unit: str) -> float:
-    """Return a unit in metres; `name` is what is in it, for the message.
+    """Return a unit in metres; `name` is the quantity, for the message.
 
     Raises
     ------
@@ -81,9 +81,9 @@ def heights_in_metres(
     values : ndarray
         Values as in the file, NaN where they are declared to be missing.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     sign : {'heights', 'depths'}, optional
-        Whether they are positive up or down. Default: what the file states, or up.
+        Whether they are positive up or down. Default: as the file states, or up.
     unit : str, optional
         Their unit, where the file does not state it. Default: metres.
     no_data : float, optional
@@ -102,27 +102,27 @@ def heights_in_metres(
     if suspect := undeclared_no_data(values, metres):
         value, times, reason = suspect
         raise UserError(
-            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
-            f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
+            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be "
+            f"no data: map_no_data = {value:.9g} of a seabed must say so if they are"
         )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"
     return -metres * values if is_down else metres * values
 
 
 def _height_unit(path: Path, stated: Stated, unit: str | None) -> float:
-    """Return the unit of heights in metres."""
+    """Return the height unit in metres."""
     given = None if unit is None else length_unit("map_unit is", unit)
     system = stated.system
     if stated.unit:
         from_system = system is not None and stated.unit == system.vertical_unit
         metres = system.vertical_metres if from_system and system else length_unit(f"{path} has heights", stated.unit)
         if given is not None and not math.isclose(given, metres, rel_tol=1e-9):
-            raise UserError(f"map_unit = {unit!r} must not differ from that of {path}, {stated.unit}.")
+            raise UserError(f"map_unit = {unit!r} must not differ from that of {path}, {stated.unit}")
         return metres
     if given is None and position_unit(path, stated) != 1:
         raise UserError(
-            f"{path} has positions in {stated.position_unit} but does not state the unit of its heights: map_unit must,"
-            f" one of {_ALLOWED}."
+            f"{path} has positions in {stated.position_unit} but does not state the unit of its heights: map_unit "
+            f"must, one of {_ALLOWED}"
         )
     return 1.0 if given is None else given
 
@@ -135,18 +135,18 @@ def position_unit(path: Path, stated: Stated) -> float:
 
 
 def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, cell: float) -> None:
-    """Refuse positions that are degrees, or whose metres are not those on the ground.
+    """Refuse positions in degrees, or whose metres differ from metres on the ground.
 
     Parameters
     ----------
     path : Path
         Their file, for messages.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     x, y : ndarray
         Positions as in the file, at least the least and the largest of them.
     cell : float
-        Typical distance of neighbours.
+        Typical distance between neighbours.
     """
     middle = [0.5 * float(one.min() + one.max()) for one in (x, y)]
     if stated.system is not None:
@@ -164,7 +164,7 @@ def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, ce
 
 
 def described(stated: Stated, values: str | None, unit: str | None, holes: int) -> str:
-    """Return a description of what a file states, for the log."""
+    """Return a file's statements as text for the log."""
     system = stated.system
     sign = {True: "down", False: "up", None: "up (not stated)"}[stated.is_down]
     sign = {"depths": "down", "heights": "up", None: sign}[values]
@@ -179,10 +179,11 @@ def described(stated: Stated, values: str | None, unit: str | None, holes: int) 
 def read_netcdf_heights(path: Path) -> Grid:
     """Read heights or depths from a NetCDF-4 file.
 
-    The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are
-    (y, x) or (x, y), with or without the coordinates ``x`` and ``y``, which may have other names if their
-    ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions of other names count as
-    (y, x). Read are ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid mapping.
+    The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are (y,
+    x) or (x, y), with or without the coordinates ``x`` and ``y``. The coordinates may have other names if their
+    ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions with other names count
+    as (y, x). The reader uses ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid
+    mapping.
 
     Raises
     ------
@@ -244,7 +245,7 @@ def _is_down(name: str, attributes: Mapping[str, object], default: bool | None) 
 
 
 def read_points(path: Path) -> tuple[FloatArray, Stated]:
-    """Read a table of points.
+    """Read a point table.
 
     `core.tables.long_tables.read_long_table` describes the format. A heading names the columns x, y and z, or easting,
     northing, and height, elevation or depth, with or without a unit of length. Without one they are the first three.
@@ -291,7 +292,7 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
     points : ndarray, shape (points, 3)
         Positions and heights [m]; points with a height of NaN are left out.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m].
 
@@ -323,7 +324,7 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
         raise UserError(f"{path} has points on a line: a height map needs an area.") from error
     size = float(np.sqrt(area / len(points))) if cell is None else positive("map_cell", cell)
     if size > 0.5 * extent.min():
-        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}.")
+        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}")
     columns, rows = np.floor(extent / size * (1 + 1e-9)) + 1
     check_size(path, 8 * columns * rows)
     x, y = (

@@ -106,7 +106,7 @@ def with_holes():
 @pytest.mark.parametrize(
     ("heights", "size", "message"),
     [
-        (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres."),
+        (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres"),
         (HEIGHTS, 0, "size = 0 must be greater than 0"),
         (HEIGHTS, np.nan, "size = nan must be finite"),
         (HEIGHTS[0], 1, "has heights of shape (4,), but must have at least 2 rows and 2 columns."),
