@@ -1,4 +1,4 @@
-"""Options of a render: type, range and meaning of each, shared by functions and commands."""
+"""Render options: type, range and meaning of each, shared by functions and commands."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Annotated
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, declared, positive_option
 
-#: Largest number of passes that can be asked for.
+#: Largest number of passes allowed.
 MOST_PASSES = 10**9
 
 #: Memory for histograms, unless another one is requested [GB].
 DEFAULT_MAX_MEMORY_GB = 2.0
 
-#: Smallest share of the paths of a full pass.
+#: Smallest share of a full pass's paths.
 SMALLEST_SHARE = 2**-9
 
 TargetError = Annotated[
@@ -38,7 +38,7 @@ Passes = Annotated[
     int | None, Option("Stop after this many independent passes, by default at the target error", 2, MOST_PASSES)
 ]
 SignedSeed = Annotated[int | None, Option("Random seed, by default 0", -(2**63), 2**63 - 1)]
-PassShare = Annotated[float | None, Option("Share of the paths of a full pass in each pass", SMALLEST_SHARE, 1)]
+PassShare = Annotated[float | None, Option("Share of a full pass's paths in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
     float | None, positive_option("Memory for histograms [GB], by default 2; with less, only gates are kept")
 ]
