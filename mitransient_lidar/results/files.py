@@ -1,4 +1,4 @@
-"""Files of all datasets of this package: one `open`, one `save`, and one way to take a dataset or its path.
+"""Files for all datasets in this package: one `open`, one `save`, and one way to take a dataset or its path.
 
 EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
 """
@@ -21,7 +21,7 @@ from mitransient_lidar.results.attributes import check_attributes, check_coordin
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
-#: What a kind of dataset is called, and the variables that one has.
+#: Names of the dataset kinds, and variables that identify each.
 _KINDS = {
     "result": ("waveforms of a render", LIGHT),
     "waveforms": ("waveforms over time", ("waveform",)),
@@ -40,7 +40,7 @@ Given = Union["xr.Dataset", str, os.PathLike[str]]
 
 
 def open(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a dataset into memory from a file of `save`, or from a folder with a sequence of gates.
+    """Read a dataset into memory from a file by `save`, or from a folder with a sequence of gates.
 
     Waveforms over time of other programs are read from NetCDF-4 files, too. The content shows the format, not the name.
 
@@ -78,8 +78,8 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         Any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images by
         daylight for an EXR file.
     path : path
-        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; of gates and frames ``.tif`` and ``.png`` are
-        images of 16 bits, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
+        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and frames ``.tif`` and ``.png`` are
+        16-bit images, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
         sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
 
     Raises
@@ -116,7 +116,7 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
     if "shot" in dataset.dims:
         raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
     if "result" in found:
-        # The attributes have the curve of the errors of sums in its place.
+        # The attributes have the curve of sum errors in its place.
         return exr.parts_of(dataset.drop_dims(sum_errors.DIMS, errors="ignore"), path, "waveforms")
     if "gates" in found:
         return exr.parts_of(check_stack(dataset).drop_dims("parameter", errors="ignore"), path, "gates")
@@ -145,16 +145,16 @@ def kinds_of(dataset: xr.Dataset) -> set[str]:
 
 
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
-    """Return a dataset that is given itself, or by the path of its file.
+    """Return a dataset that is given itself, or by its file's path.
 
     Parameters
     ----------
     name
-        Name of the parameter, for messages.
+        Parameter name, for messages.
     given
         The dataset, or a path for `open`.
     kinds
-        Kinds of `kinds_of`, of which it must be one.
+        Kinds from `kinds_of`, of which it must be one.
 
     Raises
     ------
@@ -176,6 +176,6 @@ def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
 
 
 def _listed(kinds: Iterable[str]) -> str:
-    """Return the names of kinds of datasets, the last one after "or"."""
+    """Return the names of dataset kinds, the last one after "or"."""
     *first, last = (_KINDS[kind][0] for kind in kinds)
     return f"{', '.join(first)} or {last}" if first else last

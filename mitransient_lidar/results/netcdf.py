@@ -1,4 +1,4 @@
-"""NetCDF files of labelled datasets.
+"""NetCDF files for labelled datasets.
 
 A file has at most 40 attributes of its own, numbers and texts. The attribute ``mitransient_lidar`` is a text of JSON
 with all others, lists among them, which `read` restores.
@@ -24,14 +24,14 @@ from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.results.attributes import attribute, shown
 
-#: What a file of this package starts with, and what its SHA-256 follows at its end.
+#: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
 
-#: Attribute with the JSON of those that are not attributes of the file.
+#: Attribute with the JSON of those that are not file attributes.
 OTHERS = "mitransient_lidar"
 
 _SMALL = 4096  # bytes of a variable that is not worth compressing
-_ROUNDING = 1e-2  # of a step of a converter, by which a signal may differ from a code
+_ROUNDING = 1e-2  # of a converter step, by which a signal may differ from a code
 
 
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
