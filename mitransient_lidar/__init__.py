@@ -183,14 +183,13 @@ def open(path: str | os.PathLike[str]) -> xarray.Dataset:
     Parameters
     ----------
     path : path
-        An EXR or NetCDF file: waveforms of a render, gates, images by daylight, signals of a receiver, or a table of a
-        study. Or a folder: the store of a campaign, whose arrays are read when they are needed, a flight, or a sequence
-        of gates.
+        An EXR or NetCDF file: a render's waveforms, gates, daylight images, receiver signals, or a study's table. Or a
+        folder: a campaign's store, whose arrays are read when they are needed, a flight, or a sequence of gates.
 
     Returns
     -------
     xarray.Dataset
-        What was written; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
+        The written data; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
         :func:`mitransient_lidar.campaigns.store.open_campaign`.
 
     Raises
@@ -218,8 +217,8 @@ def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
     dataset : xarray.Dataset
         The dataset.
     path : path
-        ``.nc`` is NetCDF-4, of any dataset; ``.exr`` OpenEXR, of waveforms, gates or images by daylight; ``.csv`` a
-        text table of echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
+        ``.nc`` is NetCDF-4, for any dataset; ``.exr`` OpenEXR, for waveforms, gates or daylight images; ``.csv`` a text
+        table with echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
         :func:`mitransient_lidar.results.files.save`.
 
     Raises

@@ -1,4 +1,4 @@
-"""Interactive view of a result: a page for a browser, and below the cell of a notebook."""
+"""Interactive view of a result: a page for a browser, and below a notebook cell."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.results.files import Given, dataset_of
 
-_NOTEBOOK_MB = 20.0  # of a page in a notebook, which is stored with it
-_FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # of temporary pages
+_NOTEBOOK_MB = 20.0  # per page in a notebook, which is stored with it
+_FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # for temporary pages
 
 
 class View:
-    """Page that shows a result, of `view`. A notebook shows it below the cell whose last value it is.
+    """Page that shows a result, from `view`. A notebook shows it below the cell whose last value it is.
 
     Attributes
     ----------
     page : str
-        Text of the HTML page, which needs no network.
+        HTML text, which needs no network.
     height : int
         Height below a cell [CSS pixels].
     """
@@ -37,7 +37,7 @@ class View:
         self._name = name
 
     def _repr_html_(self) -> str:
-        # A sandbox without the origin of the notebook: scripts of the page reach nothing of it.
+        # A sandbox without the notebook's origin: the page's scripts reach nothing in it.
         return (
             f'<iframe sandbox="allow-scripts" srcdoc="{html.escape(self.page)}" title="{html.escape(self._name)}" '
             f'style="width: 100%; height: {self.height}px; border: 0"></iframe>'
@@ -68,7 +68,7 @@ class View:
 
 
 def _remove_former_pages() -> None:
-    """Remove the folders of temporary pages of this user that are an hour old."""
+    """Remove this user's temporary page folders that are an hour old."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
         with contextlib.suppress(OSError):
             found = folder.lstat()
@@ -84,11 +84,11 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
     result : xarray.Dataset
         A result, a record of a receiver or camera, or a gate stack: see `plots.gate_viewer.page.page_text`.
     waveforms : xarray.Dataset, optional
-        A render of the pixels of a gate stack.
+        A render with a gate stack's pixels.
     height : int
         Height in a notebook [CSS pixels].
     limit_mb : float
-        Largest size of the page [MB of 1e6 bytes]; larger ones show means over blocks of pixels.
+        Largest page size [MB of 1e6 bytes]; larger pages show means over pixel blocks.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Depths of echoes in a gate stack."""
+"""Echo depths in a gate stack."""
 
 from __future__ import annotations
 
