@@ -23,7 +23,7 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread, PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
-#: Parameter of the loader: frame origin in the scene [m], x, y, z, for plugins that know their location.
+#: Parameter of the loader: frame origin in the scene [m], x, y, z, for plugins with a location.
 FRAME_ORIGIN = "_frame_origin"
 
 #: Optical parameters of a receiver, in the order of `ReceiverOptics`.

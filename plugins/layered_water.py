@@ -61,8 +61,8 @@ class LayeredWater(mi.Medium):
     (Hall 1989, doi:10.1121/1.398102; Novarini et al. 1998, doi:10.1109/48.725236). Their void fraction is
     :math:`9.3 \cdot 10^{-7}\,(U/10)^3\, e^{-z/L}` for a wind U [m/s], with L = 0.4 m up to 7.5 m/s and :math:`0.4 +
     0.115\,(U-7.5)` above. They scatter by :math:`b = 3\beta/(2r)` with their void fraction :math:`\beta` and effective
-    radius r = 37 um, twice the light that meets them, and their Fournier-Forand function has the given backscatter at
-    180 degrees. The glory and the bubbles' critical angle are left out. Void fractions measured 2 m down reached
+    radius r = 37 um, twice the light that meets them. Their Fournier-Forand function has the given backscatter at 180
+    degrees. The glory and the bubbles' critical angle are left out. Void fractions measured 2 m down reached
     :math:`10^{-4.5}`, and were much the same in all winds below 16 m/s (Czerski et al. 2022,
     doi:10.5194/os-18-565-2022).
 

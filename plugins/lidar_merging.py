@@ -37,8 +37,8 @@ class LidarMerging(PassIntegrator):
     down are such sectors, too; on the axis they grow with depth at most twice as much as unscattered light.
 
     Within a cell, light is counted where it meets a common plane, at a random depth in each pass. The receiver's paths
-    look it up where the light at their points would meet that plane: along the beam as the facet above refracts it, at
-    an offset that grows as ripples spread the beam. Narrow beams thus stay sharp, however waves refract them.
+    look it up where the light at their points would meet that plane. This is along the beam as the facet above refracts
+    it, at an offset that grows as ripples spread the beam. Narrow beams thus stay sharp, however waves refract them.
 
     In images with 4096 pixels or more, every second receiver path is merged in the water, with double weight; all are
     merged on solids, whose pixels need more paths.
@@ -62,25 +62,26 @@ class LidarMerging(PassIntegrator):
     that meet a solid are merged only at the first one from the receiver, or connected to it from the last scattering
     event before. There are no connections in water with bubbles or with several refractive indices, nor under water.
 
-    Around a laser under water, cells are shells cut into rings and sectors about its axis, thinner and narrower near
-    the laser, where light and view are concentrated. Cell volumes differ along a path: the merge at event *k* has the
-    weight :math:`(v_k / b_k p_k) / \sum_i v_i / (b_i p_i)`, with the cell volume :math:`v_i` at each event.
+    Around a laser under water, cells are shells cut into rings and sectors about its axis. They are thinner and
+    narrower near the laser, where light and view are concentrated. Cell volumes differ along a path. With the cell
+    volume :math:`v_i` at each event, the merge at event *k* has the weight :math:`(v_k / b_k p_k) / \sum_i v_i / (b_i
+    p_i)`.
 
     Echoes from the surface and from solids in the air are connected to the laser directly. ``lidar_volpath`` with
     ``complement_only`` adds all other paths, such as light that meets the sea twice without scattering, mirrors under
     water, and reflected solids in the air.
 
     Cells end above the first solid below the surface. Other cells begin below a solid that lets a share of the light
-    pass, such as a mask or a pane; through a second such solid they blur the light by their thickness.
+    pass, such as a mask or a pane. Through a second such solid they blur the light by their thickness.
 
     Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
-    follow the surface and are sheared along the beam; times and absorption are taken at the receiver's point; patches
+    follow the surface and are sheared along the beam. Times and absorption are taken at the receiver's point. Patches
     cut by edges count by their covered share. Over 6 m/s waves, the published geometry's water signal differs from the
     reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below. At 75 degrees over 3 m/s waves, it differs
-    by -1.4 +- 0.6 and -0.5 +- 0.5 %. A 1 mrad beam at 40 degrees over 10 m/s, which meets several facets, differs by -2
-    +- 1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``) have
-    more bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not
-    from Mitsuba's gradients.
+    by -1.4 +- 0.6 and -0.5 +- 0.5 %. A 1 mrad beam at 40 degrees over 10 m/s meets several facets. It differs by -2 +-
+    1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``) have more
+    bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not from
+    Mitsuba's gradients.
 
     .. code-block:: xml
 

@@ -36,8 +36,8 @@ class LidarTransmitter(EmitterWithoutExtent):
     Water around such a lidar has one refractive and one group index. Light that reaches the surface from below is
     reflected and refracted, and returns from targets in the air.
 
-    From orbit, lengths are relative to the distance from a point near the scene, and rays start just above it: times
-    are accurate to a millimetre of range in single precision.
+    From orbit, lengths are relative to the distance from a point near the scene, and rays start just above it. Times
+    are then accurate to a millimetre of range in single precision.
 
     .. code-block:: xml
 

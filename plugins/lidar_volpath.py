@@ -32,9 +32,9 @@ class LidarVolpath(VolpathIntegrator):
     The unbiased reference. Paths start at the receiver, cross the surface (waves and ripples), scatter to any order,
     meet bottom and targets, and are reflected inside the surface. No path meets a point laser by chance. Each vertex
     under water therefore samples a direction in which the laser may appear through a flat sea with the same total slope
-    variance, traces it to the real surface, and connects there. A path that reaches the surface unscattered is
-    connected there, too. Both estimate the same paths; the balance heuristic combines them (Veach and Guibas 1995,
-    doi:10.1145/218380.218498).
+    variance. It traces this direction to the real surface, and connects there. A path that reaches the surface
+    unscattered is connected there, too. Both estimate the same paths; the balance heuristic combines them (Veach and
+    Guibas 1995, doi:10.1145/218380.218498).
 
     Straight lines connect a laser under water. Its light reaches a scattering event from one direction, so that phase
     functions with a strong forward peak make rare, large values. In multiple scattering from a narrow beam, the

@@ -40,19 +40,19 @@ class OceanSurface(mi.Mesh):
 
     Waves are linear: independent, with Gaussian heights and slopes, without the sharper crests of real waves. The mesh
     represents the waves from the shortest one up. The rest of the total slope variance, along and across the wind, is
-    an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model for Gaussian slopes;
-    the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With ``cox_munk``
+    an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model for Gaussian slopes.
+    Its index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With ``cox_munk``
     and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The ripple variance is at least
     1e-5, so that a point laser can be connected; the loaded object's `slope_variance` is the total. A mesh needs waves
     shorter than a sixteenth of the period: where automatic cells are longer, all slopes are ripples.
 
-    Real slopes are skewed and peaked. With ``slope_distribution`` ``gram_charlier`` the ripples, a
-    ``gram_charlier_dielectric``, have the third and fourth moments by which waves and ripples together reach Cox and
-    Munk's slope density. At 20 degrees off nadir it is 1.19 times the Gaussian density looking upwind and 0.74 downwind
-    at 6 m/s, 0.95 and 0.87 at 10 m/s, and 1.11 at nadir. It was measured up to 2.5 standard deviations, with standard
-    errors of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples with a small share of the slope
-    variance (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused: narrow beams, which
-    resolve short waves, then need a longer ``shortest_wave``.
+    Real slopes are skewed and peaked. With ``slope_distribution`` ``gram_charlier`` the ripples are a
+    ``gram_charlier_dielectric``. Their third and fourth moments let waves and ripples together reach Cox and Munk's
+    slope density. At 20 degrees off nadir it is 1.19 times the Gaussian density looking upwind and 0.74 downwind at 6
+    m/s, 0.95 and 0.87 at 10 m/s, and 1.11 at nadir. It was measured up to 2.5 standard deviations, with standard errors
+    of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples with a small share of the slope variance
+    (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused. Narrow beams, which resolve short
+    waves, then need a longer ``shortest_wave``.
 
     Finer cells show the same waves with smoother facets: halving automatic cells changes the surface echo by less than
     a render's default error, 3 %. The shortest wave divides the sea into waves, drawn by the seed, and ripples, the
@@ -71,13 +71,13 @@ class OceanSurface(mi.Mesh):
     waves; ripples are drawn anew on each way. With ``ripple_focusing``, light that crosses the sea twice is multiplied
     by a mean enhancement: correlated ripples against independent ones. It depends on the echo's depth and on the number
     of scattering events, as each moves one way against the other (`mitransient_lidar.physics.sea.double_passage`). At 3
-    m/s, with waves from 1.06 m, it is 2.2, 1.5 and 1.1 at 1, 3 and 8 m for unscattered light, and 1.25, 1.15 and 1.04
-    after one forward scattering event; at 6 and 10 m/s 1.4 and 1.2 at 1 m. With it the ``table1`` echoes agree within 4
-    % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m; without it the shortest ones give 16, 23, 20 and 11
-    % more at 1, 2, 3 and 5 m. One location has the mean, without its own ripple pattern. It depends on centimetre
-    waves, which slicks lack. Above half a metre, where it would grow, few data exist, and depths are within the waves:
-    it falls to 1 at the surface. Seas without a ripple spectrum (``flat``, ``height_map``) and lidars under water have
-    none. Give ``shortest_wave`` to compare images with few-pixel receivers on exactly the same sea.
+    m/s, with waves from 1.06 m, it is 2.2, 1.5 and 1.1 at 1, 3 and 8 m for unscattered light. After one forward
+    scattering event it is 1.25, 1.15 and 1.04. At 6 and 10 m/s it is 1.4 and 1.2 at 1 m. With it the ``table1`` echoes
+    agree within 4 % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m. Without it the shortest ones give
+    16, 23, 20 and 11 % more at 1, 2, 3 and 5 m. One location has the mean, without its own ripple pattern. It depends
+    on centimetre waves, which slicks lack. Above half a metre, where it would grow, few data exist, and depths are
+    within the waves: it falls to 1 at the surface. Seas without a ripple spectrum (``flat``, ``height_map``) and lidars
+    under water have none. Give ``shortest_wave`` to compare images with few-pixel receivers on exactly the same sea.
 
     With more than 1024 of the shortest waves (or pairs of cells) per period, the waves are a sum of bands. The longest
     waves equal the waves in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the
@@ -91,8 +91,8 @@ class OceanSurface(mi.Mesh):
     up the shore. Wake heights stay within a quarter of the depth; a mean slope stays as given.
 
     Foam (``foam``) covers whole faces: a Lambertian plate with ``foam_reflectance``, from above and from below, that
-    absorbs the rest. It lies where the waves rise most above their surroundings within 2 m, so that it follows the
-    crests of short waves, as many as give the cover; on a sea without waves each face has the cover as a share. Foam
+    absorbs the rest. It lies where the waves rise most above their surroundings within 2 m, and thus follows the crests
+    of short waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam
     approaches ``surf_foam`` where the depth limits the waves. The infrared needs a lower reflectance: by the shape in
     Frouin et al. 1996, the value at 1064 nm is half the value at 532 nm.
 
@@ -166,7 +166,7 @@ class OceanSurface(mi.Mesh):
     def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
 
-        Waves follow bottom depths in the scene frame as `followed_depths` says. Ripple edits stay. Raises UserError if
+        Waves follow bottom depths in the scene frame as in `followed_depths`. Ripple edits stay. Raises UserError if
         the mesh has been edited, and must change.
         """
         read = OCEAN_SURFACE.reader(self._values.get)

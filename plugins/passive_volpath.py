@@ -20,8 +20,8 @@ class PassiveVolpath(VolpathIntegrator):
     .. parameters::
 
     Renders each pixel's radiance [W m^-2 sr^-1 nm^-1]. Paths start uniformly over the field of view and are traced as
-    in ``lidar_volpath``, where the sun replaces the laser: each path is connected to one point on the sun's disc. Paths
-    that leave the scene meet the sky. A separate ray samples the sky that the sea reflects, as few paths are reflected.
+    in ``lidar_volpath``. The sun replaces the laser: each path is connected to one point on the sun's disc. Paths that
+    leave the scene meet the sky. A separate ray samples the sky that the sea reflects, as few paths are reflected.
 
     The sea must be rough, as every ``ocean_surface`` is: through a smooth ``dielectric`` paths meet the sun's disc only
     by chance, and the image is noisy. Distances to scattering events are drawn from the scattering coefficient, and

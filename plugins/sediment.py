@@ -31,11 +31,11 @@ class Sediment(mi.BSDF):
     .. math:: p(g) = \frac{s\,(1-b^2)}{(1 - 2b\cos g + b^2)^{3/2}} + \frac{(1-s)(1-b^2)}{(1 + 2b\cos g + b^2)^{3/2}},
 
     where :math:`\mu` are cosines with the normal, *w* the particle albedo, and *H* Hapke's approximation of
-    Chandrasekhar's function (Hapke 2002, doi:10.1006/icar.2002.6853; opposition effect by shadows, Hapke 1986,
-    doi:10.1016/0019-1035(86)90108-9). The albedo *w* is chosen to give the ``reflectance``. A lidar sees the peak at
-    *g* = 0 by its own light. A level bottom's echo is :math:`\pi f / R` times the echo of a Lambertian bottom with the
-    reflectance *R*: 1.29 times at vertical incidence with the defaults and *R* = 0.1. Roughness, porosity and coherent
-    backscattering are left out.
+    Chandrasekhar's function (Hapke 2002, doi:10.1006/icar.2002.6853). The opposition effect by shadows follows Hapke
+    1986, doi:10.1016/0019-1035(86)90108-9. The albedo *w* is chosen to give the ``reflectance``. A lidar sees the peak
+    at *g* = 0 by its own light. A level bottom's echo is :math:`\pi f / R` times the echo of a Lambertian bottom with
+    the reflectance *R*. This is 1.29 at vertical incidence with the defaults and *R* = 0.1. Roughness, porosity and
+    coherent backscattering are left out.
 
     The defaults for the opposition effect are the example in figure 8.15 of Hapke's book (1993), which DISORT uses. No
     published values for particles under water were found: give measured ones. Submerged carbonate sands lit vertically

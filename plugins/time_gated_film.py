@@ -30,10 +30,10 @@ class TimeGatedFilm(mi.Film):
     response time, after the last light in any pixel. The last light comes from a bottom or target. Multiply scattered
     light gets up to 40 ns more, a quarter of the echo's time in the water, and the time from the beam to the edge of
     the view. Where no bottom is seen, or below 1e-12, the last light comes from the depth at which the column signal
-    has fallen to 1e-6 by the system attenuation of Gordon (1982): the beam attenuation coefficient in a narrow view,
-    the diffuse one in a wide view. A film with gates contains these and all direct echoes.
+    has fallen to 1e-6. The system attenuation of Gordon (1982) determines it: the beam attenuation coefficient in a
+    narrow view, the diffuse one in a wide view. A film with gates contains these and all direct echoes.
 
-    From a height H [m] at the angle theta off nadir, the sea echo arrives after 2 H/(0.2998 cos(theta)) ns; each metre
+    From a height H [m] at the angle theta off nadir, the sea echo arrives after 2 H/(0.2998 cos(theta)) ns. Each metre
     of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees.
 
     Bins are half open, [start, start + width). After a render with a lidar integrator, ``develop`` returns the energy
@@ -41,8 +41,8 @@ class TimeGatedFilm(mi.Film):
     that the same seed gives the same bits.
 
     ``mitransient_lidar.render`` cuts gates from the waveform, after pulse and response. Where an imager's histogram
-    exceeds the allowed memory, each arrival is added to the gates open during its pulse instead, and ``bin_width_ns``
-    and ``bin_count`` only set the end of the record.
+    exceeds the allowed memory, each arrival is added to the gates open during its pulse instead. In this case
+    ``bin_width_ns`` and ``bin_count`` only set the end of the record.
 
     .. code-block:: xml
 

@@ -123,8 +123,9 @@ def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: flo
     Returns
     -------
     along, across, up : ndarray
-        Shift [m/rad] in the line of sight, across it and vertically, in the shape of `depth`, to first order: for a
-        point at measured ranges, by an error in the angle from nadir (along and up), and by one across it.
+        Shift [m/rad] in the line of sight, across it and vertically, in the shape of `depth`, to first order, for a
+        point at measured ranges. An error in the angle from nadir causes along and up, an error across it causes
+        across.
     """
     water = float(snell(off_nadir, n))
     cos_air, cos_water = float(np.cos(off_nadir)), float(np.cos(water))
@@ -159,9 +160,9 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
     Notes
     -----
     ``subaqueous_vertical`` is the root mean square error of depths below the sea in the beam, over shots on all waves
-    at a wind: sqrt(bias^2 + spread^2), for the channel with the smallest. ``subaqueous_horizontal`` combines the
-    refraction by the mean slopes in the beam, which a survey assumes to be level (pooled over waters and depths at a
-    wind), and the beam's standard deviation on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the
+    at a wind: sqrt(bias^2 + spread^2), for the channel with the smallest. ``subaqueous_horizontal`` combines two parts:
+    the refraction by the mean slopes in the beam, which a survey assumes to be level (pooled over waters and depths at
+    a wind), and the beam's standard deviation on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the
     summed squares of these and of the trajectory errors; horizontal errors are means over both axes.
     """
     trajectory = trajectory or TrajectoryErrors()
@@ -233,8 +234,8 @@ def write_fits(found: xr.Dataset, part: str, path: str | os.PathLike[str]) -> No
     part : str
         ``vertical`` or ``horizontal``.
     path
-        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation; rows
-        by wind [m/s] and then by water, nan where there is no fit.
+        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation. Rows
+        are by wind [m/s] and then by water, nan where there is no fit.
     """
     fits = {f"{part}_{name}": name for name in "ab"}
     frame = found[[*fits]].to_dataframe(["wind_speed", "water"]).reset_index()

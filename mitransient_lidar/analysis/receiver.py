@@ -108,22 +108,22 @@ def detect_waveforms(
     -------
     xarray.Dataset
         ``signal`` and ``saturated`` over (shot, pixel, time) or (shot, row, column, time), for a series all records of
-        its first shot first; over the same dimensions, without shot unless it is a series, the closed forms
+        its first shot first. The closed forms are over the same dimensions, without shot unless it is a series:
         ``signal_mean``, ``signal_deviation`` (standard deviation in a shot), ``snr`` and ``saturation`` (probability),
         and ``signal_mean_stderr``, the change in the mean by a render's ``waveform_stderr``. The signal is in V, after
         a counter in counts per bin, without an amplifier in electrons per bin. Per pixel, ``saturated_shots`` is the
         share of shots with saturated samples, ``saturated_samples`` the share of saturated samples [1]. ``time`` [ns],
         ``time_start_ns`` and ``bin_width_ns`` describe the samples; other coordinates and attributes come from the
-        result, with the chain's parameters as ``receiver.*``, ``gain`` and ``optical_density`` as used (``chosen``
-        names the one that was 'auto'), and ``fitting_gain`` and ``fitting_optical_density``, each of which avoids
-        saturation while the other one is kept (`ReceiverChain.fitting_gain`). Where channels differ, chain attributes
-        are ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels comes
-        from `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is the weight of a bin's light in
-        later samples. If a converter stores blocks, samples outside them are NaN, and ``dark_level`` and
-        ``block_level`` over the pixels are the level without light and the threshold level.
+        result. The chain's parameters are added as ``receiver.*``, with ``gain`` and ``optical_density`` as used;
+        ``chosen`` names the one that was 'auto'. ``fitting_gain`` and ``fitting_optical_density`` each avoid saturation
+        while the other one is kept (`ReceiverChain.fitting_gain`). Where channels differ, chain attributes are
+        ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels comes from
+        `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is the weight of a bin's light in later
+        samples. If a converter stores blocks, samples outside them are NaN, and ``dark_level`` and ``block_level`` over
+        the pixels are the level without light and the threshold level.
 
-        A camera gives ``signal`` and ``saturated`` over (frame, row, column, gate) or (frame, pixel, gate), for a stack
-        over ``frame`` all of its first frame first, as integers [DN] with the fixed pattern of `Camera.pattern`. The
+        A camera gives ``signal`` and ``saturated`` over (frame, row, column, gate) or (frame, pixel, gate), as integers
+        [DN] with the fixed pattern of `Camera.pattern`. A stack over ``frame`` gives all of its first frame first. The
         closed forms are over the same dimensions, without frame unless the stack has it, and for each pixel with its
         pattern; ``snr`` is NaN where most frames saturate, ``signal_mean_stderr`` is by ``gate_energy_stderr``, and
         ``dark_level`` [DN] is the mean without light. A mean over ``frame`` averages. The coordinates come from the
@@ -139,7 +139,7 @@ def detect_waveforms(
     Notes
     -----
     If the result includes a response (``response_time_ns``), an amplifier's bandwidth smooths it again, and the shot
-    noise lacks that response's correlation: render with a response time of 0 for a chain with a bandwidth. Dead times
+    noise lacks that response's correlation. Render with a response time of 0 for a chain with a bandwidth. Dead times
     of counters and cells lose light without being marked as saturated.
     """
     dataset = results.dataset_of("dataset", dataset, "waveforms", "gates")

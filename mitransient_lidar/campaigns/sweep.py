@@ -202,7 +202,7 @@ def complete(
     retry_failed: bool,
     progress: ProgressCallback | None,
 ) -> Store:
-    """Render what is missing in a store, and return it; options as for `campaign`."""
+    """Render the missing runs of a store, and return it; options as for `campaign`."""
     if workers is not None and scheduler is not None:
         raise UserError(f"workers = {workers} are of this machine, and the scheduler has its own: give one of both")
     number = usable_processors() if workers is None else integer("workers", workers, 1, 1024)

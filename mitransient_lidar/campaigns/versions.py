@@ -40,7 +40,7 @@ def own_versions() -> dict[str, str]:
 
 
 def difference(wanted: Mapping[str, str], found: Mapping[str, str]) -> str | None:
-    """Return in words what is found where another version is wanted, None where all are the same."""
+    """Return in words which version is found where another one is wanted, None where all are the same."""
     texts: list[str] = []
     for name, version in wanted.items():
         other = found.get(name, "unknown")

@@ -128,7 +128,7 @@ class Command:
 
 
 def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Parameter]) -> Callable[..., None]:
-    """Return a function as Typer takes it, that keeps files of others and is silent where it is asked to be."""
+    """Return a function for Typer that keeps other files and can be silent."""
     listed = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in listed]
     run.__name__, run.__annotations__ = name.replace("-", "_"), {}
     run.__signature__ = inspect.Signature(listed)  # type: ignore[attr-defined]

@@ -2,7 +2,7 @@
 
 An instrument is an XML file in ``scenes/instruments``, a scene part: parameters (``<default>``), emitter and sensor.
 The first line of its first comment is the title; the rest describes the instrument and numbers its sources as [1], [2],
-... A parameter's comment on its own line refers to a source, or says "assumed" if there is none.
+... A parameter's comment on its own line refers to a source, or reads "assumed" if there is none.
 """
 
 from __future__ import annotations

@@ -261,7 +261,7 @@ def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
 
     given = scene.scene_dict() if isinstance(scene, SceneSource) else scene
     check_dict(given)
-    # Of a source, too: its files are the files in the scene, not the files in its list.
+    # A source's files are the files in the scene, too, not the files in its list.
     found = SceneSource.of_dict(given)
     source = scene if isinstance(scene, SceneSource) else found
     with as_user_error(), _own_file_resolver():

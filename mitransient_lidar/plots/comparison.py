@@ -30,7 +30,7 @@ def plot_comparison(
     powers, errors = ([_by_pixel(one, name) for one in (first, second)] for name in ("waveform", "waveform_stderr"))
     counted = np.isfinite(outcome.z)
     if not are_few:
-        # Pixels share light: their sum's error differs from that of independent pixels, and has no band.
+        # Pixels share light: their sum's error differs from the error for independent pixels, and has no band.
         known = np.isfinite(powers[0]) & np.isfinite(powers[1])
         powers = [np.where(known, power, 0).sum(axis=0, keepdims=True) for power in powers]
         errors = [np.zeros_like(power) for power in powers]

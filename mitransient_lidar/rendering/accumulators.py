@@ -107,7 +107,7 @@ class PassAccumulator:
     origins
         Names of the separated light origins.
     parameters, differences
-        Parameters by which light is differentiated, and those of them that use central differences.
+        Parameters by which light is differentiated, and the subset with central differences.
     batches
         Number of pass batches whose power is kept.
     kept

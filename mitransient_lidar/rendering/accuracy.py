@@ -220,8 +220,9 @@ class ErrorWindow:
     def of_probe(cls, probe: Probe) -> ErrorWindow:
         """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width.
 
-        Where the record has no bottom, the window ends with the light from the water: when absorption alone has reduced
-        it to `COLUMN_LEVEL` after the surface echo, in the near infrared after nanoseconds, or else with the record.
+        Where the record has no bottom, the window ends with the light from the water, or else with the record. This
+        light ends when absorption alone has reduced it to `COLUMN_LEVEL` after the surface echo, in the near infrared
+        after nanoseconds.
         """
         scene, echoes, time_ns = probe.scene, probe.echoes, probe.scene.axis.centres_ns
         half_pulse = 0.5 * scene.transmitter.pulse.fwhm_ns

@@ -57,14 +57,14 @@ class _Side:
 class Differences:
     """Derivatives of impulse response and waveform by scene parameters, from passes that are added one by one.
 
-    Each pass renders the scene with a parameter above and below its value, from the same random numbers, with time bins
-    and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in renders of
-    waveforms, and follow beam and sea. The session and its scene stay unchanged.
+    Each pass renders the scene with a parameter above and below its value. Both renders share the random numbers, and
+    the time bins and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in
+    renders of waveforms, and follow beam and sea. The session and its scene stay unchanged.
 
-    Standard errors are smaller than with independent random numbers (median over lit bins, default steps): in `table1`
-    by factors of 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
-    (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), and in `fig15_2x2` by 8 (``layer_tops[1]``). Light that does
-    not reach a moving bottom or target is the same.
+    Standard errors are smaller than with independent random numbers (median over lit bins, default steps). In `table1`
+    the factors are 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
+    (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), in `fig15_2x2` 8 (``layer_tops[1]``). Light that does not
+    reach a moving bottom or target is the same.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
     The derivative's noise falls with the square root of the step or faster, and the bias grows with its square. Depths,
     the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which changes
     derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views 10 % of their width,
-    other angles 0.5 degrees, and all others 1 %. The sea's mean slope has steps of 0.2 degrees: at 3 m/s and 20 degrees
+    other angles 0.5 degrees, and all others 1 %. The sea's mean slope has steps of 0.2 degrees. At 3 m/s and 20 degrees
     off nadir they change the surface echo from Gaussian slopes by 15 %, and derivatives by 0.4 %.
     """
     known, scene = parameter_of(name), renderer.scene

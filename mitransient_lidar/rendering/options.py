@@ -20,9 +20,9 @@ SMALLEST_SHARE = 2**-9
 TargetError = Annotated[
     float | None,
     Option(
-        "Stop at this relative standard error in 95 % of the bins of lit pixels, from the surface echo to the end of "
-        "the bottom echo, or in 95 % of the gates or the lit pixels of an image. By default 0.03 within 300 s, with "
-        "gates 0.1 within 60 s, for images 0.05 within 120 s",
+        "Stop at this relative standard error in 95 % of the bins of lit pixels, surface echo to bottom echo, or in "
+        "95 % of the gates or of an image's lit pixels. By default 0.03 within 300 s, with gates 0.1 within 60 s, "
+        "for images 0.05 within 120 s",
         *(0, 1),
         above=True,
     ),

@@ -31,13 +31,14 @@ DEFAULT_QUANTILE = 0.95
 class Progress:
     """Progress of a render or a study.
 
-    Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or ``run``), elapsed
-    and estimated remaining time [s], median and 95th percentile of the relative standard errors, the requested error,
-    the number of completed units that have `failed`, and the `rate` of units per second.
+    Contains the numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or
+    ``run``), and the elapsed and estimated remaining time [s]. Also the median and 95th percentile of the relative
+    standard errors, the requested error, the number of completed units that have `failed`, and the `rate` of units per
+    second.
 
-    With a requested error: the quantile of the relative standard errors that must reach it, its value, the unit to
-    which the errors belong (``bins``, ``gates`` or ``pixels``), and estimates of the passes and the time [s] still
-    needed, None while they are unknown.
+    With a requested error it also contains the quantile of the relative standard errors that must reach it, and this
+    quantile's value. The errors belong to ``bins``, ``gates`` or ``pixels``. Estimates of the passes and the time [s]
+    still needed are None while they are unknown.
     """
 
     done: int
@@ -161,8 +162,8 @@ class PassLog:
     def attributes(self, seed: int) -> dict[str, Any]:
         """Return the result attributes that describe its passes.
 
-        With a requested error: the error and its quantile, the reached error, and an estimate of the time still needed
-        [s], 0 if the request was met and NaN if unknown.
+        With a requested error: the error and its quantile, and the reached error. Also an estimate of the time still
+        needed [s], 0 if the request was met and NaN if unknown.
         """
         attributes = {"seed": int(seed), "passes": self.count, "interrupted": int(self.interrupted)}
         if self.goal.target_error is None:

@@ -110,12 +110,12 @@ def render_passive(
     Returns
     -------
     xarray.Dataset
-        ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,), after ``frame`` with
-        its coordinate ``time_s`` [s] for several; with a filter ``background_power`` [W], which the receiver detects
-        without its laser. ``etendue`` [m^2 sr] is open area times pixel solid angle times the transmittance of optics
-        and (one way) air; power is radiance times etendue times filter width. The attribute ``background_radiance`` is
-        the mean over the field of view. After Ctrl-C it includes the frames that were begun, and the attribute
-        ``interrupted`` is 1.
+        ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,). Several frames come
+        first, over ``frame`` with its coordinate ``time_s`` [s]. A filter adds ``background_power`` [W], which the
+        receiver detects without its laser. ``etendue`` [m^2 sr] is open area times pixel solid angle times the
+        transmittance of optics and (one way) air; power is radiance times etendue times filter width. The attribute
+        ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that were begun,
+        and the attribute ``interrupted`` is 1.
 
     Raises
     ------

@@ -73,8 +73,8 @@ def render(
     ----------
     scene
         Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, a scene
-        record, or a session; or a result (a dataset, or its EXR or NetCDF file), which is rendered again with its own
-        options unless others are given. See `render_again`.
+        record, or a session. A result (a dataset, or its EXR or NetCDF file) is rendered again with its own options
+        unless others are given. See `render_again`.
     params
         Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
     instrument
@@ -85,8 +85,8 @@ def render(
         Name or dict of an integrator plugin, or an integrator; by default the scene's.
     target_error
         Relative standard error, greater than 0, at most 1, that ends the render after at least 8 passes. 95 % of the
-        bins of lit pixels must have reached it, from the surface echo to the end of the bottom echo; with gates, 95 %
-        of the gates, in the median over their lit pixels.
+        bins of lit pixels must have reached it, from the surface echo to the end of the bottom echo. With gates, 95 %
+        of the gates must have reached it, in the median over their lit pixels.
     target_quantile
         Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time

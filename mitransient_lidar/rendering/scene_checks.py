@@ -40,8 +40,8 @@ _PULSES = 5.0
 def check_scene(probe: Probe) -> None:
     """Refuse a probe's scene that can return no light within its record, and warn about parts that cannot contribute.
 
-    Warnings name shapes whose echo comes before or after the record, which lie out of view or outside the beam, or
-    partly in the air, and a laser and a receiver whose axes do not meet.
+    Warnings name shapes whose echo comes before or after the record, and shapes out of view, outside the beam, or
+    partly in the air. They also report a laser and a receiver whose axes do not meet.
 
     Raises
     ------

@@ -146,7 +146,7 @@ def attribute(name: str, value: Any) -> int | float | str | list[int] | list[flo
 
 
 def text(value: str | Path) -> str:
-    """Replace what UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
+    """Replace text that UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
     return str(value).replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
 
 

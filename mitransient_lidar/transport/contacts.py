@@ -40,7 +40,7 @@ _MOST_IN_A_STACK = 64
 class _Contact:
     """A shape and a larger one that coincide: a point on their faces [m], and both normals there, shape (3,).
 
-    `has_body` says whether the shape has another face behind the one that coincides.
+    `has_body` states whether the shape has another face behind the one that coincides.
     """
 
     shape: mi.Shape

@@ -1,4 +1,4 @@
-"""What the transport needs from plugins, which lie in a layer above it."""
+"""Protocols that the transport needs from plugins, which lie in a layer above it."""
 
 from __future__ import annotations
 

@@ -129,9 +129,9 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
 def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
     """Set the missing automatic values of each ``ocean_surface`` from the scene's lasers and receivers.
 
-    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
-    the lasers and receivers of a `model` instead, the meshes in both scenes have the same cells and waves. Shallow seas
-    follow the bottom, also of the model.
+    Plugins load without their siblings: this is done for loaded scenes, before they are used. With the lasers and
+    receivers of a `model` instead, the meshes in both scenes have the same cells and waves. Shallow seas follow the
+    bottom, also of the model.
     """
     if not (waiting := [sea for sea in seas_of(scene) if sea.footprints is None]):
         return

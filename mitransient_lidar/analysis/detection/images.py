@@ -148,7 +148,7 @@ class ImageTrial:
 
     Notes
     -----
-    The filters know the camera's fixed pattern, as for a calibrated camera.
+    The filters use the camera's fixed pattern, as for a calibrated camera.
     """
 
     light: FloatArray
@@ -253,9 +253,9 @@ class ImageTrial:
     def maps(self, frames: int) -> dict[str, FloatArray]:
         """Return the camera's maps over pixels and gates, shape (*pixels, gate), for one frame.
 
-        ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for a number of
-        frames, ``snr`` and probability of ``saturation`` of the light with the target, ``contrast`` of the target (NaN
-        without light), and ``contrast_to_noise`` with its standard error over the renders.
+        The maps are ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for
+        a number of frames, ``snr`` and the probability of ``saturation`` of the light with the target. Also the
+        target's ``contrast`` (NaN without light), and ``contrast_to_noise`` with its standard error over the renders.
         """
         renders = range(self.light.shape[1])
         coefficients, found = self.products.coefficients(frames, renders), []

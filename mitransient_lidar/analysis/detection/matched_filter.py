@@ -1,8 +1,8 @@
 """Time of a known echo with unknown height in noisy samples: the matched filter, and the lower bound of its error.
 
-The arguments are ``samples`` (records minus the background, shape (shots, samples)), ``templates`` (the echo at delays,
-shape (delays, samples)), ``delays_ns`` (in equal steps [ns], at least three) and the positive definite noise
-``covariance``, shape (samples, samples).
+The arguments ``samples`` are records minus the background, shape (shots, samples), and ``templates`` the echo at
+delays, shape (delays, samples). ``delays_ns`` are at least three equal steps [ns]. The noise ``covariance``, shape
+(samples, samples), is positive definite.
 """
 
 from __future__ import annotations

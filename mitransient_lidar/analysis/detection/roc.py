@@ -64,7 +64,7 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
     -----
     The standard error follows E. R. DeLong, D. M. DeLong and D. L. Clarke-Pearson, Biometrics 44, 837 (1988),
     doi:10.2307/2531595, equation 5 for one curve. The interval is normal in the area's logit and thus below 1. If all
-    pairs are separated, the standard error is 0 and the lower limit is the area at which as many pairs of independent
+    pairs are separated, the standard error is 0. The lower limit is then the area at which as many pairs of independent
     shots would all be separated with a probability of 1 - confidence.
     """
     from scipy.special import ndtri

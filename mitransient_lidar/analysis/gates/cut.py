@@ -33,12 +33,12 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     A gate's energy is the sum over bins of mean power times bin width times the gate's exact mean over the bin. The
     errors of bins are correlated: the standard error follows from bin errors and their ``error_correlation``, measured
     over the render's passes. Without it, as in a result from an EXR file, it is the quadrature sum times the median
-    error inflation for a sum over as many bins (attributes ``error_inflation_bins`` and ``error_inflation``; linear in
-    the logarithm of the number of bins, and beyond the last one proportional to the square root). It is at most the sum
-    of the errors, which is used if nothing is known. A gate with weights w is equivalent to (sum w)^2 / sum w^2 bins.
-    Derivatives in a result are cut in the same way, with the waveform's correlation: ``gate_energy_derivative`` and its
-    standard error, over ``parameter`` too. For gates that are narrower than the bins a warning states the largest
-    error, `GateTrain.cutting_error`; gates in a film are exact.
+    error inflation for a sum over as many bins. The attributes ``error_inflation_bins`` and ``error_inflation`` give
+    the inflation: linear in the logarithm of the number of bins, and beyond the last one proportional to the square
+    root. The error is at most the sum of the errors, which is used if nothing is known. A gate with weights w is
+    equivalent to (sum w)^2 / sum w^2 bins. Derivatives in a result are cut in the same way, with the waveform's
+    correlation: ``gate_energy_derivative`` and its standard error, over ``parameter`` too. For gates that are narrower
+    than the bins a warning states the largest error, `GateTrain.cutting_error`; gates in a film are exact.
     """
     dataset = results.dataset_of("dataset", dataset, "waveforms")
     if "waveform_stderr" not in dataset:

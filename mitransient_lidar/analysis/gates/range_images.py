@@ -81,8 +81,8 @@ def range_from_gates(
     interpolated between these and the 2 gates after it. After the echo it is at most the level of these 2 gates, since
     a target may end the column. Energies below their error are replaced by it.
 
-    Echo: the gate with the largest excess over the column, among gates that exceed it by 4 standard errors or are at
-    least half as significant as the most significant one, which excludes the bright column's noise near the surface.
+    Echo: the gate with the largest excess over the column. It must exceed the column by 4 standard errors or be at
+    least half as significant as the most significant gate, which excludes the bright column's noise near the surface.
     The depth is the centroid of the excess within `reach`. Its error assumes independent errors and gates not wider
     than the pulse; an echo's position within a wider gate is unknown.
 
@@ -140,8 +140,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Notes
     -----
     The echo is located in time, and its depth follows from `geometry.LinesOfSight`; without the geometry attributes,
-    from ``gate_depth`` in all pixels. On the axis of a receiver 20 degrees off nadir at 200 m, a pixel 10 mrad farther
-    from nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
+    from ``gate_depth`` in all pixels. Take the axis of a receiver 20 degrees off nadir at 200 m: a pixel 10 mrad
+    farther from nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
     """
     stack = dataset_of("stack", stack, "gates", "frames")
     stack = _light_of_frames(stack) if has_frames(stack) else average_frames(stack)
@@ -216,8 +216,8 @@ class _ColumnModel:
 
     An echo includes `half` gates on each side of k, which is at least `first`. Columns k of `mean` and `slope` give the
     line through the gates before the echo, with k `lever` after their middle. Column k of `between` gives the line
-    between the gates before and after the echo; column k of `deep`, applied to energies, the mean of the gates after
-    it, if `has_deep`.
+    between the gates before and after the echo. Column k of `deep`, applied to energies, gives the mean of the gates
+    after it, if `has_deep`.
     """
 
     def __init__(self, mid: FloatArray, half: int) -> None:

@@ -53,8 +53,8 @@ def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, 
     """Return the time [ns] by which waveforms are later than a model, whose light is searched for in the whole record.
 
     At this time the squared difference between compressed samples, asinh(value / 2 % of the largest), is least over the
-    record, with a scale of their own and a model that is dark outside its own record. The column and faint echoes count
-    beside the surface echo.
+    record. The samples have a scale of their own, and the model is dark outside its own record. The column and faint
+    echoes count beside the surface echo.
 
     Parameters
     ----------

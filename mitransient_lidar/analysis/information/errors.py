@@ -148,8 +148,8 @@ def estimate_errors(
     derivatives
         Derivatives of the model in standard deviations per unit of each parameter, shape (parameter, pixel, time).
     noise, model
-        Errors of the waveforms and of the model's Monte Carlo: standard deviations relative to the difference's, shape
-        (pixel, time), 0 where a sample is not used, and correlations by the distance in samples, shape (lags,).
+        Errors of the waveforms and of the model's Monte Carlo. Standard deviations are relative to the difference's,
+        shape (pixel, time), 0 where a sample is not used; correlations are by the distance in samples, shape (lags,).
     held
         Parameters at a bound, which are fixed, shape (parameter,).
     scaled
@@ -162,7 +162,7 @@ def estimate_errors(
         outer products add up to the errors' covariance; None where there are none.
     borrows
         Whether waveforms without batches come from a render, whose errors are correlated over its samples like the
-        model's: the model's batches, scaled to the waveform variances, then serve the waveforms, too.
+        model's. The model's batches, scaled to the waveform variances, then serve the waveforms, too.
     recorded
         Standard deviations of the render that recorded waveforms come from, relative to the difference's, shape (pixel,
         time): errors beside `noise`, with the model's correlations and batches.
@@ -170,7 +170,7 @@ def estimate_errors(
     Notes
     -----
     With the weighted derivatives J and the covariance C of the weighted differences, the parameter covariance is (J^T
-    J)^-1 J^T C J (J^T J)^-1, which is (J^T J)^-1 for independent errors. The chi-squared has the mean tr(Q C) and the
+    J)^-1 J^T C J (J^T J)^-1. For independent errors this is (J^T J)^-1. The chi-squared has the mean tr(Q C) and the
     variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, as has a scaled chi-squared distribution (F. E. Satterthwaite,
     Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
 
@@ -303,9 +303,9 @@ def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
 def noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int) -> FloatArray:
     """Return the variance of the mean over records from one record's variance.
 
-    Rounding has the same error in all records where the preceding noise is less than half a step. The mean square of
-    this error, over voltages within a step q with noise variance s^2, is q^2 / (2 pi^2) times the sum over k = 1, 2,
-    ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
+    Rounding has the same error in all records where the preceding noise is less than half a step. Take the mean square
+    of this error over voltages within a step q with noise variance s^2. It is q^2 / (2 pi^2) times the sum over k = 1,
+    2, ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
     doi:10.1017/CBO9780511754661), which is q^2/12 without noise.
     """
     if digitiser is None or shots == 1:

@@ -83,15 +83,15 @@ def fisher_information(
     -------
     xarray.Dataset
         Over ``parameter``, the derivatives' parameters and then the nuisances: ``bound``, the smallest standard
-        deviation of an unbiased estimate from one shot with all parameters unknown, ``bound_stderr`` by render noise
-        (NaN for less than three renders), ``bound_known`` with all others known, in the parameter's unit;
-        ``variance_share``, the share of the information that is in the sample variance, and ``monte_carlo_share``, the
-        addition by the noise of all renders together, relative to the information (see Notes). Over (parameter,
-        other_parameter): ``information`` and ``correlation`` of the estimates. Over (render, parameter), from three
-        renders on: ``bound_left_out``, without one of the renders. Per pixel ``lost_samples``, the share of samples
-        that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method`` and ``prior`` (a
-        nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on parameters that
-        the record does not determine, one per line.
+        deviation of an unbiased estimate from one shot with all parameters unknown, in the parameter's unit.
+        ``bound_stderr`` is its error by render noise (NaN for less than three renders), and ``bound_known`` the bound
+        with all others known. ``variance_share`` is the share of the information that is in the sample variance.
+        ``monte_carlo_share`` is the addition by the noise of all renders together, relative to the information (see
+        Notes). Over (parameter, other_parameter): ``information`` and ``correlation`` of the estimates. Over (render,
+        parameter), from three renders on: ``bound_left_out``, without one of the renders. Per pixel ``lost_samples``,
+        the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method``
+        and ``prior`` (a nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on
+        parameters that the record does not determine, one per line.
 
     Raises
     ------

@@ -46,7 +46,7 @@ def fit_table(
     residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
     sentences = list(messages)
     if noise is None:
-        # A sample's noise is independent of the next one's: it is left out of what the scene does not explain.
+        # A sample's noise is independent of the next one's: it is left out of the unexplained part.
         shared = float(np.nansum(residual[:, 1:] * residual[:, :-1]))
         unexplained = max(shared, 0.0) / max(float(np.nansum(found.values[weights > 0] ** 2)), 1e-300)
         deviation = math.sqrt(errors.reduced) if errors.reduced > 0 else 1.0

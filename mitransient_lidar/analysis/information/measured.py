@@ -156,7 +156,7 @@ def measured(
     ----------
     source
         A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
-        averaged; its EXR or NetCDF file; or a CSV file with the column ``time_ns``, one column for each pixel in any
+        averaged; or its EXR or NetCDF file. A CSV file has the column ``time_ns``, one column for each pixel in any
         unit, and optionally columns ``NAME_stderr`` with their standard errors.
     noise
         Standard deviation of every waveform sample, above 0 and in the waveforms' unit, instead of their own.
@@ -285,8 +285,8 @@ def _recorded(
 def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:
     """Return the deviations of a render's pass batches from its mean, shape (batch, pixel, time), or None.
 
-    The sum of their outer products is an unbiased estimate of the error covariance over all bins: deviations of the
-    means over n of N passes in B batches are multiplied by the root of n/N/(B - 1).
+    The sum of their outer products is an unbiased estimate of the error covariance over all bins. For N passes in B
+    batches, the deviations of means over n passes are multiplied by the root of n/N/(B - 1).
     """
     if "waveform_batch" not in dataset or dataset.sizes["batch"] < 2:
         return None
@@ -299,10 +299,10 @@ def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray |
 def correlation(attributes: Any) -> FloatArray:
     """Return the correlation between a render's bin errors by their distance in bins, shape (lags,).
 
-    The pulse smooths bin errors, so that neighbours agree. The attribute ``error_inflation`` contains the standard
-    deviation of means over n = 1, 2, 4, ... bins divided by the value for independent bins, f(n)^2 = 1 + 2 sum (1 -
-    k/n) r(k) over the lags 0 < k < n. It is solved for r constant between these numbers of bins. Without it, bins are
-    independent.
+    The pulse smooths bin errors, so that neighbours agree. The attribute ``error_inflation`` is the ratio of two
+    standard deviations for means over n = 1, 2, 4, ... bins: the actual one and the one for independent bins. Its
+    square is f(n)^2 = 1 + 2 sum (1 - k/n) r(k) over the lags 0 < k < n. It is solved for r constant between these
+    numbers of bins. Without it, bins are independent.
     """
     bins, inflation = (np.atleast_1d(attributes.get(name, ())) for name in ("error_inflation_bins", "error_inflation"))
     found = [1.0]

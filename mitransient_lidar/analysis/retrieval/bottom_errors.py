@@ -57,7 +57,7 @@ class ReflectanceFlag(IntFlag):
     UNCERTAIN = 16  # its standard error would exceed half the reflectance
 
 
-#: What the flags mean for a user.
+#: Explanations of the flags.
 REASONS = {
     ReflectanceFlag.NO_COLUMN: "no column that can be fitted",
     ReflectanceFlag.NO_DIRECT_LIGHT: "the pixels see too little of the beam",
@@ -79,7 +79,7 @@ def loss_error(
 
     The loss assumes homogeneous water. Two signs that the water differs below count in full: the loss by two
     exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over the
-    column's, each minus its value for homogeneous water. Both are means over the shots, in the same water.
+    column's. From each its value for homogeneous water is subtracted. Both are means over the shots, in the same water.
 
     Parameters
     ----------
@@ -146,9 +146,9 @@ def whole_energy(
 
     Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy is not
     in the Gaussian fitted to the echo. The signal sum about the echo contains all of it, after subtraction of the
-    column before the echo and the column's late light after it. The Gaussian counts in four cases: noise makes the sum
-    less certain than 10 %, there is no column, the sum would reach beyond the record, or another echo is less than four
-    echo widths before the bottom's.
+    column before the echo and the column's late light after it. The Gaussian counts where noise makes the sum less
+    certain than 10 %, or there is no column. It also counts where the sum would reach beyond the record, or another
+    echo is less than four echo widths before the bottom's.
 
     Parameters as for `loss_error`.
     """

@@ -32,8 +32,8 @@ BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.05)
 class WaterEstimate:
     """Water from a column's signal [1/m]; arrays with one shape, NaN where no water fits.
 
-    They are a, bb, and Kd for downwelling irradiance with the sun at the zenith, and the beam attenuation c for the
-    typical particle bb/b, and for the largest and the smallest.
+    They are a, bb, and Kd for downwelling irradiance with the sun at the zenith. The beam attenuation c is given for
+    the typical particle bb/b, and for the largest and the smallest.
     """
 
     absorption: FloatArray
@@ -62,17 +62,17 @@ def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: fl
     ----------
     decay, backscatter : array_like
         Attenuation K along the path in the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi) including
-        multiple scattering [1/(m sr)]: the power at the surface, extrapolated with K, over `LidarSystem.column_gain`
-        and the fraction of the beam in view.
+        multiple scattering [1/(m sr)]. The backscatter is the power at the surface, extrapolated with K, over
+        `LidarSystem.column_gain` and the fraction of the beam in view.
     excess, level : float
         K minus the absorption [1/m], and backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Notes
     -----
     Kd follows Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on forward
-    scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw by sea water at 532 nm, for particles
-    with r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters in `water_types` have 0.0033 (chlorophyll
-    30 mg/m^3) to 0.0198 (Petzold's turbid water).
+    scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw by sea water at 532 nm. It is given for
+    particles with r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters in `water_types` have 0.0033
+    (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
     """
     fall, seen = np.broadcast_arrays(np.asarray(decay, dtype=np.float64), np.asarray(backscatter, dtype=np.float64))
     a, bb = fall - excess, 2 * np.pi * seen / level
@@ -101,8 +101,8 @@ def bottom_reflectance(
     """Return a Lambertian bottom's reflectance from its echo over the column's signal at the same time.
 
     It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown. It needs the
-    bottom echo's energy [J], the column's power, extrapolated to the echo's time [W], its backscatter [1/(m sr)], and
-    the light's angle from the vertical in the water, alpha.
+    bottom echo's energy [J], the column's power [W], extrapolated to the echo's time, and its backscatter [1/(m sr)].
+    The angle alpha is the light's angle from the vertical in the water.
 
     Notes
     -----

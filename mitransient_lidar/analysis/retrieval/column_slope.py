@@ -32,8 +32,8 @@ class ColumnBins:
     (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
     singly scattered light, even in a wide beam off nadir, since a mean over depths has the exponential's slope.
 
-    K depends on the sea. Ripples scatter light out of a narrow field of view, and waves that focus both beam and view
-    increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
+    K depends on the sea. Ripples scatter light out of a narrow field of view. Waves that focus both beam and view
+    increase the signal from some metres below. Single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
     0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
     """
 
@@ -83,9 +83,9 @@ class ColumnBins:
     def weights(self, energy: FloatArray, stderr: FloatArray) -> tuple[FloatArray, float]:
         """Return the weights of the bins' logarithms in K [1/m], shape (bins,), and its standard error [1/m].
 
-        Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential in s, since a bin without
-        rare paths has too low a signal and too small an error. The standard error assumes independent bins. Bins in one
-        pass share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
+        Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential in s. A bin without rare
+        paths has too low a signal and too small an error. The standard error assumes independent bins. Bins in one pass
+        share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
 
         Raises
         ------

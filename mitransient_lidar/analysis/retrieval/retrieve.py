@@ -216,14 +216,14 @@ def bottom(
     Column and bottom decay as `scattered_light` finds for homogeneous water with typical particles. The light is the
     beam's light in the pixels (coordinate ``beam_share``) through the open part of the aperture. Reflectance errors
     include noise, 1 % of the echo energy, the unknown particle bb/b, waves that focus light, slope and height of the
-    sea, and the share of the beam that a scene's targets hide. They also include layers: differences from homogeneous
-    water, or 3 % of the optical depth of both ways in columns too short to be tested. A relative error above 0.5 leaves
-    no value. Errors of efficiencies and of the pulse energy are not included.
+    sea, and the beam share that targets hide. They also include layers: differences from homogeneous water, or 3 % of
+    the optical depth of both ways in columns too short to be tested. A relative error above 0.5 leaves no value. Errors
+    of efficiencies and of the pulse energy are not included.
 
     A correction that is not expected to lower the variance is not applied. The slope correction is left out where
     `slope_corrections.variances` gives no lower variance with it, and the column correction where its noise exceeds the
     reflectance scatter over the shots. With at least 8 shots, a correction that increases the reflectance scatter is
-    not applied to any, as focusing by waves may have the opposite effect; with fewer shots their scatter is not known.
+    not applied to any, as focusing by waves may have the opposite effect. With fewer shots their scatter is not known.
     """
     lidar = lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
@@ -395,7 +395,7 @@ def retrieve(
     slope_deviation: Annotated[
         tuple[float, float] | None,
         Option(
-            "Standard deviations of an unknown sea's slopes, by default those of a series",
+            "Standard deviations of an unknown sea's slopes, by default from a series",
             0,
             above=True,
             form="ALONG,ACROSS",

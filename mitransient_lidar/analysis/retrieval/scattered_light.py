@@ -1,9 +1,9 @@
 """Light that water scatters forwards, in a column's signal and in a bottom's echo.
 
 Column and bottom do not decay alike. Light that forward scattering has turned from its ray meets more water per depth
-and returns by other angles than 180 degrees, so that the column gains on the bottom with depth; light from both leaves
-the field of view. `physics.lidar.echo_estimate` gives both signals for a water; this module finds the water whose
-column has a measured level and decay.
+and returns by other angles than 180 degrees: the column gains on the bottom with depth. Light from both leaves the
+field of view. `physics.lidar.echo_estimate` gives both signals for a water; this module finds the water whose column
+has a measured level and decay.
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def _curves(
     middle = 0.5 * (edges[1:] + edges[:-1])
     single = geometry.water_gain(middle * geometry.cos_water, geometry.off_nadir) * b * float(phase.eval_s(1.0)) * _BIN
     sigma = view.echo_width / math.sqrt(8 * math.log(2))
-    # Light that large angles turn twice, which the estimate lacks: it travels about level from one to the other, no
+    # Light that large angles turn twice, which the estimate lacks. It travels about level from one to the other, no
     # farther than it can be late, and no farther than the view reaches.
     reach = geometry.slant_range * view.radius
     twice = 1 + bb / (1 / (_ALONG * middle) + 1 / (_ACROSS * reach))

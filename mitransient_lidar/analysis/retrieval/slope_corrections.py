@@ -57,12 +57,12 @@ def bottom_depth(
 ) -> FloatArray:
     """Return a bottom point's depth below the mean sea level [m], corrected for the surface's height and slope.
 
-    It is D = R cos(theta) - H + s cos(alpha), with the paths along the ray in air, R, and in the water, s [m], the
-    lidar's height above the mean sea level, H [m], and the ray's angle from the vertical in air, theta [rad].
+    It is D = R cos(theta) - H + s cos(alpha), with the paths along the ray in air, R, and in the water, s [m]. H is the
+    lidar's height above the mean sea level [m], and theta the ray's angle from the vertical in air [rad].
 
     Notes
     -----
-    A face away from the lidar refracts the ray towards the vertical: the path to the bottom is shorter (Tulldahl 2006,
+    A face away from the lidar refracts the ray towards the vertical. The path to the bottom is shorter (Tulldahl 2006,
     FOI-R-2074-SE, figure 12), and a depth with a level sea's angle is too small. Assumptions: the beam follows the axis
     through a plane, and scattering does not change the echo time.
     """
@@ -114,7 +114,8 @@ def variances(
     Notes
     -----
     Without the correction the variance is the true correction's variance over the sea, with it the variance of its
-    error: both to first order about the level sea, for independent slopes and range. NaN quantities are not corrected.
+    error. Both are to first order about the level sea, for independent slopes and range. NaN quantities are not
+    corrected.
     """
     level = np.array([0.0, 0.0, surface_range])
     without, corrected = np.zeros(1), np.zeros(1)

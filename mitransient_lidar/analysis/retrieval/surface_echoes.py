@@ -106,9 +106,9 @@ class SeaLidar(LidarGeometry):
     ) -> tuple[FloatArray, FloatArray]:
         """Return energy and mean time of the pixels' surface echoes, shape (shots, pixels); see `SeaShots`.
 
-        Surface points, shape (shots, points) each, have a position from the point where the axis meets the mean sea
-        level, x along the azimuth [m], slopes in x and y [1], and a horizontal `area` [m^2]. The ripples' slope
-        variances are along and across the wind [1].
+        Surface points, shape (shots, points) each, have a position x, y, z [m] from the point where the axis meets the
+        mean sea level, x along the azimuth. Slopes are in x and y [1], and a point has a horizontal `area` [m^2]. The
+        ripples' slope variances are along and across the wind [1].
         """
         sin, cos = math.sin(self.off_nadir), math.cos(self.off_nadir)
         away_x, away_z = x + self.height * sin / cos, z - self.height
@@ -148,8 +148,8 @@ class SeaShots:
     time_ns
         Mean two-way time of the echo's energy [ns], NaN without energy, shape (shots, pixels).
     along, across, height
-        Mean sea slopes over the beam's footprint, positive along for a face towards the lidar and across for a rise to
-        its left [1], and mean height above the mean sea level [m], shape (shots,).
+        Mean sea slopes over the beam's footprint [1] and mean height above the mean sea level [m], shape (shots,).
+        Slopes are positive along for a face towards the lidar and across for a rise to its left.
     """
 
     energy: FloatArray
@@ -186,10 +186,10 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
     the 512 cells of a realisation add planes with random height and slopes.
 
     A horizontal area dA sends the energy Q A p F(0) D dA/(4 n_z R^4) back to the aperture A. Here Q p is the beam's
-    energy per solid angle, R the distance, n_z the vertical component of the facet normal, F the Fresnel reflectance
-    and D the distribution of ripple normals about the facet's. D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi sqrt(v_u
-    v_c) cos^4), for slopes s of the ray against the facet and ripple slope variances v (Walter, Marschner, Li and
-    Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking).
+    energy per solid angle, R the distance, n_z the vertical component of the facet normal, and F the Fresnel
+    reflectance. The ripple normals' distribution about the facet's is D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi
+    sqrt(v_u v_c) cos^4), for slopes s of the ray against the facet and ripple slope variances v. See Walter, Marschner,
+    Li and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
     """
     wind = in_range("wind_speed", wind_speed, LEAST_WIND_SPEED, MAX_WIND_SPEED)
     spectrum = MatchedSpectrum(ElfouhailySpectrum(wind, direction=wind_direction), *cox_munk(wind))

@@ -35,9 +35,9 @@ def largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
     """Return upper limits of the slope standard deviations along and across [1], and of the range's [m].
 
     With no knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
-    slopes do. Its height varies at most like the fully developed sea with this slope variance: sigma = 0.21 U^2/(4 g)
-    (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
-    doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
+    slopes do. Its height varies at most like the fully developed sea with this slope variance. Its deviation is sigma =
+    0.21 U^2/(4 g) (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), with the total 0.003 + 5.08e-3 U (Cox and
+    Munk 1954, doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
     """
     return deviations_of_sea(float(dataset.attrs.get("surface_slope_variance", math.inf)))
 

@@ -17,9 +17,9 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 #: Level to which light falls in the column before the time axis ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 
-#: Time for multiply scattered light after the last echo: in shallow water a multiple of the time that this echo spends
-#: in the water, otherwise at most a time [ns] and a share of it. Chosen with renders over longer time axes: less than
-#: 1e-4 of the energy arrives later.
+#: Time for multiply scattered light after the last echo: a multiple of this echo's time in the water, for shallow
+#: water, or if less a time [ns] plus a share of it. Chosen with renders over longer time axes: less than 1e-4 of the
+#: energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
 #: Largest distance from the beam at which the time of the way from it is added for the view [m].
@@ -170,8 +170,8 @@ class LidarView:
         of its depth of them, below a level sea at the height of the lowest trough. Multiply scattered light follows it:
         for up to four times its time in the water or 40 ns and a quarter of it, plus the time from the beam to the edge
         of the view, up to 10 m. Where no solids end these directions, the last light comes from the depth at which the
-        column signal, exp(-2 K s) by Gordon's system attenuation K (`system_attenuation`), has fallen to 1e-6. Solids
-        where it is below 1e-12 are invisible.
+        column signal has fallen to 1e-6. This signal is exp(-2 K s) by Gordon's system attenuation K
+        (`system_attenuation`). Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
         seen = self._at_sea[1]

@@ -371,6 +371,6 @@ class GatePlan:
     train: GateTrain
     #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
     given: str
-    #: Its value: half-height time of the first gate's rising edge [ns]; or depth below the mean sea level, or range
-    #: from the lidar [m], on the receiver's axis, from which echoes arrive at that time.
+    #: Its value: half-height time of the first gate's rising edge [ns]; or the depth below the mean sea level, or range
+    #: from the lidar [m], from which echoes on the receiver's axis arrive then.
     start: float

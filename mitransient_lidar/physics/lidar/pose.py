@@ -28,9 +28,9 @@ _SMALLEST_AZIMUTH = 1e-9
 class Pose:
     """Position and axis of a transmitter or receiver, for one shot or several.
 
-    A tangent-plane point about the axis is (angle_x, angle_y), in radians: its direction is the unit vector along
-    ``axis + angle_x * far + angle_y * left``. +angle_x points away from nadir, and +angle_y along +y for the default
-    pose.
+    A tangent-plane point about the axis is (angle_x, angle_y), in radians. Its direction is the unit vector along
+    ``axis + angle_x * far + angle_y * left``. The angle_x axis points away from nadir, and angle_y along +y for the
+    default pose.
 
     Parameters
     ----------

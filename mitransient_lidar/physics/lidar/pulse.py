@@ -150,8 +150,8 @@ class Pulse:
         first_lag : int
             First weight's lag in bins, usually negative.
         weights : ndarray, shape (M,)
-            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m: exact
-            integrals over the bins, truncated where less than 1e-10 lies outside, with the sum 1.
+            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are
+            exact integrals over the bins with the sum 1, truncated where less than 1e-10 lies outside.
 
         Raises
         ------

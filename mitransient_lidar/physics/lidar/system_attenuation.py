@@ -33,11 +33,11 @@ def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diame
     Notes
     -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996, solved the transfer by Monte Carlo for a level sea.
-    The signal decays exponentially over four attenuation lengths: with c where the radius R of the spot in view is far
-    below 1/c, and with Kd where c R is above 5 to 6. Between them K depends on c and the whole volume scattering
-    function. The formula is a fit by which later authors represent such results, such as Churnside (2013), Opt. Eng.
-    53, 051405, doi:10.1117/1.OE.53.5.051405, eq. 5. It uses the spot's diameter and therefore reaches Kd to within 1 %
-    of c - Kd at c R = 2.7 already.
+    The signal decays exponentially over four attenuation lengths. It decays with c where the radius R of the spot in
+    view is far below 1/c, and with Kd where c R is above 5 to 6. Between them K depends on c and the whole volume
+    scattering function. The formula is a fit by which later authors represent such results, such as Churnside (2013),
+    Opt. Eng. 53, 051405, doi:10.1117/1.OE.53.5.051405, eq. 5. It uses the spot's diameter and therefore reaches Kd to
+    within 1 % of c - Kd at c R = 2.7 already.
 
     The result is an order of magnitude. The formula does not distinguish the field of view from the beam. Nor is Kd a
     strict limit: by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, the signal in a large field of view decays with

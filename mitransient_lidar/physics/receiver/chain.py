@@ -66,7 +66,7 @@ class ReceiverChain:
     Mean and variance are exact up to the amplifier. For logarithm, saturation and rounding a sample is assumed to be
     normally distributed. This holds where the amplifier's noise or tens of photoelectrons within its response dominate.
     With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a third in
-    the variance were found; the shots themselves (`apply`) make no such assumption.
+    the variance were found. The shots themselves (`apply`) make no such assumption.
 
     Only drawn shots have jitter. Closed forms describe a shot with mean energy at its nominal time.
     """

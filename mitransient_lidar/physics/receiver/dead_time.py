@@ -1,16 +1,16 @@
 """Counting with dead time in time bins: probabilities of counts, their covariances, and random realisations.
 
 A cell that fires in a bin is dead for the rest of that bin and for the dead time tau after it. Counted from the firing
-bin, this makes tau/dt + u bins with the width dt and the event's mean position u in its bin: 1/2 in weak light, and
-less in strong light, whose first event is early. The fractional part of tau/dt + u is the probability of further dead
-bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count rate in steady
-light is exact (W. Feller 1948, "On probability problems in the theory of counters").
+bin, this makes tau/dt + u bins, with the bin width dt and the event's mean position u in its bin. It is 1/2 in weak
+light, and less in strong light, whose first event is early. The excess over the whole part of tau/dt is the probability
+of further dead bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count
+rate in steady light is exact (W. Feller 1948, "On probability problems in the theory of counters").
 
 Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
 probabilities have the same shape. All cells are live at the first bin.
 
 After a count a channel with afterpulses is dead as without them. Once it is live again, the time to an afterpulse is
-exponentially distributed, with a probability that an afterpulse occurs at all; the next count, of either kind, begins
+exponentially distributed, with a probability that an afterpulse occurs at all. The next count, of either kind, begins
 this anew. Counts are a renewal process, whose state is the channel's live time: recursions over it are exact.
 """
 

@@ -81,8 +81,8 @@ class LinearDetector(SignalTail):
 
     Notes
     -----
-    The charge of n events is drawn from a gamma distribution with mean n gain and variance n gain^2 (excess_noise - 1),
-    the leakage's shot noise from a normal one: mean and variance are exact, the tail shapes are not.
+    The charge of n events is drawn from a gamma distribution with mean n gain and variance n gain^2 (excess_noise - 1).
+    The leakage's shot noise is drawn from a normal distribution. Mean and variance are exact, the tail shapes are not.
     """
 
     quantum_efficiency: Annotated[

@@ -68,7 +68,7 @@ class LowPass:
     def sampled(self, record: FloatArray, stride: int, weights: FloatArray | None = None) -> FloatArray:
         """Filter a record of parts, with `before` and `after`; return every `stride`-th sample.
 
-        `weights` replace those of the response; N weights less need a record that is N parts shorter.
+        `weights` replace the response's own; N weights less need a record that is N parts shorter.
         """
         return filtered(record, self.weights if weights is None else weights)[..., self.start :: stride * self.parts]
 
@@ -237,7 +237,7 @@ class Digitiser(Plan):
     Notes
     -----
     Rounding adds a variance of step^2/12 (W. R. Bennett, Bell Syst. Tech. J. 27, 446 (1948)) if the preceding noise is
-    at least about half a step; a steady signal with less noise has an error of up to half a step instead.
+    at least about half a step. A steady signal with less noise has an error of up to half a step instead.
     """
 
     bits: Annotated[int, Option("Resolution", 1, 24)]

@@ -68,10 +68,10 @@ def sample_moments(
 
     Notes
     -----
-    Neighbouring samples are correlated by the amplifier's low-pass, which filters its own noise and the shot noise
-    alike, and by the dead time of counters and cells; the covariance is exact for all of these. A converter adds an
-    independent variance of step^2/12, after a logarithm times its squared inverse slope at the mean (see `Digitiser`).
-    Derivatives are central differences of the closed forms, exact for linear detectors.
+    The amplifier's low-pass, which filters its own noise and the shot noise alike, correlates neighbouring samples. So
+    does the dead time of counters and cells; the covariance is exact for all of these. A converter adds an independent
+    variance of step^2/12, after a logarithm times its squared inverse slope at the mean (see `Digitiser`). Derivatives
+    are central differences of the closed forms, exact for linear detectors.
     """
     light, changes = non_negative_array("power", power), finite_array("directions", directions)
     width, sky = positive("bin_width_ns", bin_width_ns), non_negative("background", background)

@@ -84,7 +84,7 @@ def delayed(power: FloatArray, bins: FloatArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (shots, records, time)
-        The integral and the first moment are exact, except for light that leaves the record; a delay by the fraction f
+        The integral and the first moment are exact, except for light that leaves the record. A delay by the fraction f
         of a bin widens an echo by a variance of f (1 - f) bins squared.
     """
     whole = np.floor(bins).astype(np.int64)

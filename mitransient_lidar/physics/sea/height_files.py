@@ -150,7 +150,7 @@ def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, ce
     """
     middle = [0.5 * float(one.min() + one.max()) for one in (x, y)]
     if stated.system is not None:
-        # CF asks for units of the coordinates themselves, which may be kilometres.
+        # CF requires units of the coordinates themselves, which may be kilometres.
         unit = position_unit(path, stated) / stated.system.metres
         stated.system.check_scale(path, unit * middle[0], unit * middle[1])
         return

@@ -29,7 +29,7 @@ _MOST_TILES = 31
 
 @dataclass(frozen=True)
 class Motion:
-    """What moves waves."""
+    """Causes of wave motion."""
 
     time: float = 0.0  #: Time [s].
     depth: float = math.inf  #: Depth of the water [m], positive or infinite; it slows long waves.
@@ -166,7 +166,8 @@ def facet_slope_variance(
     -----
     Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
     Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
-    cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the mesh.
+    cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
+    mesh.
     """
     variance[:, 1:] *= 2  # for the half plane kx < 0
     # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2

@@ -77,8 +77,8 @@ class DepthResponse:
     saturated tail, so that depth takes long waves away and leaves the slopes of short ones. Swell keeps its significant
     height until this exceeds half of d_e.
 
-    The effective depth d_e is the depth d or, if less, the depth at which the significant height of all waves is d/2:
-    where waves break, the longest ones are missing, as in a shallower sea. Both limits are smooth minima (a^-8 +
+    The effective depth d_e is the depth d or, if less, the depth at which the significant height of all waves is d/2.
+    Where waves break, the longest ones are missing, as in a shallower sea. Both limits are smooth minima (a^-8 +
     b^-8)^(-1/8). All amplitudes are 0 at d = 0 and over land.
     """
 
@@ -161,7 +161,7 @@ class ShoalingHeights:
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`.
 
-        With band amplitudes a, this is a_top times all waves, plus (a - a_top) times each band: bands over which the
+        With band amplitudes a, this is a_top times all waves, plus (a - a_top) times each band. Bands over which the
         depth has no effect cost no time, and leave the heights unchanged.
         """
         table, top = self.response.amplitude, self.response.top

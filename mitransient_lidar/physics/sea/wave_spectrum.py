@@ -226,7 +226,7 @@ class MatchedSpectrum(CosineSpectrum):
         reduced.
     k_from : float
         Waves with wavenumbers [rad/m] above this are scaled, positive. If the others alone have too much slope
-        variance, or a ratio that scaling cannot correct, it is reduced in steps of a tenth; below the longest wave all
+        variance, or a ratio that scaling cannot correct, it is reduced in steps of a tenth. Below the longest wave all
         are scaled.
 
     Attributes

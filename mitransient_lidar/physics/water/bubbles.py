@@ -46,12 +46,12 @@ class WindBubbles:
 
         Notes
         -----
-        The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4, with G = (a_r / a)^4 from a radius
-        of 10 um to a_r = 54.4 um and (a_r / a)^4.37 to 1000 um, and L = 0.4 m up to 7.5 m/s, 0.4 + 0.115 (U - 7.5)
-        above. Hall (1989), J. Acoust. Soc. Am. 86, 1103, doi:10.1121/1.398102; Novarini, Keiffer and Norton (1998),
-        IEEE J. Oceanic Eng. 23, 423, doi:10.1109/48.725236. They also change the sizes with depth: a_r by 1.984 um per
-        metre and the upper exponent by (z / 2.55 m)^2. These changes are left out: they raise the void fraction by at
-        most 7 % down to 3 m, and the scattering by 14 % at 1 m and 28 % at 2 m.
+        The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4. G = (a_r / a)^4 from a radius of 10
+        um to a_r = 54.4 um and (a_r / a)^4.37 to 1000 um. L = 0.4 m up to 7.5 m/s, 0.4 + 0.115 (U - 7.5) above. Hall
+        (1989), J. Acoust. Soc. Am. 86, 1103, doi:10.1121/1.398102; Novarini, Keiffer and Norton (1998), IEEE J. Oceanic
+        Eng. 23, 423, doi:10.1109/48.725236. They also change the sizes with depth: a_r by 1.984 um per metre and the
+        upper exponent by (z / 2.55 m)^2. These changes are left out: they raise the void fraction by at most 7 % down
+        to 3 m, and the scattering by 14 % at 1 m and 28 % at 2 m.
 
         Raises
         ------

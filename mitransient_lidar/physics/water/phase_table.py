@@ -31,8 +31,8 @@ class PowerLawTable:
 
     Forward peaks in natural water rise as a power of the angle over six decades, which uniform nodes in ln s resolve
     and a table in cos(theta) does not. The default, 2048 nodes from s = 1e-12 (theta = 2 microradian), has 51 nodes in
-    the backward hemisphere, which spans only ln 2; there Fournier-Forand functions are interpolated to 2e-4. Narrow
-    backward peaks need more nodes: with a weak backward Henyey-Greenstein lobe the error at 180 degrees is 3e-4 for g =
+    the backward hemisphere, which spans only ln 2. There Fournier-Forand functions are interpolated to 2e-4. Narrow
+    backward peaks need more nodes. With a weak backward Henyey-Greenstein lobe the error at 180 degrees is 3e-4 for g =
     0.3, 2e-3 for 0.5 and 2e-2 for 0.7, or 2e-3 for 0.7 with 8192 nodes.
 
     Build one with `from_function`, `from_values`, `fournier_forand` or `mixture`.
@@ -147,7 +147,7 @@ class PowerLawTable:
     def with_chi(self, chi: float) -> PowerLawTable:
         """Return the function with another value at 180 degrees and the same backscatter ratio.
 
-        Between 90 and 180 degrees it is multiplied by A + B exp(-(1 - s)/w^2), where 1 - s is about a quarter of the
+        Between 90 and 180 degrees it is multiplied by A + B exp(-(1 - s)/w^2). Here 1 - s is about a quarter of the
         squared angle from 180 degrees and 2 w is 6 degrees: at 170 degrees B counts by 6 %. Measured functions over
         their bb agree within 5 % from 90 to 170 degrees (Sullivan and Twardowski 2009, doi:10.1364/AO.48.006811), but
         not nearer to 180 degrees (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where the

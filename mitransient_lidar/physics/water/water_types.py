@@ -116,8 +116,8 @@ class InherentProperties:
         """Diffuse attenuation coefficient of downwelling irradiance [1/m], with the sun at the zenith and no waves.
 
         The mean down to the depth of a tenth of the irradiance just below the surface: Kd^2 = a^2 + 4.10 a^0.934
-        bb_p^0.849 b_p^0.217 + 1.6 a b_w, with particles p that have Fournier-Forand functions, and molecules w. It fits
-        a Monte Carlo (``oracles/diffuse_attenuation.py`` in the tests) with an error of 0.2 % rms and 0.6 % at most for
+        bb_p^0.849 b_p^0.217 + 1.6 a b_w. The particles p have Fournier-Forand functions, and w are molecules. It fits a
+        Monte Carlo (``oracles/diffuse_attenuation.py`` in the tests) with an error of 0.2 % rms and 0.6 % at most for
         b/a from 0.5 to 16 and bb_p/b_p from 0.003 to 0.05. The formula by Lee, Du and Arnone (2005), J. Geophys. Res.
         110, C02016, doi:10.1029/2004JC002275, gives 0 to 2 % more in Jerlov's types I to 3C, and 4 to 7 % more in 5C to
         9C.

@@ -45,7 +45,7 @@ _BYTES_PER_BIN = 64
 #: Fewest and most passes that are repeated until an error is reached.
 _PASSES_FOR_ERROR, MOST_PASSES_FOR_ERROR = 4, 400
 
-#: Path share with which the fewest passes reach an error in the published geometry under 6 m/s waves, and that error; a
+#: Path share with which the fewest passes reach an error in the published geometry under 6 m/s waves, and that error. A
 #: pass error falls with its number of paths to this exponent.
 _KNOWN_SHARE, _KNOWN_ERROR, _ERROR_EXPONENT = 0.05, 0.05, 0.65
 

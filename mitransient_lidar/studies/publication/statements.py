@@ -57,7 +57,7 @@ class Statement:
     share
         Share of other locations for which it holds, None if no location was chosen.
     places
-        What these locations are.
+        Description of these locations.
     difference
         Reason for a difference from the publication.
     """

@@ -64,10 +64,9 @@ _BITS_OF_CELLS, _SIDE_BITS_OF_PATCHES = 5, 3
 #: the water's signal by 0.3 % in the published geometry.
 _WIDEST = 2.0
 
-#: For differences of scenes, width of cells over the least one of a scene, number of photons that are kept of full
-#: ones, and width of patches over that of a scene. The noise of differences is that of light that moves from cell to
-#: cell, and falls as cells grow. These ones change the signal of the water by 0.2 % in the published geometry, and by
-#: up to 2 % in narrow beams.
+#: For differences between scenes: cell width over a scene's least one, number of photons kept in full cells, and patch
+#: width over a scene's. Light that moves from cell to cell causes the noise of differences, which falls as cells grow.
+#: These cells change the water's signal by 0.2 % in the published geometry, and by up to 2 % in narrow beams.
 _COARSE, _PHOTONS_OF_COARSE, _COARSE_PATCHES = 8.0, 32, 2.0
 
 #: Largest capacity for segments of a path before a pass has needed more: light that is scattered more often is weak.

@@ -29,7 +29,7 @@ from mitransient_lidar.transport.scene import LidarScene
 #: Largest depth in the table [m], and its number of depths.
 _DEEPEST, _DEPTHS = 60.0, 20
 
-#: Largest number of forward scattering events that is told apart.
+#: Largest number of forward scattering events that is distinguished.
 _MOST_EVENTS = 7
 
 #: Displacement samples.
