@@ -200,7 +200,7 @@ class Campaign(Plan):
         try:
             rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(map(str.strip, row))]
         except csv.Error as error:
-            raise UserError(f"{path} is not a CSV file.") from error
+            raise UserError(f"{path} is not a CSV file") from error
         if len(rows) < 2:
             raise UserError(f"{path} must have a heading with the names of parameters, and a row for each run")
         names = rows[0]

@@ -110,10 +110,10 @@ class Store:
             self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, LARGEST_SHARD)
             self.variables = [str(name) for name in self.attributes["variables"]]
         except _DAMAGE as error:
-            raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
+            raise UserError(f"{path} is no store of a campaign or a flight, or is damaged") from error
         if self.attributes.get(_SEAL) != seal(self.attributes):
             reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
-            raise UserError(f"{path} cannot be used: {reason}.")
+            raise UserError(f"{path} cannot be used: {reason}")
         self._arrays: dict[str, zarr.Array[Any]] = {}
         self._check_arrays()
 
@@ -157,7 +157,7 @@ class Store:
         except OSError as error:
             if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
                 return cls(path)
-            raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
+            raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
         return cls(path)
@@ -278,15 +278,15 @@ class Store:
             names = list(self._group.array_keys())
         of_runs = ("status", "error", *self.variables)
         for name in sorted({*self.attributes.get("arrays", ()), "run"} - {*names, *of_runs}):
-            raise UserError(f"{self.path} is damaged: it has lost {name}.")
+            raise UserError(f"{self.path} is damaged: it has lost {name}")
         for name in {*names, *of_runs}:
             array = self.array(name)
             if name not in of_runs:
                 lost = [one for one in range(-(-[*array.shape, 1][0] // LARGEST_SHARD)) if not self._has(name, one)]
                 if lost and array.size:
-                    raise UserError(f"{self.path} is damaged: it has lost {name}.")
+                    raise UserError(f"{self.path} is damaged: it has lost {name}")
             elif array.shape[:1] != (self.count,) or array.chunks[:1] != (min(self.shard_size, self.count),):
-                raise UserError(f"{self.path} is damaged: {name} has the shape {array.shape}.")
+                raise UserError(f"{self.path} is damaged: {name} has the shape {array.shape}")
 
     def _has(self, name: str, chunk: int) -> bool:
         """Return whether an array's chunk exists."""
@@ -362,7 +362,7 @@ def reporting_damage(path: str | os.PathLike[str]) -> Iterator[None]:
     except ValueError as error:
         if "checksum" not in str(error):
             raise
-        raise UserError(f"{path} is damaged: the same command of the campaign renders what cannot be read.") from error
+        raise UserError(f"{path} is damaged: the same command of the campaign renders what cannot be read") from error
 
 
 @contextlib.contextmanager
@@ -373,7 +373,7 @@ def _reading(path: str | os.PathLike[str], name: str) -> Iterator[None]:
     except UserError:
         raise
     except _DAMAGE as error:
-        raise UserError(f"{path} is damaged: {name} cannot be read.") from error
+        raise UserError(f"{path} is damaged: {name} cannot be read") from error
 
 
 @contextlib.contextmanager
@@ -382,7 +382,7 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
+        raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:

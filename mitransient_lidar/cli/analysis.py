@@ -69,11 +69,11 @@ def _echoes(
     if output is not None:
         check_suffix("--csv", output, ".csv")
     elif not table:
-        raise UserError("--no-table leaves nothing to do: give --csv OUT as well.")
+        raise UserError("--no-table leaves nothing to do: give --csv OUT as well")
     if correct is not None and mean_surface:
-        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
+        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes")
     if wind_speed is not None and correct is None:
-        raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
+        raise UserError(f"--wind-speed {wind_speed:g} needs --correct")
     from mitransient_lidar import results
     from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
 
@@ -113,7 +113,7 @@ def _retrieve(
 
     dataset = results.dataset_of("FILE", file, "result")
     if figure is not None and "true_slope_along" not in dataset.coords:
-        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
+        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none")
     found = call(dataset)
     name_subject(file, dataset.attrs, quiet)
     typer.echo("\n".join(describe_retrieval(found)))

@@ -34,10 +34,10 @@ def check_targets(folder: Path, targets: list[Path], source: str = "", option: s
         with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
-        raise UserError(f"cannot write to folder {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot write to folder {folder}: {error.strerror}") from error
     for target in targets:
         if target.is_dir():
-            raise UserError(f"cannot write {target}: it is a folder.")
+            raise UserError(f"cannot write {target}: it is a folder")
         if source and target.exists() and Path(source).exists() and target.samefile(source):
             raise UserError(f"{source} would be overwritten with its repetition: choose another place with -o")
     check_kept(targets, option)
@@ -71,7 +71,7 @@ def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
 def check_suffix(option: str, path: Path, suffix: str) -> None:
     """Check that a file can be written and that its name ends with a suffix."""
     if path.suffix.lower() != suffix:
-        raise UserError(f"{option} {path} must end in {suffix}.")
+        raise UserError(f"{option} {path} must end in {suffix}")
     check_targets(path.parent, [path], option="-o" if option == "--output" else option)
 
 

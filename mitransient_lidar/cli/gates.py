@@ -74,7 +74,7 @@ def _gates(
         if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
                 raise UserError(
-                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins."
+                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins"
                 )
             cut = result
         else:

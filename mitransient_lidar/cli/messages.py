@@ -107,7 +107,7 @@ def exit_if_interrupted(dataset: xr.Dataset) -> None:
             done = f"{dataset.attrs['renders']} renders, before the fit has converged"
         else:
             done = f"{dataset.attrs['passes']} passes"
-        raise KeyboardInterrupt(f"interrupted after {done}; their result is kept.")
+        raise KeyboardInterrupt(f"interrupted after {done}; their result is kept")
 
 
 def exit_if_failed(path: Path) -> None:

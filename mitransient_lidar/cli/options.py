@@ -57,7 +57,7 @@ def number_or_auto(option: str, text: str) -> float | str:
     try:
         return text if text == "auto" else finite(option, text)
     except UserError:
-        raise UserError(f"{option} {text} must be a number or auto.") from None
+        raise UserError(f"{option} {text} must be a number or auto") from None
 
 
 def name_and_value(option: str, text: str) -> tuple[str, float]:

@@ -78,7 +78,7 @@ def check_kept(targets: Iterable[Path], option: str = "-o") -> None:
         for target in targets:
             if reason := running.objection(target):
                 ways = f"choose another place with {option}, or replace it with --overwrite"
-                raise UserError(f"{target} is kept, since {reason}: {ways}.")
+                raise UserError(f"{target} is kept, since {reason}: {ways}")
 
 
 def replace_freely(targets: Iterable[Path]) -> None:
@@ -202,7 +202,7 @@ class _Running:
                 try:
                     write_mark(temporary, {**mark, "subject": self._relative_subject(path), "beside": plain})
                 except OSError as error:
-                    raise WriteError(f"cannot write {path}: {error.strerror}.") from error
+                    raise WriteError(f"cannot write {path}: {error.strerror}") from error
         self.written.update(path for _, path in settled)
         return settled
 

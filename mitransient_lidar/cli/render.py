@@ -44,7 +44,7 @@ def _render(
     name, text, _ = scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in text:
-        raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
+        raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     targets += [output / f"{name}_components.png"] if plot and call.arguments["components"] else []
     targets += [output / f"{name}_derivatives.png"] if plot and call.arguments["derivatives"] else []
@@ -168,7 +168,7 @@ def _shots(
     check_suffix("--output", output, ".nc")
     check_figure(figure, ".nc", option="--figure")
     if figure is not None and figure.with_suffix(".nc") == output:
-        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name.")
+        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name")
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
@@ -182,9 +182,9 @@ def _shots(
     if is_result(scene):
         own = {name: given[name] for name in ("count", "positions", "move_target", "seed")}
         if where := [call.flags[name].lstrip("-") for name, value in own.items() if value]:
-            raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}.")
+            raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}")
         if given["instrument"] is not None:
-            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument.")
+            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument")
     else:
         given = {"count": 20, **{name: value for name, value in given.items() if value is not None}}
     with DeferredInterrupt(at_once=False):

@@ -54,11 +54,11 @@ def _view(
         _show(file, output, shot, browser, quiet)
         return
     if layout and (log or linear):
-        raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
+        raise UserError("--layout does not go with --log or --linear: a layout has no power axis")
     if components and (log or linear or layout):
-        raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales.")
+        raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales")
     if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise UserError(f"--output {output} must end in .png, .pdf or .svg, or .html for a page.")
+        raise UserError(f"--output {output} must end in .png, .pdf or .svg, or .html for a page")
     target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
     draws_again(file)
     check_figure(target)
@@ -107,7 +107,7 @@ def _show(file: Path, output: Path | None, shot: int | None, browser: bool, quie
 def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
     """Return one shot from a series."""
     if "shot" not in dataset.dims:
-        raise UserError(f"--shot {number} needs a series of shots, but {file} holds a single shot.")
+        raise UserError(f"--shot {number} needs a series of shots, but {file} holds a single shot")
     if number not in dataset["shot"].values:
         first, last = (int(end) for end in dataset["shot"].values[[0, -1]])
         raise UserError(f"--shot {number} must be one of the shots in {file}, {first} to {last}")

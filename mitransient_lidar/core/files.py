@@ -54,11 +54,11 @@ def check_encodable(path: Path) -> None:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise UserError(f"cannot write {text!a}: its name is not valid UTF-8.") from error
+        raise UserError(f"cannot write {text!a}: its name is not valid UTF-8") from error
     if "\0" in text:
-        raise UserError(f"cannot write {text!a}: its name contains the character NUL.")
+        raise UserError(f"cannot write {text!a}: its name contains the character NUL")
     if printable(text) != text:
-        raise UserError(f"cannot write {text!a}: its name must have no control characters, such as a line break.")
+        raise UserError(f"cannot write {text!a}: its name must have no control characters, such as a line break")
 
 
 def is_file_name(name: object) -> bool:
@@ -83,7 +83,7 @@ def open_file(path: str | os.PathLike[str]) -> BufferedReader:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     try:
         _check_mode(path, os.fstat(descriptor).st_mode)
         os.set_blocking(descriptor, True)
@@ -98,9 +98,9 @@ def check_regular(path: str | os.PathLike[str]) -> None:
     try:
         mode = os.stat(path).st_mode
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     except ValueError as error:
-        raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL.") from error
+        raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL") from error
     _check_mode(path, mode)
 
 
@@ -127,10 +127,10 @@ def check_tree(folder: str | os.PathLike[str]) -> None:
             with os.scandir(folders.pop()) as found:
                 entries = list(found)
         except OSError as error:
-            raise UserError(f"cannot read {error.filename}: {error.strerror}.") from error
+            raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
         for entry in entries:
             if entry.is_symlink():
-                raise UserError(f"cannot read {folder}: {entry.path} is a link, and no link in it is followed.")
+                raise UserError(f"cannot read {folder}: {entry.path} is a link, and no link in it is followed")
             if entry.is_dir():
                 folders.append(entry.path)
             elif not entry.is_file():
@@ -153,9 +153,9 @@ def _check_mode(path: str | os.PathLike[str], mode: int) -> None:
     """Raise `UserError` for the mode of something that is not a regular file."""
     kind = stat.S_IFMT(mode)
     if kind == stat.S_IFDIR:
-        raise UserError(f"cannot read {path}: {os.strerror(errno.EISDIR)}.")
+        raise UserError(f"cannot read {path}: {os.strerror(errno.EISDIR)}")
     if kind in _OTHERS:
-        raise UserError(f"cannot read {path}: it is {_OTHERS[kind]}, and only regular files are read.")
+        raise UserError(f"cannot read {path}: it is {_OTHERS[kind]}, and only regular files are read")
 
 
 def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
@@ -172,10 +172,10 @@ def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
         if len(data) <= most_bytes:
             return data.decode("utf-8-sig")
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file in UTF-8.") from error
-    raise UserError(f"{path} is larger than {most_bytes / 2**20:g} MiB, the most for a file of this kind.")
+        raise UserError(f"{path} is not a text file in UTF-8") from error
+    raise UserError(f"{path} is larger than {most_bytes / 2**20:g} MiB, the most for a file of this kind")
 
 
 @contextlib.contextmanager
@@ -207,10 +207,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         except (OSError, RuntimeError) as error:
             # HDF5 and OpenEXR report a full disk by their own errors, with the operating system's message in them.
             if os.strerror(errno.ENOSPC) in str(error):
-                raise WriteError(f"cannot write {path}: {os.strerror(errno.ENOSPC)}.") from error
+                raise WriteError(f"cannot write {path}: {os.strerror(errno.ENOSPC)}") from error
             if isinstance(error, RuntimeError):
                 raise
-            raise WriteError(f"cannot write {path}: {_reason(error, temporary, path)}.") from error
+            raise WriteError(f"cannot write {path}: {_reason(error, temporary, path)}") from error
         finally:
             if moves is None or (temporary, path) not in moves:
                 _remove(temporary)
@@ -269,7 +269,7 @@ def _move(moves: Moves) -> None:
             else:
                 _remove(changed)
         if isinstance(error, OSError):
-            raise WriteError(f"cannot write {path}: {_reason(error, path, path)}.") from error
+            raise WriteError(f"cannot write {path}: {_reason(error, path, path)}") from error
         raise
     finally:
         for _, former in moved:

@@ -39,13 +39,13 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
         return folder_of_scenes() / f"{name_or_path}.xml"
     path = Path(name_or_path)
     if path.is_dir():
-        raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene.")
+        raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene")
     if path.exists():
         check_regular(path)
         return path
     close = difflib.get_close_matches(path.stem, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(close)}" if close else f"shipped scenes are {', '.join(names) or 'none'}"
-    raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}.")
+    raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}")
 
 
 def scene_text(name: str | os.PathLike[str]) -> str:

@@ -179,7 +179,7 @@ def _refuse_includes(root: minidom.Element, place: Path | str) -> None:
     """Raise `UserError` if an element within a root includes a file, or the root does."""
     for include in [root] if root.tagName == "include" else root.getElementsByTagName("include"):
         name = include.getAttribute("filename")
-        raise UserError(f"scene {place} includes {name!r}: only the file of a scene may include others.")
+        raise UserError(f"scene {place} includes {name!r}: only the file of a scene may include others")
 
 
 def parameters_of(root: minidom.Element) -> dict[str, str]:
@@ -285,12 +285,12 @@ def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | N
         name = include.getAttribute("filename")
         part = next((found for file in files if is_there(found := file.parent / name)), None)
         if part is None:
-            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
+            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}")
         if part.resolve() in files:
-            raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
+            raise UserError(f"scene {path} includes {name!r}, which includes it in turn")
         count[0] += 1
         if count[0] > _MOST_FILES:
-            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit.")
+            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit")
         included = _expanded(part, files, count)
         content = list(included.childNodes)
         if included.tagName != "scene":

@@ -93,7 +93,7 @@ def _check_faces(path: Path, indices: FloatArray, vertices: int) -> None:
     """Raise `UserError` for an index of a face without a vertex."""
     # Not by index < 0 or index >= vertices, which are false for NaN.
     for index in indices[~((indices >= 0) & (indices < vertices))][:1]:
-        raise UserError(f"{path} has a face with the vertex {index:.15g}, and the vertices 0 to {vertices - 1} alone.")
+        raise UserError(f"{path} has a face with the vertex {index:.15g}, and the vertices 0 to {vertices - 1} alone")
 
 
 def _header(file: BinaryIO) -> tuple[str, list[_Element]]:

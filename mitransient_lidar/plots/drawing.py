@@ -42,7 +42,7 @@ _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p"
 def check_format(path: FilePath) -> None:
     """Raise a `UserError` unless the suffix of `path` is a figure's."""
     if Path(path).suffix.lower() not in _FORMATS:
-        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}.")
+        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}")
 
 
 def new_figure(path: FilePath | None, width: float, height: float) -> Figure:

@@ -255,11 +255,11 @@ def _pose(attributes: dict[str, Any], name: str) -> Pose:
     pose = pose_of(attributes, name)
     if pose is not None:
         if pose.submerged:
-            raise UserError("the lidar is under water: it has no layout on the sea to draw.")
+            raise UserError("the lidar is under water: it has no layout on the sea to draw")
         return pose
     altitude, off_nadir_deg = (optional_number(attributes, key) for key in ("altitude", "off_nadir_deg"))
     if altitude is None or off_nadir_deg is None:
-        raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw.")
+        raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw")
     return Pose.from_angles(altitude, off_nadir_deg)
 
 
@@ -380,7 +380,7 @@ def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray, outlines: FloatArra
     """
     seen, lit, outlines = (points[np.isfinite(points).all(axis=1)] for points in (seen, lit, outlines))
     if len(seen) == 0:
-        raise UserError("the result has no pixels that look at the sea: it has no layout to draw.")
+        raise UserError("the result has no pixels that look at the sea: it has no layout to draw")
     low, high = seen.min(axis=0), seen.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     lit = np.clip(lit, low - size, high + size)

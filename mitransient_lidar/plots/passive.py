@@ -64,7 +64,7 @@ def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
     from PIL import Image
 
     if Path(path).suffix.lower() != ".gif":
-        raise UserError(f"cannot write {path}: the file name must end in .gif.")
+        raise UserError(f"cannot write {path}: the file name must end in .gif")
     if dataset["radiance"].dims != ("frame", "row", "column"):
         raise UserError("an animation needs frames of an imager: render several frames of a layout with many pixels")
     radiance = drawing.as_seen(dataset)["radiance"].values

@@ -61,7 +61,7 @@ class View:
             path = Path(tempfile.mkdtemp(prefix=_FOLDER)) / "view.html"
         path = Path(path)
         if path.suffix.lower() != ".html":
-            raise UserError(f"cannot write {path}: the file name must end in .html.")
+            raise UserError(f"cannot write {path}: the file name must end in .html")
         with replacing(path) as temporary:
             temporary.write_text(self.page, encoding="utf-8")
         return path

@@ -42,7 +42,7 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
         Power axis scale; 'both' draws two panels.
     """
     if scale not in get_args(Scale):
-        raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}.")
+        raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}")
     panels = ["linear", "log"] if scale == "both" else [scale]
     figure = drawing.new_figure(path, 9.6, 4.3 if len(panels) == 1 else 6.0)
     is_image = "pixel" not in dataset.dims

@@ -185,19 +185,19 @@ def check_coordinates(place: object, dataset: xr.Dataset, name: str) -> None:
         values = dataset[one]
         if values.dtype.kind not in "fiu":
             kind = "texts" if values.dtype.kind in "USO" else f"values of type {values.dtype}"
-            raise UserError(f"{place} has {one} with {kind}: it must hold numbers.")
+            raise UserError(f"{place} has {one} with {kind}: it must hold numbers")
         if one in _COORDINATES and np.isinf(values.values).any():
-            raise UserError(f"{place} has {one} = {values.values[np.isinf(values.values)][0]}: it must be finite.")
+            raise UserError(f"{place} has {one} = {values.values[np.isinf(values.values)][0]}: it must be finite")
         if one == f"{name}_stderr" and values.dims != dataset[name].dims:
-            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), unlike {name}.")
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), unlike {name}")
         if one in ("angle_x", "angle_y") and not set(values.dims) <= dims:
-            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), not over its pixels.")
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), not over its pixels")
     if ("angle_x" in dataset.coords) != ("angle_y" in dataset.coords):
-        raise UserError(f"{place} has one of the coordinates angle_x and angle_y: it must have both.")
+        raise UserError(f"{place} has one of the coordinates angle_x and angle_y: it must have both")
 
 
 def _refusal(place: object, name: str, value: object, allowed: str) -> UserError:
-    return UserError(f"{place} has the attribute {name} = {printed(value)}: it must be {allowed}.")
+    return UserError(f"{place} has the attribute {name} = {printed(value)}: it must be {allowed}")
 
 
 def _is_number(value: object) -> bool:

@@ -293,17 +293,17 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
     check_attributes(place, dataset.attrs)
     dims = tuple(str(dim) for dim in dataset[name].dims)
     if "time" not in dims or "time" not in dataset.coords:
-        raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}.")
+        raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}")
     if empty := [dim for dim in dims if dataset.sizes[dim] == 0]:
-        raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1.")
+        raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1")
     times = dataset["time"].values
     if times.dtype.kind not in "fiu":
-        raise UserError(f"{place} has the coordinate time of type {times.dtype}: it must hold numbers, in ns.")
+        raise UserError(f"{place} has the coordinate time of type {times.dtype}: it must hold numbers, in ns")
     if not np.isfinite(times).all():
-        raise UserError(f"{place} has the coordinate time = {times[~np.isfinite(times)][0]}: it must be finite.")
+        raise UserError(f"{place} has the coordinate time = {times[~np.isfinite(times)][0]}: it must be finite")
     for index in np.flatnonzero(np.diff(times) <= 0)[:1]:
         raise UserError(
-            f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly."
+            f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly"
         )
     check_coordinates(place, dataset, name)
 

@@ -111,7 +111,7 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     kind = _kind(content, dataset.data_vars)
     variables = _LAYERS if kind is None else kind.channels
     if extra := [str(name) for name in dataset.data_vars if name not in variables]:
-        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
+        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file")
     dataset = dataset.assign_attrs({str(name): attribute(str(name), value) for name, value in dataset.attrs.items()})
     exact = {
         "content": content,
@@ -159,7 +159,7 @@ def _split_frames(dataset: xr.Dataset, path: str | os.PathLike[str]) -> xr.Datas
     if "frame" in dataset["signal_mean"].dims or 2 * dataset.sizes["frame"] > _MOST_CHANNELS - len(_MOMENTS):
         raise UserError(
             f"cannot write {path}: an EXR file holds up to {(_MOST_CHANNELS - len(_MOMENTS)) // 2} frames of one sea; "
-            "use a .nc or .tif file."
+            "use a .nc or .tif file"
         )
     like = dataset["signal_mean"]
     values: dict[str, xr.DataArray] = {name: dataset[name] for name in map(str, dataset) if name not in _OF_FRAMES}
@@ -252,12 +252,12 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
         If `stem` is no file name, or a file cannot be written.
     """
     if not stem or Path(stem).name != stem:
-        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders.")
+        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders")
     parts = parts_of(stack.drop_dims("parameter", errors="ignore"), folder, "gates", sequence=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot write {folder}: {error.strerror}") from error
     paths = [folder / f"{stem}_{part.name}.exr" for part in parts]
     with together():
         for path, part in zip(paths, parts, strict=True):
@@ -303,7 +303,7 @@ def read(path: Path) -> xr.Dataset:
     number = _NUMBERED.fullmatch(path.name)
     if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
         first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
-        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}.")
+        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}")
     exact = exact_metadata(path, parts[0].attributes)
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
@@ -313,7 +313,7 @@ def read(path: Path) -> xr.Dataset:
     except UserError:
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is damaged: its metadata and its images disagree.") from error
+        raise UserError(f"{path} is damaged: its metadata and its images disagree") from error
 
 
 def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]:
@@ -341,9 +341,9 @@ def _of_images(
     if exact["is_sequence"] and count > 1:
         parts = parts + _later_files(path, count)
     if len(parts) != count:
-        raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} {kind.dim}s can be read.")
+        raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} {kind.dim}s can be read")
     if len({part.attributes[_IDENTITY] for part in parts}) != 1:
-        raise UserError(f"{path} is damaged: its {count} {kind.dim}s belong to different stacks.")
+        raise UserError(f"{path} is damaged: its {count} {kind.dim}s belong to different stacks")
     axis = exact["dims"].index(kind.dim) if along else 0
     found = {}
     for name, channel in kind.channels.items():
@@ -370,12 +370,12 @@ def _later_files(first: Path, count: int) -> list[Part]:
     """Return the images of a sequence after the first file; raise `UserError` if a file is missing or damaged."""
     number = _NUMBERED.fullmatch(first.name)
     if number is None or int(number[2]) != 0:
-        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr.")
+        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr")
     parts: list[Part] = []
     for index in range(1, count):
         path = first.with_name(f"{number[1]}_gate{index:0{len(number[2])}d}{first.suffix}")
         if not path.is_file():
-            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing.")
+            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing")
         parts += read_parts(path)
     return parts
 
@@ -384,14 +384,14 @@ def _first_of_folder(folder: Path) -> Path:
     try:
         numbers = {path: _NUMBERED.fullmatch(path.name) for path in sorted(folder.iterdir())}
     except OSError as error:
-        raise UserError(f"cannot read {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot read {folder}: {error.strerror}") from error
     firsts = [path for path, number in numbers.items() if number and int(number[2]) == 0]
     if len(firsts) == 1:
         return firsts[0]
     if firsts:
         names = ", ".join(path.name for path in firsts[:3])
-        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names}).")
-    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr.")
+        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names})")
+    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr")
 
 
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
@@ -422,7 +422,7 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
             raise UserError(_damaged(path))
         checksum = _checksum(part)
         if part.attributes.get(_CHECKSUM, checksum) != checksum:
-            raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written.")
+            raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written")
     return parts
 
 

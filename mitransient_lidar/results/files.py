@@ -57,7 +57,7 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         dataset, foreign = netcdf.read(path)
     found = kinds_of(dataset)
     if foreign and not found:
-        raise UserError(f"{path} is a NetCDF file, but not of mitransient-lidar.")
+        raise UserError(f"{path} is a NetCDF file, but not of mitransient-lidar")
     for kind, name in (("waveforms", "waveform"), ("signals", "signal")):
         if kind in found and "campaign" not in found:
             check_axes(path, dataset, name)
@@ -97,7 +97,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         image_files.write(dataset, path)
         return
     if suffix not in (".exr", ".nc"):
-        raise UserError(f"cannot write {path}: the file name must end in .exr, .nc, .tif or .png.")
+        raise UserError(f"cannot write {path}: the file name must end in .exr, .nc, .tif or .png")
     with replacing(path) as temporary:
         if suffix == ".nc":
             try:
@@ -114,7 +114,7 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
     """Return a dataset as parts of an EXR file; raise `UserError` if it is none that such a file stores."""
     found = kinds_of(dataset)
     if "shot" in dataset.dims:
-        raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
+        raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file")
     if "result" in found:
         # The attributes have the curve of sum errors in its place.
         return exr.parts_of(dataset.drop_dims(sum_errors.DIMS, errors="ignore"), path, "waveforms")
@@ -126,7 +126,7 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
         images = dataset.drop_vars(["etendue", "background_power"], errors="ignore")
         return exr.parts_of(images, path, "radiance")
     stored = _listed(("result", "gates", "frames", "radiance"))
-    raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file.")
+    raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file")
 
 
 def is_exr(path: str | os.PathLike[str]) -> bool:
@@ -134,7 +134,7 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
     with open_file(path) as file:
         signature = file.read(len(netcdf.SIGNATURE))
     if not signature.startswith(EXR_SIGNATURE) and signature != netcdf.SIGNATURE:
-        raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file.")
+        raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file")
     return signature.startswith(EXR_SIGNATURE)
 
 

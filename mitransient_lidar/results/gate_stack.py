@@ -147,7 +147,7 @@ def build_gates(
         array = np.asarray(values, np.float64)
         whole = (*first, *shape, train.count)
         if array.shape not in (whole, (*first, math.prod(shape), train.count)):
-            raise UserError(f"{name} has shape {array.shape}; it must be {whole}.")
+            raise UserError(f"{name} has shape {array.shape}; it must be {whole}")
         variables[name] = ((*frames, *dims, "gate"), array.reshape(whole))
     axis = {
         "gate": np.arange(train.count),
@@ -243,19 +243,19 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
         If it has no gates, or dimensions other than (row, column, gate) or (pixel, gate); `place` names it.
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
-        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}")
     dataset = average_frames(dataset)
     energy = dataset["gate_energy"]
     pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
     if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):
         raise UserError(
             f"the dataset is no gate stack: gate_energy has the shape {dict(energy.sizes)}, but must have the "
-            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and must not be empty."
+            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and must not be empty"
         )
     needed = {"gate_start": {"gate"}, "gate_width": {"gate"}, "angle_x": {*pixels}, "angle_y": {*pixels}}
     for name, dims in needed.items():
         if name not in dataset.coords or set(dataset[name].dims) != dims:
-            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
+            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)})")
     check_attributes(place, dataset.attrs)
     check_coordinates(place, dataset, "gate_energy")
     stack = dataset.drop_dims(_OF_BINS, errors="ignore")

@@ -106,7 +106,7 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
             found.update(block)
             size -= len(block)
     if known != _CHECKSUM + found.hexdigest().encode():
-        raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written.")
+        raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written")
     return True
 
 

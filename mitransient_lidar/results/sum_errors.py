@@ -215,12 +215,12 @@ def _check(dataset: xr.Dataset) -> None:
     sizes = [dataset[VARIABLE].sizes.get(name, 0) for name in DIMS]
     if sizes[0] != sizes[1] or not sizes[0]:
         raise UserError(
-            f"the result has {VARIABLE} over {dict(dataset[VARIABLE].sizes)}: it must be square over {DIMS}."
+            f"the result has {VARIABLE} over {dict(dataset[VARIABLE].sizes)}: it must be square over {DIMS}"
         )
     for name, dims in ((VARIABLE, None), (DIMS[0], DIMS[:1]), ("time", ("time",))):
         values = dataset[name]
         if values.dtype.kind not in "fiu" or (dims and values.dims != dims) or not np.isfinite(values.values).all():
-            raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them.")
+            raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them")
 
 
 def _curve(attributes: Mapping[str, Any]) -> FloatArray:

@@ -76,7 +76,7 @@ class Cases(Generic[_Case]):
         """Return a result, of which the study needs all; raise KeyboardInterrupt if its render was interrupted."""
         if result.attrs.get("interrupted"):
             planned = len(self.cases) * self._steps
-            raise KeyboardInterrupt(f"interrupted after {self._done} of {planned} {self._unit}s, and none is kept.")
+            raise KeyboardInterrupt(f"interrupted after {self._done} of {planned} {self._unit}s, and none is kept")
         self.kept += 1
         return result
 

@@ -447,7 +447,7 @@ def _read_csv(path: Path) -> Measured:
     try:
         lines = [line for line in csv.reader(read_text(path).splitlines()) if any(cell.strip() for cell in line)]
     except csv.Error as problem:
-        raise UserError(f"{path} is not a CSV file.") from problem
+        raise UserError(f"{path} is not a CSV file") from problem
     heading = [name.strip() for name in lines[0]] if lines else []
     if _TIME not in heading or len(heading) < 2:
         raise UserError(f"{path} must begin with a heading of {_TIME} and names of pixels, separated by commas")

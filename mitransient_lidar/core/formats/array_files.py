@@ -39,7 +39,7 @@ def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        raise UserError(f"cannot read {path}: the name of a {kind} must end in {', '.join(suffixes)}.")
+        raise UserError(f"cannot read {path}: the name of a {kind} must end in {', '.join(suffixes)}")
     open_file(path).close()
     return suffix
 
@@ -80,7 +80,7 @@ def check_size(path: str | os.PathLike[str], size: float, most: int = LARGEST_AR
     """Raise `UserError` if the arrays of a file have more bytes than allowed, which may be many times its own."""
     if size > most:
         sizes = f"{size / 2**20:.4g} MiB, and {most / 2**20:.4g} MiB are the most for a file of this kind"
-        raise UserError(f"{path} holds arrays of {sizes}.")
+        raise UserError(f"{path} holds arrays of {sizes}")
 
 
 def largest_result() -> int:
@@ -141,10 +141,10 @@ def check_hdf5(path: str | os.PathLike[str]) -> None:
             for name in group:
                 link = group.get(name, getlink=True)
                 if isinstance(link, h5py.ExternalLink):
-                    raise UserError(f"{path} holds a link {name!r} into another file: it must hold all that it needs.")
+                    raise UserError(f"{path} holds a link {name!r} into another file: it must hold all that it needs")
                 part = group[name] if isinstance(link, h5py.HardLink) else None
                 if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-                    raise UserError(f"{path} has {name!r} in other files: it must hold all values that it needs.")
+                    raise UserError(f"{path} has {name!r} in other files: it must hold all values that it needs")
                 # Links may lead back to a group above.
                 if isinstance(part, h5py.Group) and (at := h5py.h5o.get_info(part.id).addr) not in seen:
                     seen.add(at)

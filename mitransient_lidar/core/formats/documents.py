@@ -27,14 +27,14 @@ def check_xml(text: str | bytes, name: object) -> None:
     try:
         parser.Parse(text, True)
     except (expat.ExpatError, UnicodeEncodeError) as error:
-        raise UserError(f"{name} is not well-formed XML: {error}.") from error
+        raise UserError(f"{name} is not well-formed XML: {error}") from error
 
 
 def _refusing(name: object, what: str) -> Callable[..., None]:
     """Return the handler that refuses a part of a document."""
 
     def refuse(*_: object) -> None:
-        raise UserError(f"{name} holds {what}: it must hold elements, attributes and comments only.")
+        raise UserError(f"{name} holds {what}: it must hold elements, attributes and comments only")
 
     return refuse
 

@@ -79,7 +79,7 @@ class MapSystem(NamedTuple):
         if not abs(scale - 1) < LARGEST_DISTORTION:
             raise UserError(
                 f"{path} has coordinates in {self.name}, whose lengths at ({x:.10g}, {y:.10g}) are {scale:.4g} times"
-                f" those on the ground: they must be within {LARGEST_DISTORTION:.0%}, as in UTM."
+                f" those on the ground: they must be within {LARGEST_DISTORTION:.0%}, as in UTM"
             )
 
     @_in_one_thread
@@ -136,13 +136,13 @@ def map_system(path: object, text: Any, name: object = None) -> MapSystem:
         horizontal = horizontal.source_crs
     called = system.name
     if horizontal.is_geographic:
-        raise UserError(f"{path} has coordinates in degrees ({called}): they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in degrees ({called}): they must be projected, in metres or feet")
     if not horizontal.is_projected and not horizontal.is_engineering:
-        raise UserError(f"{path} has coordinates in {called}: they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in {called}: they must be projected, in metres or feet")
     axes = horizontal.axis_info[:2]
     if horizontal.is_projected and not is_east_north(horizontal):
         directions = " and ".join(str(axis.direction) for axis in axes)
-        raise UserError(f"{path} has coordinates in {called}, to {directions}: they must be to east and north.")
+        raise UserError(f"{path} has coordinates in {called}, to {directions}: they must be to east and north")
     unit, metres = (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else ("metre", 1.0)
     found = MapSystem(horizontal.to_wkt() if horizontal.is_projected else None, called, unit, metres)
     if vertical is None:
@@ -169,12 +169,12 @@ def read_prj(path: Path) -> MapSystem | None:
     words = [line.split() for line in text.upper().splitlines()]
     old = {line[0]: " ".join(line[1:]) for line in words if len(line) > 1}
     if old["PROJECTION"].startswith("GEO") or old.get("UNITS") in ("DD", "DS", "DMS"):
-        raise UserError(f"{path} has coordinates in degrees ({prj}): they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in degrees ({prj}): they must be projected, in metres or feet")
     lengths = {"METERS": 1.0, "FEET": _METRES_PER_FOOT}
     unit, heights = old.get("UNITS", "METERS"), old.get("ZUNITS", "NO")
     for name, value, allowed in (("Units", unit, lengths), ("Zunits", heights, (*lengths, "NO"))):
         if value not in allowed:
-            raise UserError(f"{path} has {name} {value} in {prj}: allowed are {', '.join(allowed)}.")
+            raise UserError(f"{path} has {name} {value} in {prj}: allowed are {', '.join(allowed)}")
     stated = {} if heights == "NO" else {"vertical_unit": heights.lower(), "vertical_metres": lengths[heights]}
     return MapSystem(None, old["PROJECTION"], unit.lower(), lengths[unit], **stated)  # type: ignore[arg-type]
 

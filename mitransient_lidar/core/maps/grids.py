@@ -104,10 +104,10 @@ def read_ascii_grid(path: Path) -> Grid:
         header = {words[i].lower(): float(words[i + 1]) for i in range(0, length, 2)}
         values = np.array(words[length:], dtype=np.float64)
     except ValueError as error:
-        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}.") from error
+        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}") from error
     columns, rows = (integer(f"{path}: {name}", _entry(path, header, name), 1, 10**6) for name in ("ncols", "nrows"))
     if values.size != columns * rows:
-        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
+        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}")
     cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
     positive(f"{path}: cellsize", min(cell))
     first = [
@@ -125,7 +125,7 @@ def _entry(path: Path, header: dict[str, float], *names: str) -> float:
     for name in names:
         if np.isfinite(header.get(name, np.nan)):
             return header[name]
-    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}.")
+    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}")
 
 
 def stated_by(system: MapSystem | None, unit: str = "") -> Stated:
@@ -172,11 +172,11 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
     """Return the first band of an open raster; refuse several bands, and rotated or missing map coordinates."""
     place = file.transform
     if file.count != 1 and not is_bag:
-        raise UserError(f"{path} has {file.count} bands: a height map must have one.")
+        raise UserError(f"{path} has {file.count} bands: a height map must have one")
     if place.is_identity:
-        raise UserError(f"{path} has no map coordinates: it must have them.")
+        raise UserError(f"{path} has no map coordinates: it must have them")
     if place.b != 0 or place.d != 0:
-        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
+        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x")
     system = map_system(path, file.crs.to_wkt()) if file.crs else None
     check_size(path, 8.0 * file.width * file.height)
     values = without_no_data(file.read(1), _BAG_EMPTY if is_bag else file.nodata)
@@ -210,7 +210,7 @@ def _corner_shift(
         inset = next((shift for shift in (0, 1) if abs(steps - number + 1 - shift) < _CORNER_TOLERANCE), None)
         if inset is None:
             raise UserError(
-                f"{path} has {number} cells along {'xy'[axis]}, but corners that are {steps:.6g} cells apart."
+                f"{path} has {number} cells along {'xy'[axis]}, but corners that are {steps:.6g} cells apart"
             )
         shifts.append(0.5 * inset)
     return shifts[0], shifts[1]

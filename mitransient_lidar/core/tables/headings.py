@@ -143,7 +143,7 @@ def read_headings(
     for column in columns:
         same = [name for name, heading in zip(names, used, strict=True) if heading and heading.column is column]
         if len(same) > 1:
-            raise UserError(f"{path} has {len(same)} columns {' and '.join(same)} for {column.name}: allowed is one.")
+            raise UserError(f"{path} has {len(same)} columns {' and '.join(same)} for {column.name}: allowed is one")
     others = [name for name, heading in zip(names, used, strict=True) if heading is None and name]
     if others:
         logger.info("%s: columns %s are not used", path, ", ".join(others))
@@ -171,7 +171,7 @@ def pick_columns(
         wanted = " or ".join(column.name for column in group)
         if len(known) > 1:
             same = " and ".join(names[i] for i, _ in known)
-            raise UserError(f"{path} has {len(known)} columns {same} that may be {wanted}: allowed is one.")
+            raise UserError(f"{path} has {len(known)} columns {same} that may be {wanted}: allowed is one")
         for i, _ in named if not known else ():
             if re.search(r"[\[(/]", names[i]):
                 raise UserError(f"{path} has an unknown unit in column {names[i]!r} {_found_and_allowed(names, group)}")
@@ -202,11 +202,11 @@ def _at_wavelength(
     if wavelength_nm is None:
         if len(found) > 1:
             raise UserError(
-                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm."
+                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm"
             )
         wavelength_nm = found[0]
     elif not any(abs(value - wavelength_nm) < _SAME_WAVELENGTH for value in found):
-        raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}.")
+        raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}")
     logger.info("%s: coefficients at %g nm", path, wavelength_nm)
     return [
         heading

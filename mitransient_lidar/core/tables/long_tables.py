@@ -52,7 +52,7 @@ def read_head(path: Path) -> str:
     with open_file(path) as file:
         size, head = os.fstat(file.fileno()).st_size, file.read(_HEAD)
     if size > _LARGEST:
-        raise UserError(f"{path} has {size / 2**20:.4g} MiB: a table may have {_LARGEST / 2**20:g} MiB.")
+        raise UserError(f"{path} has {size / 2**20:.4g} MiB: a table may have {_LARGEST / 2**20:g} MiB")
     text = head.decode("utf-8-sig", "replace")
     return text if size <= _HEAD else text[: text.rfind("\n") + 1]
 
@@ -87,13 +87,13 @@ def read_long_table(
 
     names, rows = find_rows(path, read_head(path), columns, others, names)
     if not rows:
-        raise UserError(f"{path} has no rows of numbers.")
+        raise UserError(f"{path} has no rows of numbers")
     chosen = choose(names)
     width, separator = len(rows[0].cells), rows[0].separator
     what = f"{path} is not a table of {', '.join(column.name for column in columns)}"
     named = width - (rows[0].cells[-1] == "" and width == len(names) + 1)  # a separator may end each row
     if width < 1 + max(i for i, _ in chosen) or (names and named != len(names)):
-        raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}.")
+        raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}")
     order = [i for i, _ in chosen]
     try:
         with open_file(path) as file:
@@ -114,9 +114,9 @@ def read_long_table(
             )
     except (ValueError, OverflowError) as error:  # pandas' errors are ValueErrors
         where = _faulty_line(path, rows[0].number, order, width) or " ".join(str(error).split())[:200]
-        raise UserError(f"{what}: {where}.") from error
+        raise UserError(f"{what}: {where}") from error
     if len(frame) > _MOST_ROWS:
-        raise UserError(f"{path} has more than {_MOST_ROWS} rows, the most of a table.")
+        raise UserError(f"{path} has more than {_MOST_ROWS} rows, the most of a table")
     return LongTable(frame[order].to_numpy(), [one for _, one in chosen], path, rows[0].number)
 
 

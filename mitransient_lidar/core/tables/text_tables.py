@@ -115,7 +115,7 @@ def read_table(
     """
     text = read_text(path)
     if (count := text.count("\n")) > _MOST_LINES:
-        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}.")
+        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}")
     lines, comments = split_lines(text)
     width = _width(lines)
     start = next((i for i, line in enumerate(lines) if len(line.cells) == width and _is_row(line)), len(lines))
@@ -175,7 +175,7 @@ def read_time_samples(path: str | PathLike[str], quantity: Column) -> tuple[Floa
     if times.size > 1 and "time" in table.without_unit and np.ptp(times) < _SHORTEST_RECORD:
         raise UserError(
             f"{path} has times from {times.min():g} to {times.max():g} without a unit, too short for ns: the heading"
-            " must name it, such as time_s."
+            " must name it, such as time_s"
         )
     return times, values
 
@@ -349,8 +349,8 @@ def _invalid_line(
         wanted = " and ".join(_with_first_unit(heading.column) for heading in headings if heading)
         return UserError(f"{where}: {' '.join(line.cells)!r} must be two numbers, {wanted}")
     if column is None:
-        return UserError(f"{where} has {len(line.cells)} values but must have {len(names)}, one for each column.")
-    return UserError(f"{where}: {names[column]} = {line.cells[column]!r} must be a number.")
+        return UserError(f"{where} has {len(line.cells)} values but must have {len(names)}, one for each column")
+    return UserError(f"{where}: {names[column]} = {line.cells[column]!r} must be a number")
 
 
 def _with_first_unit(column: Column) -> str:

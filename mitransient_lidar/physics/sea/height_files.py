@@ -60,7 +60,7 @@ def length_unit(name: str, unit: str) -> float:
     """
     key = re.sub(r"[\s_.]+", "", unit.lower())
     if key not in METRES:
-        raise UserError(f"{name} in {unit!r}: allowed are {_ALLOWED}.")
+        raise UserError(f"{name} in {unit!r}: allowed are {_ALLOWED}")
     return METRES[key]
 
 
@@ -159,7 +159,7 @@ def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, ce
     if not stated.position_unit and is_within and is_away and cell < _SMALLEST_CELL:
         raise UserError(
             f"{path} has positions about ({middle[0]:.6g}, {middle[1]:.6g}) in cells of {cell:.2g}, which look like"
-            " degrees: they must be projected, in metres, or their unit be stated."
+            " degrees: they must be projected, in metres, or their unit be stated"
         )
 
 
@@ -198,7 +198,7 @@ def read_netcdf_heights(path: Path) -> Grid:
         found = f" ({', '.join(names)})" if names else ""
         raise UserError(
             f"{path} has {len(names)} variables that may be the heights{found}: it must have one called"
-            f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions."
+            f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions"
         )
     heights = variables[names[0]]
     x, y = _axis(variables, "x"), _axis(variables, "y")
@@ -206,12 +206,12 @@ def read_netcdf_heights(path: Path) -> Grid:
     for name in (*map(str, heights.dims), x, y):
         units = str(variables[name].attrs["units"]) if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
-            raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
+            raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet")
     mapping = next((one.attrs for one in variables.values() if not _GRID_MAPPING.isdisjoint(one.attrs)), None)
     stated = stated_by(None if mapping is None else map_system(path, mapping))
     of_axes = {str(variable.attrs["units"]) for variable in positions.values()}
     if len(of_axes) > 1:
-        raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")
+        raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units")
     unit = "".join(of_axes - set(_NO_UNIT))
     stated = stated._replace(
         unit=stated.unit if heights.attrs["units"] in _NO_UNIT else str(heights.attrs["units"]),
@@ -269,16 +269,16 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
             return [(i, Heading(column, "", 0.0)) for i, column in enumerate((_X, _Y, _Z))]
         is_placed = any(heading and heading.known_unit for heading in (parse_heading(name, (_X, _Y)) for name in names))
         if not is_placed and any(parse_heading(name, (_ANGLES,)) for name in names):
-            raise UserError(f"{path} has columns of degrees ({', '.join(names)}): positions must be projected.")
+            raise UserError(f"{path} has columns of degrees ({', '.join(names)}): positions must be projected")
         return pick_columns(path, names, ((_X,), (_Y,), (_Z, _DEPTH)))
 
     table = read_long_table(path, (_X, _Y, _Z), (_DEPTH, _ANGLES), choose, [])
     points, (x, y, z) = table.values, table.headings
     if x.unit != y.unit:
-        raise UserError(f"{path} has x in {x.unit or 'no unit'} and y in {y.unit or 'no unit'}: they must be the same.")
+        raise UserError(f"{path} has x in {x.unit or 'no unit'} and y in {y.unit or 'no unit'}: they must be the same")
     for row in np.flatnonzero(~np.isfinite(points[:, :2]).all(axis=1) | np.isinf(points[:, 2]))[:1]:
         shown = ", ".join(f"{one:g}" for one in points[row])
-        raise UserError(f"{path}, line {table.line(row)}: the point {shown} must be finite.")
+        raise UserError(f"{path}, line {table.line(row)}: the point {shown} must be finite")
     return points, Stated(z.unit, True if z.column is _DEPTH else None, x.unit)
 
 
@@ -306,14 +306,14 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
         logger.warning("%s: %d of %d points have no height and are left out", path, missing, len(points))
         points = points[~np.isnan(points[:, 2])]
     if len(points) < 3:
-        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
+        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3")
     corner = points[:, :2].min(axis=0)
     places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
     if cell is None and (own := _own_grid(places, points[:, 2])) is not None:
         return Grid.of_cells(own[0], (float(corner[0]), float(corner[1])), own[1], stated)
     if len(points) > _MOST_SCATTERED:
         raise UserError(
-            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
+            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them"
         )
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import ConvexHull, Delaunay, QhullError
@@ -321,7 +321,7 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
     try:
         area, triangles = ConvexHull(places).volume, Delaunay(places)
     except (QhullError, ValueError) as error:
-        raise UserError(f"{path} has points on a line: a height map needs an area.") from error
+        raise UserError(f"{path} has points on a line: a height map needs an area") from error
     size = float(np.sqrt(area / len(points))) if cell is None else positive("map_cell", cell)
     if size > 0.5 * extent.min():
         raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}")

@@ -149,7 +149,7 @@ def read_height_map(
         raise UserError(f"map_holes = {holes!r} must be refuse or fill")
     kind = readable_suffix(path, (*_READERS, *_POINTS), "height map")
     if cell is not None and kind not in _POINTS:
-        raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points.")
+        raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points")
     given = values, unit, no_data
     if kind in _POINTS:
         if size is not None:
@@ -158,7 +158,7 @@ def read_height_map(
     else:
         grid = _in_metres(path, _READERS[kind](path), size, given)
         if origin is not None and size is not None:
-            raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
+            raise UserError(f"origin_x and origin_y must not be given: {path} has no positions")
     x, y = grid.positions["x"], grid.positions["y"]
     heights, filled = _without_holes(path, grid.values, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
     terrain = _moved(path, HeightMap(heights, x, y, None, filled, grid.stated.system), grid.centre, origin)
@@ -187,11 +187,11 @@ def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Gri
     """Return a grid in metres; without its own positions, about the origin with the given size."""
     heights, stated = _numbers(path, "heights", grid.values), grid.stated
     if heights.ndim != 2 or min(heights.shape) < 2:
-        raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns.")
+        raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns")
     heights = heights_in_metres(path, heights, stated, *given)
     counts = {"x": heights.shape[1], "y": heights.shape[0]}
     if len(grid.positions) == 1:
-        raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none.")
+        raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none")
     if not grid.positions:
         if size is None:
             raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres")
@@ -207,7 +207,7 @@ def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Gri
 
 
 def _superfluous_size(path: Path, size: float) -> UserError:
-    return UserError(f"size = {size} must not be given: {path} has positions of its own.")
+    return UserError(f"size = {size} must not be given: {path} has positions of its own")
 
 
 def _without_holes(
@@ -249,7 +249,7 @@ def _moved(
         if not low - _FARTHEST <= finite(f"origin_{name}", value) <= high + _FARTHEST:
             raise UserError(
                 f"origin_{name} = {value:.10g} must lie within {_FARTHEST / 1000:g} km of {path}, whose {name} is "
-                f"{low:.10g} to {high:.10g}."
+                f"{low:.10g} to {high:.10g}"
             )
     x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
     _warn_beside(path, (x, y))
@@ -270,21 +270,21 @@ def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatAr
     """Return `count` finite, increasing, evenly spaced positions."""
     positions = _numbers(path, name, values)
     if positions.shape != (count,):
-        raise UserError(f"{path} has {name} of shape {positions.shape}, but its heights need ({count},).")
+        raise UserError(f"{path} has {name} of shape {positions.shape}, but its heights need ({count},)")
     for i in np.flatnonzero(~np.isfinite(positions))[:1]:
-        raise UserError(f"{path} has {name}[{i}] = {positions[i]:g}: positions must be finite.")
+        raise UserError(f"{path} has {name}[{i}] = {positions[i]:g}: positions must be finite")
     gaps = np.diff(positions)
     for i in np.flatnonzero(gaps <= 0)[:1]:
         raise UserError(
             f"{path} has {name}[{i}] = {positions[i]:g} and {name}[{i + 1}] = {positions[i + 1]:g}:"
-            " positions must increase."
+            " positions must increase"
         )
     spacing = (positions[-1] - positions[0]) / (count - 1)
     worst = int(np.argmax(np.abs(gaps - spacing)))
     if abs(gaps[worst] - spacing) > UNEVENNESS * spacing:
         raise UserError(
             f"{path} has {name}[{worst}] and {name}[{worst + 1}] {gaps[worst]:g} apart, but {spacing:g} on average:"
-            " positions must be evenly spaced."
+            " positions must be evenly spaced"
         )
     return positions
 
@@ -298,14 +298,14 @@ def _cells(positions: FloatArray, wanted: npt.ArrayLike) -> tuple[IntArray, Floa
 def _numbers(path: Path, name: str, values: Array) -> FloatArray:
     """Return real numbers in 64 bits."""
     if values.dtype.kind not in "iuf":
-        raise UserError(f"{path} has {name} of type {values.dtype}, but they must be real numbers.")
+        raise UserError(f"{path} has {name} of type {values.dtype}, but they must be real numbers")
     return values.astype(np.float64)
 
 
 def _read_npz(path: Path) -> Grid:
     arrays = read_npz(path, ("heights", "x", "y"))
     if "heights" not in arrays:
-        raise UserError(f"{path} must have an array heights, and may have x and y.")
+        raise UserError(f"{path} must have an array heights, and may have x and y")
     return Grid(arrays.pop("heights"), arrays)
 
 
@@ -314,7 +314,7 @@ def _read_exr(path: Path) -> Grid:
     names = list(images) if len(images) == 1 else [name for name in "YRZ" if name in images]
     if not names:
         channels = ", ".join(sorted(images))
-        raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
+        raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z")
     return Grid(images[names[0]][::-1], {})
 
 

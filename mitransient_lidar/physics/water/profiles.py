@@ -299,9 +299,9 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     try:
         columns = _in_order(path, _checked(path, columns))
     except _RowError as error:
-        raise UserError(f"{path}, {places[error.row]}: {error.text}.") from None
+        raise UserError(f"{path}, {places[error.row]}: {error.text}") from None
     if columns["depth"].size < 2:
-        raise UserError(f"{path} has {columns['depth'].size} depths but a profile must have at least 2.")
+        raise UserError(f"{path} has {columns['depth'].size} depths but a profile must have at least 2")
     return Profile(**columns)
 
 
@@ -323,7 +323,7 @@ def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, lis
     for (name, item), heading in zip(profiles.items(), headings, strict=True):
         if heading is not None:
             if item.values.dtype.kind not in "iuf":
-                raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers.")
+                raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers")
             column, values = heading.column.name, item.values.astype(np.float64) * heading.factor
             if (direction := str(item.attrs.get("positive", "")).lower()) in ("up", "down"):
                 column, values = "depth", values if direction == "down" else -values
@@ -338,10 +338,10 @@ def _check_names(path: Path, names: list[str]) -> None:
     """Reject missing and contradictory columns."""
     if ("depth" in names) == ("z" in names) or sum(name in _PROPERTIES for name in names) < 2:
         raise UserError(
-            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth or z and two of a, b, c, omega."
+            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth or z and two of a, b, c, omega"
         )
     if "bb" in names and "bb_ratio" in names:
-        raise UserError(f"{path} has the columns bb and bb_ratio, but must have only one of them.")
+        raise UserError(f"{path} has the columns bb and bb_ratio, but must have only one of them")
 
 
 def _checked(path: Path, columns: _Columns) -> _Columns:

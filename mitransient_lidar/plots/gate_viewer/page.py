@@ -122,11 +122,11 @@ def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
     if result is None:
         return None
     if "waveform" not in result:
-        raise UserError("the result has no variable waveform.")
+        raise UserError("the result has no variable waveform")
     wanted = {name: size for name, size in stack["gate_energy"].sizes.items() if name != "gate"}
     found = {name: size for name, size in result["waveform"].sizes.items() if name != "time"}
     if found != wanted:
-        raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}.")
+        raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}")
     # A result without angles is in the order of the stack.
     known = {name: stack[name].variable for name in ("angle_x", "angle_y") if name not in result.coords}
     return drawing.as_seen(result.assign_coords(known))
@@ -153,7 +153,7 @@ def _fit(
             break
     else:
         without = "" if is_record else ", even without waveforms"
-        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack{without}.")
+        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack{without}")
     if record is not None:
         for factor in factors[factors.index(gates.factor) :]:
             waveforms = _encode(record, _WAVEFORMS, factor)

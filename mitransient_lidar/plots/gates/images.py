@@ -86,7 +86,7 @@ def check_animation(stack: xr.Dataset, path: Path) -> None:
     if "pixel" in stack.dims:
         raise UserError(
             f"cannot write {path}: an animation needs images, but this stack has {stack.sizes['pixel']} single pixels; "
-            "draw its contact sheet."
+            "draw its contact sheet"
         )
 
 
@@ -101,7 +101,7 @@ def find_ffmpeg(path: Path) -> str:
     except (ImportError, RuntimeError):
         raise UserError(
             f"cannot write {path}: .mp4 needs the program ffmpeg, which pip install 'mitransient-lidar[movie]' brings; "
-            "choose .gif without it."
+            "choose .gif without it"
         ) from None
 
 
@@ -119,7 +119,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4.")
+        raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4")
     stack = as_stack(dataset)
     check_animation(stack, path)
     figure, show = _animated_figure(stack, log=log)
@@ -136,7 +136,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
                     show(index)
                     writer.grab_frame()
         except CalledProcessError as error:
-            raise UserError(f"cannot write {path}: ffmpeg ended with the error {error.returncode}.") from error
+            raise UserError(f"cannot write {path}: ffmpeg ended with the error {error.returncode}") from error
 
 
 def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
