@@ -55,13 +55,13 @@ def detect_waveforms(
     dataset: results.Given,
     chain: Annotated[
         Receiver | None,
-        Option(f"{RECEIVERS_OR_CAMERAS}. By default that of the result's instrument, or apd", flag="--receiver"),
+        Option(f"{RECEIVERS_OR_CAMERAS}. By default the result's instrument, or apd", flag="--receiver"),
     ] = None,
     shots: Annotated[int, Option("Records per waveform, or frames per gate, with independent noise", 1, 10**9)] = 1,
     seed: Seed = 0,
     background_power: Annotated[
         Powers,
-        Option("Power of the daylight on each pixel (at least 0) [W]", flag="--background-power-w"),
+        Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
     ] = 0.0,
     *,
     gain: Annotated[

@@ -136,7 +136,7 @@ def _fit(
             help="Result or recorded signal (.nc, .exr), or a CSV file with a column time_ns and one column per pixel.",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
     """Fit, print and write."""

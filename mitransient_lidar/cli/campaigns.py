@@ -179,8 +179,8 @@ FIGURES = {
         _figures,
         """Make the figures of the published model again.
 
-        Writes a PNG file for each figure, and a table of the publication's statements with our numbers, their errors,
-        and whether they hold.
+        Writes a PNG file for each figure, and a table of the publication's statements with computed numbers, their
+        errors, and whether they hold.
         """,
     )
 }

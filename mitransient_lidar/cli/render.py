@@ -238,7 +238,7 @@ COMMANDS = {
         _shots,
         """Render a series of shots over one sea.
 
-        Writes one file of all waveforms, with the true slope, height and depth at each place, which record, echoes,
+        Writes one file with all waveforms, and the true slope, height and depth at each location, which record, echoes,
         retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
         """,
         defaults={"count": None, "seed": None},
@@ -249,7 +249,7 @@ COMMANDS = {
         _frames,
         """Render frames of gate images, each with its own pulses.
 
-        Each gate of each frame has pulses of its own, between which waves and platform move. Writes
+        Each gate in each frame has its own pulses, between which waves and platform move. Writes
         DIR/<scene>_frames.nc, and the mean over the frames as <scene>_frames_gates.exr, _gates.png and _depth.png.
         Ctrl-C keeps the completed frames.
         """,

@@ -147,8 +147,8 @@ COMMANDS = {
         _view,
         """Show a result in the browser, or draw its waveforms or layout.
 
-        The page is a map of the pixels at each time, and the waveforms of those that are clicked; it needs no network.
-        Gates are shown where FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a
+        The page shows a pixel map at each time, and the waveforms of clicked pixels; it needs no network.
+        It shows gates where FILE has them, and the mean of camera frames. With --plot, --components, --layout or a
         drawing as --output, a PNG, PDF or SVG file is written instead, by default in the folder of FILE. Both print the
         path. With --layout, the command also prints where the axes of receiver and laser, refracted by a level sea,
         meet the sea level, targets' depths and the bottom: x, y, z.

@@ -114,10 +114,10 @@ COMMANDS = {
         _HEADING,
         "",
         _info,
-        """Print versions, the Mitsuba variant and the path of LLVM, or the parameters of a result.
+        """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
 
-        Of a result: its attributes, then every object of its scene with the values of all parameters, defaults too; a
-        dash for those that are not given and have no default, or are not used.
+        A result gives its attributes, then every object in its scene with all parameter values, defaults too. A dash
+        marks parameters that are not given and have no default, or are not used.
         """,
     ),
     "bench": Command(_HEADING, "studies.bench.integrators:run", _bench, "Measure the time to a given accuracy."),

@@ -83,7 +83,7 @@ def _depth_bias(
 
 def _tpu(
     call: Call,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
     """Write an instrument's uncertainties, with figures and fits for each altitude and angle."""
@@ -162,7 +162,7 @@ STUDIES = {
         """Compute Cramer-Rao bounds of parameters from one shot, and rank designs.
 
         No unbiased estimate from one shot's record, with the receiver's noise, has a smaller standard deviation.
-         Renders the scene with derivatives by the free parameters, for each combination of values.
+        Renders the scene with derivatives by the free parameters, for each combination of values.
         """,
         table="write_table",
     ),

@@ -62,7 +62,7 @@ def beam_spread(
     instrument: Instrument = None,
     passes: Annotated[int, Option("Number of independent passes per render", 2, 10_000)] = 8,
     max_time: FewerPasses = None,
-    photons: Annotated[int, Option("Photons of a pass", 1024, 2**24)] = 2**16,
+    photons: Annotated[int, Option("Photons per pass", 1024, 2**24)] = 2**16,
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:

@@ -49,13 +49,13 @@ def rising(meaning: str, unit: str, **more: Any) -> Option:
 InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
 Winds = Annotated[Numbers, rising("Wind speeds; 0 for a level sea with ripples", "m/s")]
 Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
-Depths = Annotated[Numbers, rising("Depths of the bottom", "m", above=True)]
+Depths = Annotated[Numbers, rising("Bottom depths", "m", above=True)]
 SeaScene = Annotated[str, Option("Scene that supplies sea, water and bottom")]
 OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrument's")]
 Places = Annotated[int, Option("Random locations per wavy sea, or renders of a level sea", 2, 10_000)]
 Records = Annotated[int, Option("Records with noise at each location", 1, 10_000)]
 SeaTime = Annotated[
-    float | None, positive_option("Render no sea after this many seconds; those left out are NaN in the table")
+    float | None, positive_option("Render no sea after this many seconds; omitted seas are NaN in the table")
 ]
 SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 

@@ -63,7 +63,7 @@ def detect(
     *,
     instrument: Instrument = None,
     receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS_OR_CAMERAS)] = "apd",
-    pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
+    pfa: Annotated[float, Option("False alarm probability", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
     ] = 0.9,

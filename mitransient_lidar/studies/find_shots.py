@@ -63,7 +63,7 @@ def find_shots(
     *,
     at: Annotated[Sequence[tuple[float, float]], Option("A location, instead of a search", unit="m", form="X,Y")] = (),
     slope_sigmas: Annotated[float, positive_option("Slopes to find, in standard deviations")] = 2.0,
-    count: Annotated[int, Option("Places of each kind", 1, 100)] = 1,
+    count: Annotated[int, Option("Locations of each kind", 1, 100)] = 1,
     waveforms: Annotated[bool, Option("Also render the shots")] = True,
     max_time: Annotated[
         float | None, positive_option("Stop before this many seconds, with fewer passes or waveforms")

@@ -49,7 +49,7 @@ def target_signal(
     max_time: Annotated[
         float | None,
         positive_option(
-            "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more"
+            "Stop before this many seconds, shared among the positions, with fewer passes, at least 16 per position"
         ),
     ] = None,
     seed: Annotated[int, Option("Random seed", -(2**63), 2**63 - 1)] = 0,

@@ -63,7 +63,7 @@ def tpu(
     records: Records = 4,
     corrections: Annotated[
         Given | None,
-        Option("Table of depth-bias to also correct the depths by, auto for the shipped one, or none", form="FILE"),
+        Option("Table from depth-bias that also corrects the depths, auto for the shipped one, or none", form="FILE"),
     ] = "auto",
     pointing_mrad: Annotated[float, Option("Standard deviation of the beam direction, each axis", 0)] = 0.1,
     position_m: Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)] = 0.05,

@@ -62,9 +62,7 @@ def describe_water(
     ] = None,
     wavelength_nm: Annotated[
         float,
-        Option(
-            "Wavelength; of Jerlov's and Petzold's waters green, or 700 or more", 400, 1100, "nm", flag="--wavelength"
-        ),
+        Option("Wavelength; green for Jerlov and Petzold waters, or 700 or more", 400, 1100, "nm", flag="--wavelength"),
     ] = 532.0,
     temperature: Annotated[float, Option("Temperature, for the indices", 0, 30, "degrees Celsius")] = 20.0,
     salinity: Annotated[float, Option("Salinity, for the indices", 0, 40, "per mille")] = 35.0,
