@@ -207,7 +207,7 @@ def open(
     Returns
     -------
     xarray.Dataset
-        What was written; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
+        The written data; values from EXR files have 32 bits. See :func:`mitransient_lidar.results.files.open` and
         :func:`mitransient_lidar.campaigns.store.open_campaign`.
 
     Raises
@@ -235,8 +235,8 @@ def save(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
     dataset : xarray.Dataset
         The dataset.
     path : path
-        ``.nc`` is NetCDF-4, of any dataset; ``.exr`` OpenEXR, of waveforms, gates or images by daylight; ``.csv`` a
-        text table of echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
+        ``.nc`` is NetCDF-4, for any dataset; ``.exr`` OpenEXR, for waveforms, gates or daylight images; ``.csv`` a text
+        table with echoes or bounds. Without a suffix, gates become a sequence of EXR files, one per gate. See
         :func:`mitransient_lidar.results.files.save`.
 
     Raises

@@ -1,4 +1,4 @@
-"""Base classes of the plugins."""
+"""Base classes for the plugins."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread, PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
-#: Parameter of the loader: place of the frame's origin in the scene [m], x, y, z, of plugins that know places.
+#: Parameter of the loader: frame origin in the scene [m], x, y, z, for plugins with a location.
 FRAME_ORIGIN = "_frame_origin"
 
-#: Parameters of a receiver's optics, in the order of `ReceiverOptics`.
+#: Optical parameters of a receiver, in the order of `ReceiverOptics`.
 _OPTICS = tuple(each.name for each in fields(ReceiverOptics))
 
 
@@ -42,8 +42,8 @@ class DeclaredProperties(mi.Properties):
         self._plugin = plugin
         #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
         self.values: dict[str, Any] = {}
-        #: Place of the frame's origin in the scene [m]: parameters are places in the scene, loaded objects lie in the
-        #: frame, in which single precision is exact.
+        #: Frame origin in the scene [m]: parameters are scene coordinates, loaded objects lie in the frame, in which
+        #: single precision is exact.
         self.frame_origin = np.array(self.take(FRAME_ORIGIN, (0.0, 0.0, 0.0)), dtype=np.float64)
         for parameter in plugin:
             if parameter.may_be_empty and parameter.name in self and super().get(parameter.name) == "":
@@ -61,7 +61,7 @@ class DeclaredProperties(mi.Properties):
         return self._plugin.reader(self.get)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return the value of a parameter, or the default."""
+        """Return a parameter's value, or the default."""
         return self._kept(name, super().get(name, default))
 
     def __getitem__(self, name: str) -> Any:
@@ -88,12 +88,12 @@ class DeclaredProperties(mi.Properties):
 def register(
     kind: str, plugin: Plugin, make: Callable[[DeclaredProperties], Any], described: type | None = None
 ) -> None:
-    """Register a plugin of a kind of Mitsuba, made by its class or a function of the class that describes it.
+    """Register a Mitsuba plugin of a kind, made by its class or by a function of the class that describes it.
 
-    The manual, the docstring of the class, gets the table of its parameters.
+    The class docstring, the plugin's manual, gets the parameter table.
 
-    Its objects have ``parameters``: the plugin's name as ``type``, the value of each parameter that they have read, and
-    nested objects; and a description of these.
+    The objects get ``parameters``: the plugin's name as ``type``, each parameter's value that they have read, and
+    nested objects; and a description that lists these.
     """
     manual: Any = make if described is None else described
     if manual.__doc__:
@@ -104,7 +104,7 @@ def register(
         children = dict(props.objects(False))
         made = make(own)
         type(made).to_string = _described
-        # Mitsuba refuses parameters of `props` that nobody has read: the class has read, or removed, those of the copy.
+        # Mitsuba refuses unread parameters of `props`: the class has read, or removed, the copy's parameters.
         given, left = list(props.keys()), set(own.keys())
         used = [name for name in given if name not in left or own.was_queried(name)]
         for name in used:
@@ -162,19 +162,19 @@ def closed(plugin: Any) -> Any:
 class PassIntegrator(mi.CppADIntegrator):
     """Integrator that prepares a scene and renders one pass of it.
 
-    It has no state of a scene: every call of ``mi.render`` prepares the scene again, with changes by ``mi.traverse``.
-    ``mitransient_lidar.render`` prepares a scene once for all of its passes.
+    It keeps no scene state: every ``mi.render`` call prepares the scene again, with changes by ``mi.traverse``.
+    ``mitransient_lidar.render`` prepares a scene once for all passes.
     """
 
-    #: Name of the integrator in results.
+    #: Integrator name in results.
     plugin: str
 
-    #: Whether it renders daylight instead of a lidar's echoes.
+    #: Whether it renders daylight instead of lidar echoes.
     passive = False
 
     @abstractmethod
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> Any:
-        """Return the renderer of passes of a scene (`PassRenderer` or `DaylightRenderer`).
+        """Return the pass renderer for a scene (`PassRenderer` or `DaylightRenderer`).
 
         Raises
         ------
@@ -196,10 +196,10 @@ class PassIntegrator(mi.CppADIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        """Render one pass; passes of different seeds are independent.
+        """Render one pass; passes with different seeds are independent.
 
-        `spp` is the number of paths for each pixel; 0 selects the integrator's number of paths for all pixels together.
-        Without `develop` the result is empty; `evaluate` is not used.
+        `spp` is the number of paths per pixel; 0 selects the integrator's total number of paths. Without `develop` the
+        result is empty; `evaluate` is not used.
 
         Returns
         -------
@@ -210,7 +210,7 @@ class PassIntegrator(mi.CppADIntegrator):
         Raises
         ------
         UserError
-            When `prepare` does, or `seed` is not within 0 to 2^64 - 1, or `spp` not within 0 to 2^28.
+            When `prepare` raises it, or `seed` is not within 0 to 2^64 - 1, or `spp` not within 0 to 2^28.
         """
         seed, spp = integer("seed", int(np.array(seed).item()), 0, 2**64 - 1), integer("spp", spp, 0, 2**28)
         if isinstance(sensor, int):
@@ -253,7 +253,7 @@ class ReceiverSensor(mi.Sensor):
 
 
 def read_pose(props: DeclaredProperties) -> KernelPose:
-    """Return the pose of a lidar in the frame: of ``to_world``, or of height, angle and aim."""
+    """Return a lidar's pose in the frame, from ``to_world`` or from height, angle and aim."""
     if "to_world" not in props:
         pose = KernelPose.from_angles(*(props.get(each.name, each.default) for each in ANGLES))
         return pose.in_frame(props.frame_origin)
@@ -262,7 +262,7 @@ def read_pose(props: DeclaredProperties) -> KernelPose:
 
 
 def _blur(props: DeclaredProperties) -> PointSpread | None:
-    """Return the point-spread function of a receiver; None for sharp optics."""
+    """Return a receiver's point-spread function; None for sharp optics."""
     if "blur_file" not in props:
         if "blur_file_mrad" in props:
             raise UserError("blur_file_mrad is the size of blur_file, which is missing")
@@ -281,8 +281,8 @@ def refuse_medium(props: mi.Properties) -> None:
     """Raise UserError for a medium inside a sensor or an emitter, which would have no effect."""
     if any(isinstance(child, mi.Medium) for _, child in props.objects()):
         raise UserError(
-            f"{props.plugin_name()}: a medium inside it would have no effect, leave it out: what lies below the sea "
-            "surface is in its water, and what lies above in clear air"
+            f"{props.plugin_name()}: a medium inside it would have no effect, leave it out: below the sea surface the "
+            "solid lies in the sea's water, above it in clear air"
         )
 
 
@@ -309,7 +309,7 @@ class EmitterWithoutExtent(mi.Emitter):
         return ds
 
 
-#: Mesh attribute of the share of foam.
+#: Mesh attribute: foam share.
 FOAM = "face_foam"
 
 

@@ -22,8 +22,8 @@ class GramCharlierDielectric(mi.BSDF):
 
     .. parameters::
 
-    The ripples of an ``ocean_surface`` with ``slope_distribution`` ``gram_charlier``. The density of slopes over their
-    standard deviations, *x* along v and *y* against u, is that of a Gaussian rough dielectric (Walter et al. 2007,
+    The ripples of an ``ocean_surface`` with ``slope_distribution`` ``gram_charlier``. Its slope density, over *x* along
+    v and *y* against u in standard deviations, is the Gaussian rough dielectric density (Walter et al. 2007,
     doi:10.2312/EGWR/EGSR07/195-206) times
 
     .. math:: 1 - \tfrac{c_{21}}{2} (x^2 - 1) y - \tfrac{c_{03}}{6} (y^3 - 3 y) + \tfrac{c_{40}}{24} (x^4 - 6 x^2 + 3)
@@ -111,7 +111,7 @@ class GramCharlierDielectric(mi.BSDF):
         return value * self._ratio(si.wi, wo), pdf
 
     def _ratio(self, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
-        """Return the ratio of the BSDF to that of Gaussian slopes."""
+        """Return the BSDF's ratio to the BSDF with Gaussian slopes."""
         cos_i, cos_o = mi.Frame3f.cos_theta(wi), mi.Frame3f.cos_theta(wo)
         # Generalised half vector (Walter et al. 2007, equations 13 and 16), on the upper side.
         index = dr.select(cos_i > 0, self._index, dr.rcp(self._index))
@@ -121,7 +121,7 @@ class GramCharlierDielectric(mi.BSDF):
         return self._scale * facets * self._visible(wi) * self._visible(wo)
 
     def _visible(self, direction: mi.Vector3f) -> mi.Float:
-        """Return the ratio of Smith's masking to that of Gaussian slopes."""
+        """Return the ratio of Smith's masking to the masking by Gaussian slopes."""
         up = dr.mulsign(direction, direction.z)
         along_u, along_v = up.x * self._u, up.y * self._v
         spread2 = dr.square(along_u) + dr.square(along_v)

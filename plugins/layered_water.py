@@ -33,10 +33,10 @@ logger = logging.getLogger(__name__)
 
 _INDICES = ("refractive_index", "group_index")
 
-#: Absorption over that of pure water below which coefficients given as numbers are doubted.
+#: Coefficients given as numbers raise a warning below this share of the absorption by pure water.
 _LEAST_ABSORPTION = 0.8
 
-#: Parameters of bubbles behind a ship, in the order of `BubblePlume`.
+#: Parameters of a ship's bubble plume, in the order of `BubblePlume`.
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
 
 
@@ -46,13 +46,13 @@ class LayeredWater(mi.Medium):
 
     .. parameters::
 
-    Of coefficients, the six ways to give a water, and ``profile`` one is allowed; an empty text counts as not given. A
-    water holds for all layers, or is a list with one value a layer: ``1C, 5C``. Sources and uncertainties are those of
-    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients.
+    Give the coefficients, one of the six other water descriptions, or ``profile``; an empty text counts as not given. A
+    description holds for all layers, or is a list with one value per layer: ``1C, 5C``. `physics.water.water_types`
+    states sources and uncertainties, and ``mitransient-lidar water`` prints the coefficients.
 
-    At a ``wavelength_nm`` above 700, a water by name, or the default one, absorbs as pure water does there (14.4 1/m at
-    1064 nm), and its particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay as they are,
-    with a warning where they absorb less than pure water.
+    At a ``wavelength_nm`` above 700, a named or default water absorbs like pure water (14.4 1/m at 1064 nm), and its
+    particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay unchanged, with a warning where
+    they absorb less than pure water.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -60,15 +60,15 @@ class LayeredWater(mi.Medium):
     Bubbles below a windy sea are a mean over time, without the plumes of fresh breakers: the Hall-Novarini model
     (Hall 1989, doi:10.1121/1.398102; Novarini et al. 1998, doi:10.1109/48.725236). Their void fraction is
     :math:`9.3 \cdot 10^{-7}\,(U/10)^3\, e^{-z/L}` for a wind U [m/s], with L = 0.4 m up to 7.5 m/s and :math:`0.4 +
-    0.115\,(U-7.5)` above. They scatter by :math:`b = 3\beta/(2r)` of their void fraction :math:`\beta` and effective
-    radius r = 37 um, twice what meets them, and their Fournier-Forand function has the given backscatter at 180
-    degrees. The glory and the critical angle of bubbles are left out. Void fractions that were measured 2 m down
-    reached :math:`10^{-4.5}`, and were much the same in all winds below 16 m/s (Czerski et al. 2022,
+    0.115\,(U-7.5)` above. They scatter by :math:`b = 3\beta/(2r)` with their void fraction :math:`\beta` and effective
+    radius r = 37 um, twice the light that meets them. Their Fournier-Forand function has the given backscatter at 180
+    degrees. The glory and the bubbles' critical angle are left out. Void fractions measured 2 m down reached
+    :math:`10^{-4.5}`, and were much the same in all winds below 16 m/s (Czerski et al. 2022,
     doi:10.5194/os-18-565-2022).
 
-    Between layers of different refractive index light is refracted, or reflected totally; the partial reflection (5e-6
-    between fresh and sea water at vertical incidence) is left out. At most 16 such layers are allowed, and they must
-    begin below the troughs of the waves.
+    Layers with different refractive indices refract light, or reflect it totally; the partial reflection (5e-6 between
+    fresh and sea water at vertical incidence) is left out. At most 16 such layers are allowed, and they must begin
+    below the wave troughs.
 
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
     volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
@@ -127,21 +127,21 @@ def _read_water(
     nested: dict[str, mi.PhaseFunction],
     bubbles: mi.PhaseFunction | None,
 ) -> Water:
-    """Return the water of parameters.
+    """Return the water that parameters describe.
 
     Parameters
     ----------
     props
-        Parameters of the plugin, as its manual page describes them.
+        Plugin parameters, as the manual page describes them.
     nested
         Phase functions by name, one for all layers or one for each; may be empty.
     bubbles
-        Phase function of the bubbles; None for that of ``plume_backscatter_ratio`` or ``bubble_backscatter``.
+        Phase function of the bubbles; None for the one by ``plume_backscatter_ratio`` or ``bubble_backscatter``.
 
     Raises
     ------
     UserError
-        When a value is not allowed, or two parameters describe the same.
+        When a value is not allowed, or two parameters describe one thing.
     """
     check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
     read = props.read
@@ -181,11 +181,11 @@ def _read_water(
 
 
 def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
-    """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
+    """Return the layers by coefficients, named water or profile, their scattering by molecules and the wavelength.
 
-    That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
-    wavelength [nm], None where none is given. `is_of_phase` says that backscattering follows from a phase
-    function: the parameter then counts up to the scattering.
+    The scattering by molecules [1/m] has one value per layer or one for all, 0 where unknown; the wavelength [nm] is
+    None where none is given. With `is_of_phase`, backscattering follows from a phase function: the parameter then may
+    reach the scattering.
     """
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
@@ -253,8 +253,8 @@ def _bubbles(props: DeclaredProperties) -> tuple[BubblePlume | BubbleLayer | Non
         return plume, ratio
     if plume is not None:
         raise UserError(
-            f"plume_scattering = {plume.scattering:g} must be 0 with bubbles of bubble_wind_speed or "
-            "bubble_void_fraction: water has one kind of bubbles"
+            f"plume_scattering = {plume.scattering:g} must be 0 with bubbles by bubble_wind_speed or "
+            "bubble_void_fraction: a water has one kind of bubbles"
         )
     return BubbleLayer(bubbles.scattering, bubbles.depth), bubbles.backscatter_ratio(backscatter)
 
@@ -270,14 +270,14 @@ def _is_given(props: DeclaredProperties, name: str) -> bool:
 
 
 def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:
-    """Return the column with neighbouring layers of equal properties joined, and the first layer of each."""
+    """Return the column with equal neighbouring layers joined, and the first layer of each."""
     rows = np.array([column.attenuation, column.scattering, column.backscattering, *others])
     kept = np.append(0, 1 + np.flatnonzero(np.any(np.diff(rows, axis=1) != 0, axis=0)))
     return WaterColumn(column.layer_tops[kept], *rows[:3, kept]), kept
 
 
 def _check_water_scattering(molecules: np.ndarray, column: WaterColumn) -> None:
-    """Raise `UserError` unless the scattering by molecules [1/m] is a part of that of each layer."""
+    """Raise `UserError` unless the scattering by molecules [1/m] is part of each layer's scattering."""
     for layer in np.flatnonzero((molecules < 0) | (molecules > column.scattering))[:1]:
         raise UserError(
             f"water_scattering = {molecules[layer]:g} must be at least 0 and at most scattering = "

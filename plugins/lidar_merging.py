@@ -22,30 +22,30 @@ class LidarMerging(PassIntegrator):
     .. parameters::
 
     Nearly every echo has one vertical reversal, and both parts of its path are easy to sample from their own ends.
-    Light is traced from the laser and paths from the receiver, both through waves and ripples into the water, with
-    scattering of any order, and points are placed at equal distances along both. Where a point of a light path and one
-    of a receiver's path lie in the same small cell, they are merged into a complete path, with the phase function
-    between their directions; likewise on the same small patch of the bottom or of a target, with the BSDF (photon
-    mapping in a medium: Jensen and Christensen 1998, doi:10.1145/280814.280925; points at equal distances instead of
-    collisions: the track-length estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
+    Light paths start at the laser and receiver paths at the receiver. Both cross waves and ripples into the water,
+    scatter to any order, and get points at equal distances. A light point and a receiver point in the same small cell
+    are merged into a complete path, with the phase function between their directions. The same small patch on the
+    bottom or on a target merges them with the BSDF (photon mapping in a medium: Jensen and Christensen 1998,
+    doi:10.1145/280814.280925; points at equal distances instead of collisions: the track-length estimator, Spanier
+    1966, doi:10.1137/0114057, at both ends).
 
     Cells are sectors of rings about the refracted beam, in layers below the surface. With the distance *r* from the
-    axis and a core radius *q* of two standard deviations of the beam and 0.05 m for each metre of depth, rings have
-    equal widths in arsinh(*r*/*q*): cells are small where the light is concentrated, and grow with the distance from a
-    narrow beam. They are half as thick as the distance of the points, at most 0.3 attenuation lengths, and thinner near
-    the surface where a narrow beam spreads fast, where facets are small, and in turbid water. Patches of solids that
-    look up or down are such sectors, too; on the axis they grow with depth at most twice as much as unscattered light.
+    axis and a core radius *q* of two beam standard deviations plus 0.05 m per metre of depth, rings have equal widths
+    in arsinh(*r*/*q*). Cells are thus small where the light is concentrated, and grow with the distance from a narrow
+    beam. Their thickness is half the point distance, at most 0.3 attenuation lengths. They are thinner near the surface
+    where a narrow beam spreads fast, where facets are small, and in turbid water. Patches on solids that look up or
+    down are such sectors, too; on the axis they grow with depth at most twice as much as unscattered light.
 
     Within a cell, light is counted where it meets a common plane, at a random depth in each pass. The receiver's paths
-    look it up where the light at their points would meet that plane: along the beam as the facet above refracts it, at
-    an offset that grows as ripples spread the beam. Narrow beams then do not blur, however waves refract them.
+    look it up where the light at their points would meet that plane. This is along the beam as the facet above refracts
+    it, at an offset that grows as ripples spread the beam. Narrow beams thus stay sharp, however waves refract them.
 
-    Of images from 4096 pixels on, every second path of the receiver is merged in the water, and stands for two; all are
+    In images with 4096 pixels or more, every second receiver path is merged in the water, with double weight; all are
     merged on solids, whose pixels need more paths.
 
-    Some points of the receiver's paths are connected, over any distance, with a random point of a light path, or with
-    light on a solid, by a segment in the water. Light that is scattered into a narrow beam, or out of it, far from the
-    axis rarely meets a small cell, and is found by connections (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
+    Some receiver points are connected, over any distance, with a random light point or with light on a solid, by a
+    segment in the water. Light that is scattered into or out of a narrow beam far from the axis rarely meets a small
+    cell; connections find it (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
 
     A path with several scattering events can arise from a merge at each of them, and from a connection between any two
     that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all: with
@@ -62,25 +62,26 @@ class LidarMerging(PassIntegrator):
     that meet a solid are merged only at the first one from the receiver, or connected to it from the last scattering
     event before. There are no connections in water with bubbles or with several refractive indices, nor under water.
 
-    About a laser under water, cells are shells cut into rings and sectors about its axis, thinner and narrower near the
-    laser, where light and view are concentrated. Their volumes differ along a path, and the merge at event *k* has the
-    weight :math:`(v_k / b_k p_k) / \sum_i v_i / (b_i p_i)` with the volume :math:`v_i` of the cell of each event.
+    Around a laser under water, cells are shells cut into rings and sectors about its axis. They are thinner and
+    narrower near the laser, where light and view are concentrated. Cell volumes differ along a path. With the cell
+    volume :math:`v_i` at each event, the merge at event *k* has the weight :math:`(v_k / b_k p_k) / \sum_i v_i / (b_i
+    p_i)`.
 
     Echoes from the surface and from solids in the air are connected to the laser directly. ``lidar_volpath`` with
     ``complement_only`` adds all other paths, such as light that meets the sea twice without scattering, mirrors under
-    water, and solids in the air seen by reflection.
+    water, and reflected solids in the air.
 
-    Cells end above the first solid below the surface. At one that lets a share of the light pass, such as a mask or a
-    pane, others begin below; through a second one below it they blur the light by their thickness.
+    Cells end above the first solid below the surface. Other cells begin below a solid that lets a share of the light
+    pass, such as a mask or a pane. Through a second such solid they blur the light by their thickness.
 
     Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
-    follow the surface and are sheared along the beam; times and absorption are those of the receiver's point; patches
-    cut by edges count by their covered share. Over waves of 6 m/s the water's signal in the published geometry differs
-    from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below; at 75 degrees over waves of 3 m/s
-    by -1.4 +- 0.6 and -0.5 +- 0.5 %. A beam of 1 mrad at 40 degrees over 10 m/s, which meets several facets, differs by
-    -2 +- 1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``)
-    have more bias. A beam may be 1000 attenuation lengths of the water wide. Derivatives come from
-    `mitransient_lidar.render`, not by Mitsuba.
+    follow the surface and are sheared along the beam. Times and absorption are taken at the receiver's point. Patches
+    cut by edges count by their covered share. Over 6 m/s waves, the published geometry's water signal differs from the
+    reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below. At 75 degrees over 3 m/s waves, it differs
+    by -1.4 +- 0.6 and -0.5 +- 0.5 %. A 1 mrad beam at 40 degrees over 10 m/s meets several facets. It differs by -2 +-
+    1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``) have more
+    bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not from
+    Mitsuba's gradients.
 
     .. code-block:: xml
 
@@ -111,15 +112,15 @@ class LidarMerging(PassIntegrator):
         connections: bool = True,
         axis: TimeAxis | None = None,
     ) -> PassRenderer:
-        """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
+        """Return the pass renderer for a scene, by default with one light class and the sensor's own receiver.
 
-        Where the film leaves start or number of the time bins to the scene, they are those of `axis`, or hold all light
-        (`find_lidar_scene`).
+        `axis` gives the start or number of time bins that the film leaves to the scene; without it they contain all
+        light (`find_lidar_scene`).
 
-        `layout_of` is the renderer of another scene whose time bins, points and cells are used, so that the same seeds
-        make the same paths in scenes that differ by a target, or a little in a parameter. Without `connections` paths
-        that do not meet the target return the same light with and without it, but for light in cells that are full; the
-        errors of narrow beams are larger.
+        `layout_of` is another scene's renderer, whose time bins, points and cells are used. Scenes that differ by a
+        target, or slightly in a parameter, then make the same paths from the same seeds. Without `connections`, paths
+        that miss the target return the same light with and without it, except for light in full cells; errors with
+        narrow beams are larger.
 
         Raises
         ------

@@ -25,19 +25,19 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     .. math:: g(g_x, g_y) = \exp(-(g_x^2 + g_y^2) / 2\sigma^2) / (2 \pi \sigma^2)
 
-    (+angle_x is away from nadir, +angle_y to the left, along +y), with a sigma for each axis when it is elliptic; that
-    of an image is even within each cell. The radiant intensity follows from
+    (+angle_x is away from nadir, +angle_y to the left, along +y), with a sigma for each axis when it is elliptic; an
+    image beam is even within each cell. The radiant intensity follows from
     :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`. The pulse's shape is applied to waveforms, not in the
     transport.
 
-    Laser and receiver are both above the sea or both under water. Under water, angles are those in the water: behind a
-    flat window, the angles of beam and view in air divided by the refractive index. Radiance is that in the water and
-    the window's losses belong to the efficiencies; ``two_way_atmospheric_transmittance`` is a further factor, to be set
-    to 1. Water around such a lidar has one refractive and one group index. Light that reaches the surface from below
-    is reflected and refracted, and returns from targets in the air.
+    Laser and receiver are both above the sea or both under water. Under water, angles are angles in the water: behind a
+    flat window, the angles in air divided by the refractive index. Radiance is radiance in the water, and the
+    efficiencies contain the window's losses; ``two_way_atmospheric_transmittance`` is a further factor, to be set to 1.
+    Water around such a lidar has one refractive and one group index. Light that reaches the surface from below is
+    reflected and refracted, and returns from targets in the air.
 
-    From orbit, lengths are relative to the distance of a point near the scene, and rays start just above it: times are
-    accurate to a millimetre of range in single precision.
+    From orbit, lengths are relative to the distance from a point near the scene, and rays start just above it. Times
+    are then accurate to a millimetre of range in single precision.
 
     .. code-block:: xml
 
@@ -62,7 +62,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         self.energy = self.pulse_energy * self.optical_efficiency
         self.beam_profile = read("beam_profile")
         self.profile = _profile(props, self.beam_profile)
-        #: Full angle of the beam [rad] as in ``divergence_mrad``; of an image twice its widest rms angle.
+        #: Full beam angle [rad] as in ``divergence_mrad``; for an image twice its widest rms angle.
         self.divergence = self.profile.divergence[0]
         #: Root-mean-square angles of the beam [rad]: the narrowest, which cells must resolve, and the widest.
         self.angular_spread, self.widest_angular_spread = min(self.profile.spreads), max(self.profile.spreads)
@@ -129,7 +129,7 @@ class LidarTransmitter(EmitterWithoutExtent):
 
 
 def _profile(props: DeclaredProperties, kind: str) -> BeamProfile:
-    """Return the beam profile of the plugin's parameters."""
+    """Return the beam profile that the parameters describe."""
     read = props.read
     image_names = ("profile_file", "profile_mrad")
     for name in (*WIDTHS, "divergence_across_mrad", "ellipse_deg") if kind == "image" else image_names:

@@ -15,7 +15,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class VolpathIntegrator(PassIntegrator):
-    """Integrator with the options of the path tracer."""
+    """Integrator with the path tracer's options."""
 
     def __init__(self, props: DeclaredProperties, complement_only: bool = False) -> None:
         super().__init__(props)
@@ -30,15 +30,15 @@ class LidarVolpath(VolpathIntegrator):
     .. parameters::
 
     The unbiased reference. Paths start at the receiver, cross the surface (waves and ripples), scatter to any order,
-    meet bottom and targets, and are reflected inside the surface. As no path meets a point laser by chance, each vertex
-    under water samples a direction in which the laser may appear through a flat sea of the same total slope variance,
-    traces it to the real surface, and connects there; where the path itself reaches the surface unscattered it is
-    connected, too. Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
-    doi:10.1145/218380.218498).
+    meet bottom and targets, and are reflected inside the surface. No path meets a point laser by chance. Each vertex
+    under water therefore samples a direction in which the laser may appear through a flat sea with the same total slope
+    variance. It traces this direction to the real surface, and connects there. A path that reaches the surface
+    unscattered is connected there, too. Both estimate the same paths; the balance heuristic combines them (Veach and
+    Guibas 1995, doi:10.1145/218380.218498).
 
-    A laser under water is connected by straight lines. Its light reaches a scattering event from one direction, so that
-    phase functions with a strong forward peak make rare, large values: in multiple scattering from a narrow beam, their
-    standard errors are too small and their means mostly too low. ``lidar_merging`` does not have this limit.
+    Straight lines connect a laser under water. Its light reaches a scattering event from one direction, so that phase
+    functions with a strong forward peak make rare, large values. In multiple scattering from a narrow beam, the
+    standard errors are thus too small and the means mostly too low. ``lidar_merging`` does not have this limit.
 
     Every segment is timed with the group index of the medium that it crosses. Derivatives come from
     `mitransient_lidar.render`, not from Mitsuba's gradients.
@@ -70,7 +70,7 @@ class LidarVolpath(VolpathIntegrator):
         connections: bool = True,
         axis: TimeAxis | None = None,
     ) -> VolpathRenderer:
-        """Return the renderer of passes of a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
+        """Return the pass renderer for a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
         axis = axis if layout_of is None else layout_of.scene.axis
         lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)

@@ -18,20 +18,18 @@ class MultipixelReceiver(ReceiverSensor):
 
     .. parameters::
 
-    Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is to
-    the left of the line of sight, along +y. Rows, columns and image files are in the order of a picture taken from the
-    lidar: row 0 far, column 0 left.
-    Pixels of a circular field of view that lie outside the circle exist and stay dark.
+    Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is left
+    of the line of sight, along +y. Rows, columns and image files follow a picture taken from the lidar: row 0 far,
+    column 0 left. In a circular field of view, pixels outside the circle exist and stay dark.
 
-    Paths are drawn over the field of view and then assigned to pixels: more pixels take no more time, and the pixels of
-    a layout or of a pixel map sum to a single pixel of the same area path by path. Hexagons have 82.7 % of the area of
-    their circle.
+    Paths are drawn over the field of view and then assigned to pixels. More pixels take no more time, and a layout's or
+    map's pixels sum, path by path, to a single pixel with the same area. Hexagons have 82.7 % of their circle's area.
 
-    With a fill factor each cell of ``RxC`` shrinks about its centre, sides by the square root of the factor, and a
+    With a fill factor, each ``RxC`` cell shrinks about its centre: its sides by the square root of the factor. A
     circular field of view cuts the shrunk cells as a field stop does.
 
-    Blur distributes light from the direction (angle_x, angle_y) around that place on the detector by the point-spread
-    function, the same one all over the field of view. Light between pixels is lost.
+    Blur distributes light from the direction (angle_x, angle_y) around that point on the detector by the point-spread
+    function, which is the same all over the field of view. Light between pixels is lost.
 
     .. code-block:: xml
 
@@ -52,7 +50,7 @@ class MultipixelReceiver(ReceiverSensor):
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
 
-#: Parameters of a lens.
+#: Lens parameters.
 _LENS = ("focal_length_mm", "pixel_pitch_um")
 
 
@@ -83,7 +81,7 @@ def _own_pixels(props: DeclaredProperties) -> PixelArray:
 
 
 def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float]:
-    """Return the sides (angle_x, angle_y) [rad] of the field of view of a detector behind a lens."""
+    """Return the sides (angle_x, angle_y) [rad] of a lens detector's field of view."""
     for name in _LENS:
         if name not in props:
             raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")

@@ -20,10 +20,10 @@ from mitransient_lidar.plugins.bases import FOAM, DeclaredProperties, fill_mesh,
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
 
-#: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` knows the lidar.
+#: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` gets the lidar.
 WAITS = "_waits"
 
-#: Buffers of a mesh that `OceanSurface.fit` makes anew.
+#: Mesh buffers that `OceanSurface.fit` makes anew.
 _BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
 
 
@@ -33,33 +33,32 @@ class OceanSurface(mi.Mesh):
     .. parameters::
 
     The automatic shortest wave is the beam's standard deviation on the sea or, if shorter, four pixels, 0.08 to 2 m; it
-    does not depend on the cells. Automatic cells are a twelfth of that standard deviation and at most half of a pixel's
-    side, 0.02 to 0.25 m. The patch holds beam and field of view with a margin of 8 m. Where it would have more than 512
-    cells per side, the beam's cells grow up to a quarter of its standard deviation; with more than 1024 the patch is
-    limited to the beam, and then the cells grow, within the footprint. A scene without a lidar has 32 m in cells of
+    does not depend on the cells. Automatic cells are a twelfth of that standard deviation and at most half a pixel's
+    side, 0.02 to 0.25 m. The patch contains beam and field of view with a margin of 8 m. Where it would have more than
+    512 cells per side, the beam's cells grow up to a quarter of its standard deviation. With more than 1024 the patch
+    is limited to the beam, and then the cells grow, within the footprint. A scene without a lidar has 32 m in cells of
     0.125 m, with waves from 1 m. The choice is made when the scene is rendered, or loaded by ``mitransient_lidar``.
 
-    Waves are linear: independent, with Gaussian heights and slopes, without the sharper crests of real ones. The mesh
+    Waves are linear: independent, with Gaussian heights and slopes, without the sharper crests of real waves. The mesh
     represents the waves from the shortest one up. The rest of the total slope variance, along and across the wind, is
-    an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian slopes;
-    the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With ``cox_munk``
-    and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of the ripples is at
-    least 1e-5, so that a point laser can be connected; `slope_variance` of the loaded object is the total. Waves
-    shorter than a sixteenth of the period are needed for a mesh: where automatic cells are longer, all slopes are
-    ripples.
+    an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model for Gaussian slopes.
+    Its index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With ``cox_munk``
+    and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The ripple variance is at least
+    1e-5, so that a point laser can be connected; the loaded object's `slope_variance` is the total. A mesh needs waves
+    shorter than a sixteenth of the period: where automatic cells are longer, all slopes are ripples.
 
-    Real slopes are skewed and peaked. With ``slope_distribution`` ``gram_charlier`` the ripples, a
-    ``gram_charlier_dielectric``, have the third and fourth moments that Cox and Munk give for all slopes, so that those
-    of waves and ripples together have their density. At 20 degrees off nadir it is 1.19 times the Gaussian one looking
-    upwind and 0.74 downwind at 6 m/s, 0.95 and 0.87 at 10 m/s, and 1.11 at nadir. It was measured up to 2.5 standard
-    deviations, with standard errors of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples of a
-    small part of the slope variance (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused:
-    narrow beams, which resolve short waves, then need a longer ``shortest_wave``.
+    Real slopes are skewed and peaked. With ``slope_distribution`` ``gram_charlier`` the ripples are a
+    ``gram_charlier_dielectric``. Their third and fourth moments let waves and ripples together reach Cox and Munk's
+    slope density. At 20 degrees off nadir it is 1.19 times the Gaussian density looking upwind and 0.74 downwind at 6
+    m/s, 0.95 and 0.87 at 10 m/s, and 1.11 at nadir. It was measured up to 2.5 standard deviations, with standard errors
+    of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples with a small share of the slope variance
+    (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused. Narrow beams, which resolve short
+    waves, then need a longer ``shortest_wave``.
 
     Finer cells show the same waves with smoother facets: halving automatic cells changes the surface echo by less than
-    the error of 3 % to which renders go by default. The shortest wave divides the sea into waves, drawn by the seed,
-    and ripples, the mean over all shorter ones: the mean echo over many seas does not depend on it, but that of one
-    place does. Changes of the echo of a beam of 10 mrad from 200 m, rms over 64 places:
+    a render's default error, 3 %. The shortest wave divides the sea into waves, drawn by the seed, and ripples, the
+    mean over all shorter waves. The mean echo over many seas does not depend on it; the echo at one location does.
+    Changes in the echo of a 10 mrad beam from 200 m, rms over 64 locations:
 
     ===============  ===========================  ==========================================
     Angle            0, 10, 20 deg: cells halved  0, 10, 20 deg: shortest wave halved
@@ -70,42 +69,41 @@ class OceanSurface(mi.Mesh):
     ===============  ===========================  ==========================================
 
     Light also returns from the water through the waves that focused it on its way down. The mesh shows this for its own
-    waves; ripples are drawn anew on each way. With ``ripple_focusing`` light that crosses the sea twice is multiplied
-    by the mean enhancement with correlated ripples over that without, by the depth of the echo and the number of
-    scattering events, as each moves one way against the other (`mitransient_lidar.physics.sea.double_passage`). At 3
-    m/s, with waves from 1.06 m, that is 2.2, 1.5 and 1.1 at 1, 3 and 8 m for unscattered light, and 1.25, 1.15 and 1.04
-    after one forward scattering event; at 6 and 10 m/s 1.4 and 1.2 at 1 m. With it the echoes of ``table1`` agree
-    within 4 % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m; without it the shortest ones give 16, 23,
-    20 and 11 % more at 1, 2, 3 and 5 m. It is a mean: one place has it without the pattern of its ripples. It depends
-    on waves of centimetres, which slicks lack. Above half a metre, where it would grow, little is known of them, and
-    depths are within the waves: it falls to 1 at the surface. Seas without a spectrum of ripples (``flat``,
-    ``height_map``) and lidars under water have none. Give ``shortest_wave`` to compare images with receivers of few
-    pixels on exactly the same sea.
+    waves; ripples are drawn anew on each way. With ``ripple_focusing``, light that crosses the sea twice is multiplied
+    by a mean enhancement: correlated ripples against independent ones. It depends on the echo's depth and on the number
+    of scattering events, as each moves one way against the other (`mitransient_lidar.physics.sea.double_passage`). At 3
+    m/s, with waves from 1.06 m, it is 2.2, 1.5 and 1.1 at 1, 3 and 8 m for unscattered light. After one forward
+    scattering event it is 1.25, 1.15 and 1.04. At 6 and 10 m/s it is 1.4 and 1.2 at 1 m. With it the ``table1`` echoes
+    agree within 4 % from 0.5 m to the bottom for waves from 1.06, 0.25 and 0.12 m. Without it the shortest ones give
+    16, 23, 20 and 11 % more at 1, 2, 3 and 5 m. One location has the mean, without its own ripple pattern. It depends
+    on centimetre waves, which slicks lack. Above half a metre, where it would grow, few data exist, and depths are
+    within the waves: it falls to 1 at the surface. Seas without a ripple spectrum (``flat``, ``height_map``) and lidars
+    under water have none. Give ``shortest_wave`` to compare images with few-pixel receivers on exactly the same sea.
 
-    With more than 1024 of the shortest waves (or of pairs of cells) per period the waves are a sum of bands. The
-    longest waves are the same as in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31)
-    of the last one's period.
+    With more than 1024 of the shortest waves (or pairs of cells) per period, the waves are a sum of bands. The longest
+    waves equal the waves in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the
+    previous period.
 
-    Over a shallow bottom (``shoaling``) waves are divided into bands of half an octave, each with the amplitude of the
-    TMA spectrum at the local depth. The significant height is at most half of the depth, by the loss of the longest
-    waves, and all waves end at the water line; ripples stay. The depth is that of the largest solids under each vertex:
-    their rendered faces, without instances, targets and piers, continued beyond their edges. At 10 m/s over 0.3 m the
-    waves have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not
-    run up the shore. The heights of a wake stay within a quarter of the depth; a mean slope stays as given.
+    Over a shallow bottom (``shoaling``) waves are divided into bands of half an octave, each with the TMA spectrum's
+    amplitude at the local depth. The significant height is at most half the depth, as the longest waves are lost, and
+    all waves end at the water line; ripples stay. The depth is the depth of the largest solids under each vertex: their
+    rendered faces, without instances, targets and piers, continued beyond their edges. At 10 m/s over 0.3 m the waves
+    have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not run
+    up the shore. Wake heights stay within a quarter of the depth; a mean slope stays as given.
 
-    Foam (``foam``) covers whole faces: a Lambertian plate of ``foam_reflectance``, from above and from below, that
-    absorbs the rest. It lies where the waves rise most above places 2 m around, so that it follows crests of short
-    waves, as many as give the cover; on a sea without waves each face has the cover as a share. ``surf_foam`` is
-    approached where the depth limits the waves. The infrared needs a lower reflectance: by the shape of Frouin et al.
-    1996, half of that at 532 nm at 1064 nm.
+    Foam (``foam``) covers whole faces: a Lambertian plate with ``foam_reflectance``, from above and from below, that
+    absorbs the rest. It lies where the waves rise most above their surroundings within 2 m, and thus follows the crests
+    of short waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam
+    approaches ``surf_foam`` where the depth limits the waves. The infrared needs a lower reflectance: by the shape in
+    Frouin et al. 1996, the value at 1064 nm is half the value at 532 nm.
 
-    A mean slope turns the sea about the centre of the patch, or about the place of each shot of a series. It is as wide
-    as the patch; beyond it the sea is level. It adds to the slopes of the waves, and not to ``slope_variance``.
+    A mean slope turns the sea about the patch centre, or about each shot's location in a series. It is as wide as the
+    patch; beyond it the sea is level. It adds to the wave slopes, and not to ``slope_variance``.
 
     Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
     scattered far. Light beyond ``size`` is lost and reported after rendering.
 
-    Edits by ``mi.traverse`` act, those of the mesh after the first render, which fits it to the lidar.
+    Edits by ``mi.traverse`` act; mesh edits act after the first render, which fits the mesh to the lidar.
 
     Other surfaces: any mesh (``ply``, ``obj``) with a ``layered_water`` as its interior medium and a dielectric BSDF of
     the water's index.
@@ -137,9 +135,9 @@ class OceanSurface(mi.Mesh):
 
         read = OCEAN_SURFACE.reader(get)
         read("foam_reflectance")
-        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
+        #: Surface shape (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
         self.sea = SeaSurface.read(read, is_placeholder=waits)
-        #: Resolution of the mesh; None for a level plane in its place.
+        #: Mesh resolution; None for a level plane in its place.
         self._resolution = None if waits else Resolution.read(read, ())
         children = [child for _, child in props.objects()]
         water = next((child.water for child in children if isinstance(child, WaterMedium)), None)
@@ -161,7 +159,7 @@ class OceanSurface(mi.Mesh):
         self._edited.clear()
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Take edits of `mi.traverse`, of which those of the mesh must come after `fit`."""
+        """Take edits by `mi.traverse`; mesh edits must follow `fit`."""
         super().parameters_changed(list(keys))
         if self.footprints is None:
             self._edited |= _BUFFERS & set(keys)
@@ -169,8 +167,8 @@ class OceanSurface(mi.Mesh):
     def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
 
-        Waves follow the depths of a bottom in the frame of the scene as `followed_depths` says. Edits of the ripples
-        stay. Raises UserError if the mesh has been edited, and must change.
+        Waves follow bottom depths in the scene frame as in `followed_depths`. Ripple edits stay. Raises UserError if
+        the mesh has been edited, and must change.
         """
         read = OCEAN_SURFACE.reader(self._values.get)
         resolution = Resolution.read(read, footprints)
@@ -213,7 +211,7 @@ class OceanSurface(mi.Mesh):
 
     @property
     def time_s(self) -> float:
-        """Time of the waves [s]."""
+        """Wave time [s]."""
         return float(self._values["time"])
 
     @property
@@ -268,14 +266,14 @@ class OceanSurface(mi.Mesh):
 
 
 class SeaPatches:
-    """Fine patches of an ``ocean_surface`` about several places, side by side in one mesh.
+    """Fine patches of an ``ocean_surface`` about several locations, side by side in one mesh.
 
     Attributes
     ----------
     shape
-        The mesh, with the ripples of the sea.
+        The mesh, with the sea's ripples.
     shapes
-        Scene of this mesh alone.
+        Scene with this mesh alone.
     """
 
     def __init__(self, surface: OceanSurface) -> None:

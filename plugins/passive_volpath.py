@@ -19,10 +19,9 @@ class PassiveVolpath(VolpathIntegrator):
 
     .. parameters::
 
-    Renders the radiance of each pixel [W m^-2 sr^-1 nm^-1]. Paths start uniformly over the field of view and are traced
-    as in ``lidar_volpath``, where the sun replaces the laser: each path is connected to one point of the sun's disc.
-    Paths that leave the scene meet the sky; the sky that the sea reflects is sampled by a separate ray, as few paths
-    are reflected.
+    Renders each pixel's radiance [W m^-2 sr^-1 nm^-1]. Paths start uniformly over the field of view and are traced as
+    in ``lidar_volpath``. The sun replaces the laser: each path is connected to one point on the sun's disc. Paths that
+    leave the scene meet the sky. A separate ray samples the sky that the sea reflects, as few paths are reflected.
 
     The sea must be rough, as every ``ocean_surface`` is: through a smooth ``dielectric`` paths meet the sun's disc only
     by chance, and the image is noisy. Distances to scattering events are drawn from the scattering coefficient, and
@@ -55,7 +54,7 @@ class PassiveVolpath(VolpathIntegrator):
         )
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
-        """Return the renderer of passes of a scene; raise UserError when a part is missing or not supported."""
+        """Return the pass renderer for a scene; raise UserError when a part is missing or not supported."""
         return DaylightRenderer(DaylightScene.from_scene(scene, sensor), self.options, self.paths_per_pass)
 
     def develop(self, received: ReceivedDaylight, sensor: mi.Sensor) -> mi.TensorXf:

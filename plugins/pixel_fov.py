@@ -1,4 +1,4 @@
-"""Sensor plugin ``pixel_fov``: the field of view of one pixel."""
+"""Sensor plugin ``pixel_fov``: one pixel's field of view."""
 
 from __future__ import annotations
 

@@ -27,10 +27,10 @@ class Retroreflector(mi.BSDF):
 
     with the angle :math:`\gamma` between the two, the reflectance *R*, the diffuse share *s* and the width *w*. *D* is
     the Gaussian of the sphere (Fisher 1953, doi:10.1098/rspa.1953.0064), normalised over all directions. The BSDF is
-    reciprocal, and reflects at most *R*: a narrow lobe of :math:`\sigma = w/2` loses the share :math:`0.4\,\sigma
-    \tan\theta_i` at oblique incidence, more where a part of it falls behind the surface. In the direction of incidence
-    it reflects :math:`(1-s) R / (2\pi\sigma^2)` per steradian at any angle; real prisms and beads reflect less beyond
-    about 30 degrees.
+    reciprocal, and reflects at most *R*. A narrow lobe with :math:`\sigma = w/2` loses the share :math:`0.4\,\sigma
+    \tan\theta_i` at oblique incidence, more where a part falls behind the surface. Straight back it reflects
+    :math:`(1-s) R / (2\pi\sigma^2)` per steradian at any angle; real prisms and beads reflect less beyond about 30
+    degrees.
 
     It reflects on the side of its normal only; ``twosided`` makes it reflect on both. A lobe much narrower than the
     beam's spread under water, about 1 degree, causes noise.
@@ -99,7 +99,7 @@ class Retroreflector(mi.BSDF):
         lobe, diffuse = self._shares(ctx)
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0) & (cos_o > 0)
-        # From the difference of the directions: the cosine of a small angle is 1 to rounding.
+        # From the difference between the directions: the cosine of a small angle is 1 to rounding.
         peak = self._concentration / (2 * dr.pi * self._mass)
         density = peak * dr.exp(-0.5 * self._concentration * dr.squared_norm(wo - si.wi))
         lambertian = cos_o * dr.inv_pi
@@ -108,7 +108,7 @@ class Retroreflector(mi.BSDF):
         return mi.Color1f(dr.select(active, self.reflectance * value, 0)), dr.select(active, pdf, 0)
 
     def _shares(self, ctx: mi.BSDFContext) -> tuple[float, float]:
-        """Return the shares of the lobe and of the Lambertian part, 0 where the context disables them."""
+        """Return the shares of lobe and Lambertian part, 0 where the context disables them."""
         glossy = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
         diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
         return (1 - self.diffuse_share) * glossy, self.diffuse_share * diffuse

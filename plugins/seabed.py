@@ -23,10 +23,10 @@ logger = logging.getLogger(__name__)
 #: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
 _STEEPEST_RIPPLE = 0.3
 
-#: Largest number of cells on a side of the fine square: 8 million triangles.
+#: Largest number of cells per side of the fine square: 8 million triangles.
 _MOST_CELLS = 2048
 
-#: Longest default cell [m], and cells in the length of a ripple and in the radius of a patch.
+#: Longest default cell [m], and cells per ripple length and per patch radius.
 _LARGEST_CELL, _CELLS_PER_RIPPLE, _CELLS_PER_RADIUS = 0.25, 8.0, 8.0
 
 #: Fewest cells that resolve a ripple.
@@ -35,7 +35,7 @@ _FEWEST_CELLS_PER_RIPPLE = 4.0
 #: Side of the fine square without height map and patches [m].
 _DEFAULT_SIZE = 20.0
 
-#: Mesh attribute of the reflectance.
+#: Mesh attribute: reflectance.
 REFLECTANCE = "vertex_reflectance"
 
 
@@ -54,7 +54,7 @@ class Patch:
 
 
 class Bottom:
-    """Height and reflectance of a bottom, with the parameters of `Seabed` as attributes.
+    """Height and reflectance of a bottom, with the `Seabed` parameters as attributes.
 
     Raises
     ------
@@ -85,7 +85,7 @@ class Bottom:
         self.centre = read("centre_x", middle[0]), read("centre_y", middle[1])
         widest = max([widest, *(2 * patch.reach(self.centre) for patch in self.patches)])
         self.curvature = read("curvature")
-        #: Side of the cells [m], infinite for a plane.
+        #: Cell side [m], infinite for a plane.
         cell, side = read("cell_size"), read("refined_size")
         self.cell_size = self._largest_cell() if cell == AUTO else cell
         self.refined_size = widest if side == AUTO else side
@@ -96,7 +96,7 @@ class Bottom:
         self._check()
 
     def _largest_cell(self) -> float:
-        """Return the side of the cells that the bottom needs [m], infinite for a plane of one reflectance."""
+        """Return the cell side that the bottom needs [m], infinite for a plane with one reflectance."""
         wanted = [patch.radius / _CELLS_PER_RADIUS for patch in self.patches]
         if self.ripple_height > 0:
             wanted.append(self.ripple_length / _CELLS_PER_RIPPLE)
@@ -108,7 +108,7 @@ class Bottom:
         return min(wanted, default=math.inf)
 
     def _check(self) -> None:
-        """Refuse cells that are too coarse or too many, and patches beyond them; warn of a map of land alone."""
+        """Refuse too coarse or too many cells, and patches beyond them; warn about a map of land alone."""
         cells = self.refined_size / self.cell_size
         if cells > _MOST_CELLS:
             raise UserError(
@@ -209,9 +209,9 @@ class Seabed(mi.Mesh):
     .. math:: z = -d + x \tan\alpha_x + y \tan\alpha_y + \tfrac{1}{2} C r^2
               + \tfrac{1}{2} h \cos(2\pi (x \cos\beta + y \sin\beta) / L) + z_\text{map}(x, y).
 
-    Points x, y, z [m] are columns of these names or the first three. Points on an even grid, of which at least a
-    quarter of the cells have one, are its cells. Others are triangulated (Delaunay), and the height at a place in a
-    triangle is linear in it, :math:`z_\text{map} = \sum_i \lambda_i z_i` with the barycentric coordinates
+    Points x, y, z [m] are columns with these names or the first three. Points on an even grid are its cells where at
+    least a quarter of the cells have one. Other points are triangulated (Delaunay), and the height is linear in each
+    triangle, :math:`z_\text{map} = \sum_i \lambda_i z_i` with the barycentric coordinates
     :math:`\lambda_i`, on a grid with the cell :math:`\sqrt{A/N}` for N points in a convex hull of the area A. Cells
     outside the hull are holes; inside it, triangles also cross gaps between lines of points.
 
@@ -265,7 +265,7 @@ class Seabed(mi.Mesh):
 
     @property
     def height_map(self) -> HeightMap | None:
-        """Height map of the bottom; None without one."""
+        """Bottom height map; None without one."""
         return self.bottom.terrain
 
     def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:

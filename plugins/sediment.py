@@ -12,7 +12,7 @@ from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
-#: Parameters of particles.
+#: Particle parameters.
 _PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
 
 
@@ -30,18 +30,18 @@ class Sediment(mi.BSDF):
 
     .. math:: p(g) = \frac{s\,(1-b^2)}{(1 - 2b\cos g + b^2)^{3/2}} + \frac{(1-s)(1-b^2)}{(1 + 2b\cos g + b^2)^{3/2}},
 
-    where :math:`\mu` are cosines with the normal, *w* the albedo of the particles, and *H* Hapke's approximation of
-    Chandrasekhar's function (Hapke 2002, doi:10.1006/icar.2002.6853; opposition effect of shadows, Hapke 1986,
-    doi:10.1016/0019-1035(86)90108-9). The albedo *w* is the one that gives the ``reflectance``. A lidar sees the peak
-    at *g* = 0 of its own light: from a level bottom an echo :math:`\pi f / R` times that of a Lambertian one of the
-    reflectance *R*, 1.29 times at vertical incidence with the defaults and *R* = 0.1. Roughness, porosity and coherent
-    backscattering are left out.
+    where :math:`\mu` are cosines with the normal, *w* the particle albedo, and *H* Hapke's approximation of
+    Chandrasekhar's function (Hapke 2002, doi:10.1006/icar.2002.6853). The opposition effect by shadows follows Hapke
+    1986, doi:10.1016/0019-1035(86)90108-9. The albedo *w* is chosen to give the ``reflectance``. A lidar sees the peak
+    at *g* = 0 by its own light. A level bottom's echo is :math:`\pi f / R` times the echo of a Lambertian bottom with
+    the reflectance *R*. This is 1.29 at vertical incidence with the defaults and *R* = 0.1. Roughness, porosity and
+    coherent backscattering are left out.
 
-    Defaults of the opposition effect are those of the example in figure 8.15 of Hapke's book (1993), which DISORT uses.
-    No published values for particles under water were found: give measured ones. Submerged carbonate sands lit
-    vertically were nearly Lambertian, and at oblique incidence brightest towards the source (Zhang et al. 2003,
-    doi:10.4319/lo.2003.48.1_part_2.0380). Reflectances by name are those of `physics.water.sediments`; there is no mud
-    among them.
+    The defaults for the opposition effect are the example in figure 8.15 of Hapke's book (1993), which DISORT uses. No
+    published values for particles under water were found: give measured ones. Submerged carbonate sands lit vertically
+    were nearly Lambertian, and at oblique incidence brightest towards the source (Zhang et al. 2003,
+    doi:10.4319/lo.2003.48.1_part_2.0380). `physics.water.sediments` lists the reflectances by name; mud is not among
+    them.
 
     It reflects on the side of its normal only; ``twosided`` makes it reflect on both.
 
@@ -113,7 +113,7 @@ class Sediment(mi.BSDF):
         """Return BSDF times cosine, and density [1/sr]."""
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0) & (cos_o > 0) & ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
-        # sin^2(g/2), from the difference of the directions: the cosine of a small angle is 1 to rounding.
+        # sin^2(g/2), from the difference between the directions: the cosine of a small angle is 1 to rounding.
         s = dr.minimum(0.25 * dr.squared_norm(wo - si.wi), 1)
         b, width = self._asymmetry, self._width
         # tan(g/2) = sin / cos, without a quotient that is infinite.
@@ -126,13 +126,13 @@ class Sediment(mi.BSDF):
         return mi.Color1f(dr.select(active, value, 0)), dr.select(active, cos_o * dr.inv_pi, 0)
 
     def _h_function(self, cosine: mi.Float) -> mi.Float:
-        """Return the H function of the surface (`HapkeSurface.h_function`)."""
+        """Return the surface's H function (`HapkeSurface.h_function`)."""
         x, r0 = dr.maximum(cosine, 1e-6), self._r0
         return dr.rcp(1 - self._albedo * x * (r0 + (0.5 - r0 * x) * dr.log(1 + dr.rcp(x))))
 
 
 class LambertianSediment(mi.BSDF):
-    """The Lambertian model of `Sediment`: Mitsuba's ``diffuse``, with parameters that a result can hold."""
+    """Lambertian `Sediment` model: Mitsuba's ``diffuse``, with parameters that a result can contain."""
 
     def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
@@ -191,12 +191,12 @@ def _reflectance(props: DeclaredProperties) -> float:
 
 
 def _particles(props: DeclaredProperties) -> HapkeSurface:
-    """Return a surface of particles without their albedo."""
+    """Return a particle surface without its albedo."""
     return HapkeSurface(0.0, *map(props.read, _PARTICLES))
 
 
 def _create(props: DeclaredProperties) -> mi.BSDF:
-    """Return the BSDF of the parameter ``model``."""
+    """Return the BSDF for the parameter ``model``."""
     return Sediment(props) if props.read("model") == "hapke" else LambertianSediment(props)
 
 

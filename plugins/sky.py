@@ -17,9 +17,9 @@ class Sky(EmitterWithoutExtent):
 
     .. parameters::
 
-    The upper half of an infinite sphere; the lower half is black. The radiance distribution (for ``clear`` of Harrison
+    The upper half of an infinite sphere; the lower half is black. The radiance distribution (for ``clear`` by Harrison
     and Coombes 1988, doi:10.1016/0038-092X(88)90072-2) is scaled to the irradiance. The sun itself is the plugin
-    ``sun``, whose angles must be those of a clear sky. The lidar integrators leave the sky out.
+    ``sun``, whose angles a clear sky must share. The lidar integrators leave the sky out.
 
     .. code-block:: xml
 
@@ -33,7 +33,7 @@ class Sky(EmitterWithoutExtent):
         {'type': 'sky', 'distribution': 'clear', 'sun_zenith_deg': 40.0}
     """
 
-    #: Kind of daylight, by which integrators identify it.
+    #: Daylight kind, by which integrators identify it.
     daylight = "sky"
 
     def __init__(self, props: DeclaredProperties) -> None:

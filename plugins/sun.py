@@ -34,7 +34,7 @@ class Sun(EmitterWithoutExtent):
         {'type': 'sun', 'zenith_deg': 40.0, 'azimuth_deg': 120.0}
     """
 
-    #: Kind of daylight, by which integrators identify it.
+    #: Daylight kind, by which integrators identify it.
     daylight = "sun"
 
     def __init__(self, props: DeclaredProperties) -> None:
@@ -48,7 +48,7 @@ class Sun(EmitterWithoutExtent):
         # sin^2 of half the radius, as the cosine of so small an angle is 1 to rounding.
         self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)
         self._radiance = self.irradiance / (np.pi * np.sin(np.radians(radius)) ** 2)
-        #: Irradiance that each of the directions of `sample` represents [W m^-2 nm^-1].
+        #: Irradiance that each direction of `sample` represents [W m^-2 nm^-1].
         self.sampled_irradiance = float(self._radiance * 4 * np.pi * self._edge)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value | mi.EmitterFlags.DeltaDirection.value

@@ -19,29 +19,29 @@ _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
 
 @closed
 class TimeGatedFilm(mi.Film):
-    r"""Time histogram of received energy of each pixel, and gates (``time_gated_film``).
+    r"""Time histogram of each pixel's received energy, and gates (``time_gated_film``).
 
     .. parameters::
 
     With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
-    ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
-    before the first light of any pixel, from the highest crest or a target above it, and ten bins before the time
-    until which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, and 12 times the
-    response time, after the last light of any pixel. This comes from a bottom or target; light that is scattered
-    several times is given up to 40 ns, a quarter of the echo's time in the water, and the time of the way from the beam
-    to the edge of the view. Where no bottom is seen, or below 1e-12, it comes from the depth at which the column signal
-    has fallen to 1e-6 by the system attenuation of Gordon (1982): the beam attenuation coefficient in a narrow view,
-    the diffuse one in a wide one. A film with gates holds these and all direct echoes.
+    ``plugin_parameters``. It starts before the first light in any pixel, from the highest crest or a target above it:
+    by three pulse widths or the length of a measured pulse, at least 12 ns. It also starts ten bins before the end of
+    the interval in which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, plus 12 times the
+    response time, after the last light in any pixel. The last light comes from a bottom or target. Multiply scattered
+    light gets up to 40 ns more, a quarter of the echo's time in the water, and the time from the beam to the edge of
+    the view. Where no bottom is seen, or below 1e-12, the last light comes from the depth at which the column signal
+    has fallen to 1e-6. The system attenuation of Gordon (1982) determines it: the beam attenuation coefficient in a
+    narrow view, the diffuse one in a wide view. A film with gates contains these and all direct echoes.
 
-    From a height H [m] at the angle theta off nadir, the echo of the sea arrives after 2 H/(0.2998 cos(theta)) ns; each
-    metre of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees.
+    From a height H [m] at the angle theta off nadir, the sea echo arrives after 2 H/(0.2998 cos(theta)) ns. Each metre
+    of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees.
 
     Bins are half open, [start, start + width). After a render with a lidar integrator, ``develop`` returns the energy
     [J] of that pass as a tensor (pixel, time), or (row, column, time) for imagers. Energies are summed as integers, so
     that the same seed gives the same bits.
 
-    ``mitransient_lidar.render`` cuts gates from the waveform, after pulse and response. Where the histogram of an
-    imager exceeds the allowed memory, each arrival is added to the gates open during its pulse instead, and
+    ``mitransient_lidar.render`` cuts gates from the waveform, after pulse and response. Where an imager's histogram
+    exceeds the allowed memory, each arrival is added to the gates open during its pulse instead. In this case
     ``bin_width_ns`` and ``bin_count`` only set the end of the record.
 
     .. code-block:: xml
@@ -57,7 +57,7 @@ class TimeGatedFilm(mi.Film):
 
     def __init__(self, props: DeclaredProperties) -> None:
         start, count = map(props.read, ("time_start_ns", "bin_count"))
-        #: Parameters of the record; None for a start [ns] or a number of bins that is chosen.
+        #: Record parameters; None for an automatic start [ns] or number of bins.
         self.time_start_ns = None if start == AUTO else start
         self.bin_width_ns = props.read("bin_width_ns")
         self.bin_count = None if count == AUTO else count
@@ -65,7 +65,7 @@ class TimeGatedFilm(mi.Film):
         self.axis: TimeAxis | None = None
         if self.time_start_ns is not None and self.bin_count is not None:
             self.axis = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count)
-        #: Gates of the scene, or None.
+        #: The scene's gates, or None.
         self.gates = _gate_plan(props)
         props["width"], props["height"] = self.bin_count or 1, 1
         super().__init__(props)
@@ -78,8 +78,8 @@ class TimeGatedFilm(mi.Film):
     def energy(self) -> np.ndarray:
         """Return the energy [J] of the last pass as float64, shape (pixel, time) or (row, column, time).
 
-        Bins are NaN where a value was not finite. Before the first pass zeros of shape (1, time), or
-        (1, 1) where the number of bins is automatic.
+        Bins are NaN where a value was not finite. Before the first pass: zeros with shape (1, time), or (1, 1) where
+        the number of bins is automatic.
         """
         return np.zeros((1, self.bin_count or 1)) if self._pass is None else self._pass.energy()
 
@@ -97,7 +97,7 @@ class TimeGatedFilm(mi.Film):
         return mi.Bitmap(mi.TensorXf(energy.reshape(-1, energy.shape[-1], 1).astype(np.float32)))
 
     def write(self, path: str) -> None:
-        """Write the bitmap of `bitmap` to an EXR file; ``mitransient_lidar.render`` writes the full stack."""
+        """Write the `bitmap` image to an EXR file; ``mitransient_lidar.render`` writes the full stack."""
         self.bitmap().write(path)
 
     def prepare(self, aovs: list[str]) -> int:

@@ -16,7 +16,7 @@ from mitransient_lidar.results.waveform_files import placed_in_time
 
 BoolArray = npt.NDArray[np.bool_]
 
-#: Probability of a difference between two results of the same scene.
+#: Probability of a difference between two results for the same scene.
 SIGNIFICANCE = 0.01
 
 #: Neighbouring bins over which relative errors are averaged, since value and error of a bin without rare large
@@ -25,7 +25,7 @@ _NEIGHBOURS = 5
 
 _ANGLES = ("angle_x", "angle_y")
 
-#: Largest difference of the angles of a pixel in two results, relative to the largest angle of all.
+#: Largest difference between a pixel's angles in two results, relative to the largest angle of all.
 _SAME_PLACE = 0.1
 
 #: Largest relative error of a bin; larger ones are estimated poorly by the spread of few passes.
@@ -39,13 +39,13 @@ class Comparison:
     Attributes
     ----------
     z
-        Difference of the impulse responses in standard errors, second minus first, shape (pixel, time), converted to
-        the normal distribution for few passes; NaN in excluded bins.
+        Difference between the impulse responses in standard errors, second minus first, shape (pixel, time), converted
+        to the normal distribution for few passes; NaN in excluded bins.
     limit
-        Critical ``abs(z)`` of the largest difference of all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
+        Critical ``abs(z)`` for the largest difference over all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
     energy_ratio, energy_ratio_stderr
-        Energy of the included bins, second over first, and its standard error. Where the results state how errors of
-        bins are correlated (`results.sum_errors`), it is that of the power in these bins; pixels are independent.
+        Energy in the included bins, second over first, and its standard error. Where the results state the correlation
+        between bin errors (`results.sum_errors`), it is the error of the power in these bins; pixels are independent.
     """
 
     z: FloatArray
@@ -75,7 +75,7 @@ class Comparison:
 
 
 def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return two results with time bins; where one has gates alone, those of both as bins at their middles.
+    """Return two results with time bins; where one has gates alone, both results' gates are bins at their middles.
 
     Records of shots become their mean signal, with the error by the spread of the shots, which count as passes.
 
@@ -113,8 +113,8 @@ def _of_shots(record: xr.Dataset) -> xr.Dataset:
 def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     """Compare the impulse responses of two results with the same pixels and time bins, bin by bin.
 
-    Results of gates alone are compared gate by gate. Errors of a pixel's gates, which may overlap, count in the error
-    of the energy as if they had one sign.
+    Results with gates alone are compared gate by gate. Errors of a pixel's gates, which may overlap, count in the
+    energy error as if they had one sign.
 
     Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
 
@@ -172,7 +172,7 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
 
 
 def _error_of_energy(result: xr.Dataset, counted: BoolArray) -> float | None:
-    """Return the relative error of the energy of bins, shape (pixels, time), None where correlations are not known."""
+    """Return the relative error of the energy in bins, shape (pixels, time), None where correlations are not known."""
     errors = SumErrors.of(result) if "waveform_stderr" in result else None
     if errors is None:
         return None
@@ -185,12 +185,12 @@ def sidak_limit(count: int, significance: float = SIGNIFICANCE) -> float:
     """Return the ``abs(z)`` that the largest of `count` normal numbers exceeds with probability `significance`."""
     from scipy.special import ndtri
 
-    # log1p and expm1 keep the digits of a probability of 1e-6.
+    # log1p and expm1 keep the digits of a probability such as 1e-6.
     return float(-ndtri(-0.5 * np.expm1(np.log1p(-significance) / count)))
 
 
 def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> FloatArray:
-    """Return the larger of the relative variances of each bin and of its neighbours [1], shape (pixel, time).
+    """Return the larger relative variance of each bin and its neighbours [1], shape (pixel, time).
 
     The arguments are means and the variances of the means, shape (pixel, time).
     """
@@ -199,7 +199,7 @@ def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> Float
     mean, variance = np.nan_to_num(values), np.nan_to_num(variances)
     box = np.full(_NEIGHBOURS, 1 / _NEIGHBOURS)
     around = convolve1d(variance, box, axis=1) / np.maximum(convolve1d(mean, box, axis=1), 1e-150) ** 2
-    # At the beginning of an echo, the error of a bin may exceed that of its neighbours.
+    # At the beginning of an echo, a bin's error may exceed its neighbours'.
     return np.asarray(np.maximum(around, variance / np.maximum(mean, 1e-150) ** 2))
 
 

@@ -1,4 +1,4 @@
-"""Uncertainties of soundings from errors of depths, waves, pointing and position, and orders of surveys they meet."""
+"""Sounding uncertainties from depth errors, waves, pointing and position, and the survey orders that they meet."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from mitransient_lidar.results.variables import described
 #: Smallest share of shots with a depth for which a cell has an uncertainty.
 LEAST_FOUND = 0.5
 
-#: Names of the dimension ``correction``: depths as measured, and corrected by a table of mean errors.
+#: Names in the dimension ``correction``: depths as measured, and corrected by a table of mean errors.
 CORRECTIONS = ("none", "table")
 
-#: Standard deviations to the limits of 95 % of a normal error, in one dimension and of a circle in two.
+#: Standard deviations to the 95 % limits of a normal error, in one dimension and for a circle in two.
 VERTICAL_95, HORIZONTAL_95 = 1.96, 2.45
 
 
 @dataclass(frozen=True)
 class SurveyOrder:
-    """Largest uncertainties of an order of hydrographic surveys, at the confidence level of 95 %."""
+    """Largest uncertainties in an order of hydrographic surveys, at the 95 % confidence level."""
 
     name: str
     vertical: tuple[float, float]  #: a [m] and b [1] of TVU = sqrt(a^2 + (b d)^2) at the depth d.
-    horizontal: tuple[float, float]  #: Constant [m] and share of the depth [1] of THU, whose sum counts.
+    horizontal: tuple[float, float]  #: Constant [m] and share of the depth [1] in THU, whose sum counts.
 
     def largest_tvu(self, depth: npt.ArrayLike) -> FloatArray:
         """Return the largest total vertical uncertainty [m] at depths [m]."""
@@ -76,11 +76,11 @@ def order_met(depth: npt.ArrayLike, tvu: npt.ArrayLike, thu: npt.ArrayLike) -> I
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Standard deviations of the errors of a survey's trajectory, by default those of a good inertial system."""
+    """Standard deviations of a survey trajectory's errors, by default a good inertial system's."""
 
-    pointing_mrad: float = 0.1  #: Of the beam's direction on either axis [mrad]: attitude, boresight and scanner.
-    position_m: float = 0.05  #: Of the horizontal position on either axis [m].
-    height_m: float = 0.05  #: Of the height of the sea surface [m]: position, range and datum.
+    pointing_mrad: float = 0.1  #: Beam direction on either axis [mrad]: attitude, boresight and scanner.
+    position_m: float = 0.05  #: Horizontal position on either axis [m].
+    height_m: float = 0.05  #: Sea surface height [m]: position, range and datum.
 
     def __post_init__(self) -> None:
         for name in ("pointing_mrad", "position_m", "height_m"):
@@ -88,12 +88,12 @@ class TrajectoryErrors:
 
 
 def shift_by_slope(off_nadir: float, n: float) -> tuple[float, float]:
-    """Return the shift of a point on the bottom by a slope of the sea that is taken as level.
+    """Return the shift of a bottom point by a sea slope that is assumed to be level.
 
     Parameters
     ----------
     off_nadir : float
-        Angle of the beam from the vertical [rad].
+        Beam angle from the vertical [rad].
     n : float
         Refractive index of the water.
 
@@ -107,24 +107,25 @@ def shift_by_slope(off_nadir: float, n: float) -> tuple[float, float]:
 
 
 def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: float) -> tuple[FloatArray, ...]:
-    """Return the shift of a point on the bottom by an error of the beam's direction.
+    """Return the shift of a bottom point by an error in the beam's direction.
 
     Parameters
     ----------
     off_nadir : float
-        Angle of the beam from the vertical [rad].
+        Beam angle from the vertical [rad].
     height : float
-        Height of the lidar above the sea [m].
+        Lidar height above the sea [m].
     depth : ndarray
-        Depths of the bottom [m].
+        Bottom depths [m].
     n : float
         Refractive index of the water.
 
     Returns
     -------
     along, across, up : ndarray
-        Shift [m/rad] in the line of sight, across it and vertically, with the shape of `depth`, to first order: of a
-        point at measured ranges, by an error of the angle from nadir (along and up), and of one across it.
+        Shift [m/rad] in the line of sight, across it and vertically, in the shape of `depth`, to first order, for a
+        point at measured ranges. An error in the angle from nadir causes along and up, an error across it causes
+        across.
     """
     water = float(snell(off_nadir, n))
     cos_air, cos_water = float(np.cos(off_nadir)), float(np.cos(water))
@@ -136,7 +137,7 @@ def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: flo
 
 
 def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None = None) -> xr.Dataset:
-    """Return the uncertainties of soundings with one estimator at one altitude, and their fits.
+    """Return the sounding uncertainties for one estimator at one altitude, and their fits.
 
     Parameters
     ----------
@@ -144,25 +145,25 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
         From `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
         ``refractive_index`` and ``divergence_mrad``.
     trajectory : TrajectoryErrors, optional
-        Errors of the survey's trajectory.
+        Trajectory errors of the survey.
 
     Returns
     -------
     xarray.Dataset
-        Over ``off_nadir_deg``, ``wind_speed``, ``water`` and ``depth``, with ``correction`` in front for depths
-        measured and, if the table has them, corrected: ``subaqueous_vertical``, ``tvu``, ``thu`` and ``order``; for
-        both the same ``subaqueous_horizontal``, ``stated``, ``found`` and ``channel``; and without ``depth`` the fits
+        Over ``off_nadir_deg``, ``wind_speed``, ``water`` and ``depth``, with ``correction`` in front for measured and,
+        if the table has them, corrected depths: ``subaqueous_vertical``, ``tvu``, ``thu`` and ``order``; for both the
+        same ``subaqueous_horizontal``, ``stated``, ``found`` and ``channel``; and without ``depth`` the fits
         ``vertical_a`` and ``vertical_b``, ``horizontal_a`` and ``horizontal_b``, with ``vertical_residual`` over all.
-        All but ``found`` are NaN (-1 for ``order``, an empty ``channel``) where fewer than half of the shots have a
-        depth, fits where no depth remains; of a single one the fit is constant.
+        All but ``found`` are NaN (-1 for ``order``, an empty ``channel``) where fewer than half the shots have a depth.
+        Fits are NaN where no depth remains; a single depth gives a constant fit.
 
     Notes
     -----
-    ``subaqueous_vertical`` is the root mean square of the error of depths below the sea in the beam, of shots of all
-    waves of a wind: sqrt(bias^2 + spread^2), of the channel with the smallest. ``subaqueous_horizontal`` has the
-    refraction by the mean slopes in the beam, which a survey takes as level (pooled over waters and depths of a wind),
-    and the standard deviation of the beam on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the sum of
-    the squares of these and of the errors of the trajectory; horizontal errors are means of both axes.
+    ``subaqueous_vertical`` is the root mean square error of depths below the sea in the beam, over shots on all waves
+    at a wind: sqrt(bias^2 + spread^2), for the channel with the smallest. ``subaqueous_horizontal`` combines two parts:
+    the refraction by the mean slopes in the beam, which a survey assumes to be level (pooled over waters and depths at
+    a wind), and the beam's standard deviation on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the
+    summed squares of these and of the trajectory errors; horizontal errors are means over both axes.
     """
     trajectory = trajectory or TrajectoryErrors()
     one = table.isel(estimator=0, drop=True).transpose(*AXES, "pixel", ...)
@@ -202,7 +203,7 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
 
 
 def non_negative_line(x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[float, float]:
-    """Return the intercept and the slope, both at least 0, of the line with the least squares of residuals.
+    """Return the least-squares line's intercept and slope, both at least 0.
 
     NaN among `y` are left out; without any other both are NaN, and of values at a single x the line is constant. With
     two unknowns the solution is the unconstrained one, the proportional one, or the constant one.
@@ -233,8 +234,8 @@ def write_fits(found: xr.Dataset, part: str, path: str | os.PathLike[str]) -> No
     part : str
         ``vertical`` or ``horizontal``.
     path
-        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation; rows
-        by wind [m/s] and then by water, nan where there is no fit.
+        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation. Rows
+        are by wind [m/s] and then by water, nan where there is no fit.
     """
     fits = {f"{part}_{name}": name for name in "ab"}
     frame = found[[*fits]].to_dataframe(["wind_speed", "water"]).reset_index()

@@ -10,6 +10,6 @@ from mitransient_lidar.core.validation import FloatArray
 
 
 def jackknife_error(values: FloatArray) -> float:
-    """Return the standard error of an estimate from its values without each of the groups, shape (groups,)."""
+    """Return an estimate's standard error from its values without each of the groups, shape (groups,)."""
     count = len(values)
     return math.sqrt((count - 1) / count * float(np.sum((values - values.mean()) ** 2)))

@@ -1,4 +1,4 @@
-"""Recorded shots of a result: its waveforms after a receiver chain, or its gates as frames of a camera."""
+"""Recorded shots from a result: its waveforms after a receiver chain, or its gates as camera frames."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from mitransient_lidar.results.attributes import made_from
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import label
 
-#: A power, or those of pixels.
+#: A power, or pixel powers.
 Powers = Union[npt.ArrayLike, "xr.DataArray"]
 
-#: What a receiver is given by.
+#: Forms in which a receiver is given.
 Receiver = Camera | ReceiverChannels | ReceiverChain | str | os.PathLike[str]
 
 _R = TypeVar("_R")
@@ -55,15 +55,13 @@ def detect_waveforms(
     dataset: results.Given,
     chain: Annotated[
         Receiver | None,
-        Option(f"{RECEIVERS_OR_CAMERAS}. By default that of the result's instrument, or apd", flag="--receiver"),
+        Option(f"{RECEIVERS_OR_CAMERAS}. By default the result's instrument, or apd", flag="--receiver"),
     ] = None,
-    shots: Annotated[
-        int, Option("Number of records of each waveform, or frames of each gate, with independent noise", 1, 10**9)
-    ] = 1,
+    shots: Annotated[int, Option("Records per waveform, or frames per gate, with independent noise", 1, 10**9)] = 1,
     seed: Seed = 0,
     background_power: Annotated[
         Powers,
-        Option("Power of the daylight on each pixel (at least 0) [W]", flag="--background-power-w"),
+        Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
     ] = 0.0,
     *,
     gain: Annotated[
@@ -84,7 +82,7 @@ def detect_waveforms(
         ),
     ] = None,
 ) -> xr.Dataset:
-    """Record shots of a result, or of each shot of a series, with a receiver chain, or gates with a camera.
+    """Record shots of a result, or of each shot in a series, with a receiver chain, or gates with a camera.
 
     Parameters
     ----------
@@ -92,58 +90,57 @@ def detect_waveforms(
         A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``; for a
         camera a gate stack, optionally over ``frame``.
     chain : Camera, ReceiverChannels, ReceiverChain, str or path-like, optional
-        The receiver of every channel, or one chain for all; a name in `receiver_files.RECEIVERS` or of an instrument,
+        The receiver for every channel, or one chain for all; a name in `receiver_files.RECEIVERS` or of an instrument,
         a camera or its name in `receiver_files.CAMERAS`, or a TOML file
-        (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument of the result, and the
+        (`physics.receiver.receiver_files.parse_receiver`). By default the receiver of the result's instrument, and the
         preset ``apd`` without one.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
     gain : float or 'auto', optional
-        Factor of the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation. By default
-        that of the receiver's channels, 1 where they have none.
+        Factor on the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation. By default
+        from the receiver's channels, 1 where they have none.
     optical_density : float or 'auto', optional
         Optical density of a filter before the detector, 0 to 12, which also attenuates the background; 'auto' for the
-        least multiple of 0.1 without saturation. By default that of the channels, 0 where they have none.
+        least multiple of 0.1 without saturation. By default from the channels, 0 where they have none.
 
     Returns
     -------
     xarray.Dataset
         ``signal`` and ``saturated`` over (shot, pixel, time) or (shot, row, column, time), for a series all records of
-        its first shot first; over the same dimensions, without shot unless it is a series, the closed forms
-        ``signal_mean``, ``signal_deviation`` (standard deviation of a shot), ``snr`` and ``saturation`` (probability),
-        and ``signal_mean_stderr``, what ``waveform_stderr`` of a render changes in the mean.
-        The signal is in V, after a counter in counts per bin, without an amplifier in electrons per bin. Per pixel,
-        ``saturated_shots`` is the share of shots with saturated samples, ``saturated_samples`` that of the samples
-        [1]. ``time`` [ns], ``time_start_ns`` and ``bin_width_ns`` are those of the samples; other coordinates and
-        attributes are those of the result, with the parameters of the chain as ``receiver.*``, ``gain`` and
-        ``optical_density`` as used (``chosen`` names the one that was 'auto'), and ``fitting_gain`` and
-        ``fitting_optical_density``, each of which avoids saturation while the other one is kept
-        (`ReceiverChain.fitting_gain`). Where channels differ, attributes of the chain are
-        ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels is that of
-        `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is
-        the weight of the light of a bin in later samples. Of a converter that stores blocks, samples outside them are
-        NaN, and ``dark_level`` and ``block_level`` over the pixels are the levels without light, and of the threshold.
+        its first shot first. The closed forms are over the same dimensions, without shot unless it is a series:
+        ``signal_mean``, ``signal_deviation`` (standard deviation in a shot), ``snr`` and ``saturation`` (probability),
+        and ``signal_mean_stderr``, the change in the mean by a render's ``waveform_stderr``. The signal is in V, after
+        a counter in counts per bin, without an amplifier in electrons per bin. Per pixel, ``saturated_shots`` is the
+        share of shots with saturated samples, ``saturated_samples`` the share of saturated samples [1]. ``time`` [ns],
+        ``time_start_ns`` and ``bin_width_ns`` describe the samples; other coordinates and attributes come from the
+        result. The chain's parameters are added as ``receiver.*``, with ``gain`` and ``optical_density`` as used;
+        ``chosen`` names the one that was 'auto'. ``fitting_gain`` and ``fitting_optical_density`` each avoid saturation
+        while the other one is kept (`ReceiverChain.fitting_gain`). Where channels differ, chain attributes are
+        ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels comes from
+        `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is the weight of a bin's light in later
+        samples. If a converter stores blocks, samples outside them are NaN, and ``dark_level`` and ``block_level`` over
+        the pixels are the level without light and the threshold level.
 
-        Of a camera ``signal`` and ``saturated`` are over (frame, row, column, gate) or (frame, pixel, gate), for a
-        stack over ``frame`` all of its first frame first, as integers [DN] with the fixed pattern of `Camera.pattern`.
-        The closed forms are over the same dimensions, without frame unless the stack has it, and those of each pixel
-        with its pattern; ``snr`` is NaN where most frames saturate, ``signal_mean_stderr`` is by
-        ``gate_energy_stderr``, and ``dark_level`` [DN] is the mean without light. A mean over ``frame`` averages. The
-        coordinates are those of the gate stack. See `analysis.gates.recording.record_gates` for the jitter of gates.
+        A camera gives ``signal`` and ``saturated`` over (frame, row, column, gate) or (frame, pixel, gate), as integers
+        [DN] with the fixed pattern of `Camera.pattern`. A stack over ``frame`` gives all of its first frame first. The
+        closed forms are over the same dimensions, without frame unless the stack has it, and for each pixel with its
+        pattern; ``snr`` is NaN where most frames saturate, ``signal_mean_stderr`` is by ``gate_energy_stderr``, and
+        ``dark_level`` [DN] is the mean without light. A mean over ``frame`` averages. The coordinates come from the
+        gate stack. See `analysis.gates.recording.record_gates` for gate jitter.
 
     Raises
     ------
     UserError
-        If the dataset has other dimensions, gates without a camera or a camera without gates, its waveform is not
-        finite or negative, the receiver is unknown or has no amplifier for a gain, both are 'auto', noise alone exceeds
-        the range, or another argument is out of range.
+        If the dataset has other dimensions, gates without a camera or a camera without gates; its waveform is not
+        finite or negative; the receiver is unknown or has no amplifier for a gain; both are 'auto'; noise alone exceeds
+        the range; or another argument is out of range.
 
     Notes
     -----
-    If the result includes a response (``response_time_ns``), the bandwidth of an amplifier smooths it again, and the
-    shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
-    Dead times of counters and cells lose light without being marked as saturated.
+    If the result includes a response (``response_time_ns``), an amplifier's bandwidth smooths it again, and the shot
+    noise lacks that response's correlation. Render with a response time of 0 for a chain with a bandwidth. Dead times
+    of counters and cells lose light without being marked as saturated.
     """
     dataset = results.dataset_of("dataset", dataset, "waveforms", "gates")
     if (camera := _camera_of(dataset, chain)) is not None:
@@ -185,8 +182,8 @@ class PixelChain(NamedTuple):
     """Receiver of one pixel as used in a record, with its gain."""
 
     chain: ReceiverChain
-    transmittance: float  #: Of the filter before the detector [1], for signal and background.
-    background: float  #: Power of the background before the filter [W].
+    transmittance: float  #: Transmittance of the filter before the detector [1], for signal and background.
+    background: float  #: Background power before the filter [W].
 
 
 def pixel_chains(
@@ -197,10 +194,10 @@ def pixel_chains(
     gain: Setting | None = None,
     optical_density: Setting | None = None,
 ) -> list[PixelChain]:
-    """Return the receiver of each pixel with the gain and filter that `detect_waveforms` would use.
+    """Return each pixel's receiver with the gain and filter that `detect_waveforms` would use.
 
-    Arguments and errors are those of `detect_waveforms`, for a result without ``shot``; pixels of an imager are in
-    row-major order.
+    Arguments and errors as for `detect_waveforms`, for a result without ``shot``; pixels of an imager are in row-major
+    order.
     """
     _, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     width, (_, light) = results.time_axis(dataset).bin_width_ns, _waveform(dataset)
@@ -257,7 +254,7 @@ def receiver_of_result(
 
 
 def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
-    """Return the records of groups of pixels as one, with the attributes in which they differ by pixel."""
+    """Return the records of pixel groups as one, with their differing attributes by pixel."""
     order = np.argsort(np.concatenate(places))
     joined = xr.concat(parts, "pixel", data_vars="minimal", coords="minimal", compat="override", join="override")
     joined = joined.isel(pixel=order)
@@ -286,9 +283,9 @@ def _same(first: Any, second: Any) -> bool:
 def _record_channel(
     dataset: xr.Dataset, channel: Channel, shots: int, seeds: tuple[int, int], sky: FloatArray
 ) -> xr.Dataset:
-    """Return the record of pixels that share a channel.
+    """Return the record for pixels that share a channel.
 
-    The arguments are those of `detect_waveforms`; seeds are those of energy and trigger, and of all else.
+    Arguments as for `detect_waveforms`; seeds are for energy and trigger, and for everything else.
     """
     given = channel.chain
     dims, light = _waveform(dataset)
@@ -313,7 +310,7 @@ def _record_channel(
     stride = receiver.stride(width)
     time = dataset["time"][::stride]
     forms = [expected.mean, np.sqrt(expected.variance), snr, expected.saturation]
-    # Without those of gates and of errors, which a record has not.
+    # Without gates and errors, which a record does not have.
     kept = {*dims[:-1]}
     coords = {name: coordinate for name, coordinate in dataset.coords.items() if kept.issuperset(coordinate.dims)}
     if series:
@@ -373,7 +370,7 @@ def _record_channel(
 
 
 def saturation_advice(recorded: xr.Dataset) -> str:
-    """Return a sentence on the saturation in a record of `detect_waveforms`, and on what would avoid it."""
+    """Return a sentence on the saturation in a record from `detect_waveforms`, and on how to avoid it."""
     saturated = recorded["saturated"]
     share = float(saturated.any([dim for dim in saturated.dims if dim != "shot"]).mean())
     if share == 0:
@@ -468,7 +465,7 @@ def chain_of(parameter: str, given: Receiver) -> ReceiverChannels:
 
 
 def _named(parameter: str, found: Callable[[], _R]) -> _R:
-    """Return what a function finds, with the name of the parameter in the message of an error."""
+    """Return a function's result, with the parameter's name in an error message."""
     try:
         return found()
     except UserError as error:
@@ -479,7 +476,7 @@ def _named(parameter: str, found: Callable[[], _R]) -> _R:
 
 
 def _waveform(dataset: xr.Dataset) -> tuple[tuple[str, ...], FloatArray]:
-    """Return dimensions and values of the waveform."""
+    """Return the waveform's dimensions and values."""
     dims = results.record_dims(dataset, "waveform", shots=True)
     values = np.asarray(dataset["waveform"].values, dtype=np.float64)
     if not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Plans of campaigns: the file of a campaign, and the table of its runs."""
+"""Campaign plans: a campaign's file, and the table of its runs."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from mitransient_lidar.core.plans import Plan
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 
-#: Kinds of designs: every combination; points of a sequence, of a Latin hypercube, or random ones; rows of a file.
+#: Design kinds: every combination; points of a sequence, of a Latin hypercube, or random ones; file rows.
 DesignKind = Literal["grid", "sobol", "latin_hypercube", "random", "table"]
 
-#: Contents of a store that a campaign may keep.
+#: Store contents that a campaign may keep.
 KEPT = ("waveform", "stderr", "components", "echoes", "truth")
 
-#: Most runs of a campaign, and most shots of a run.
+#: Most runs in a campaign, and most shots in a run.
 MOST_RUNS, MOST_SHOTS = 10**7, 10_000
 
-#: Most values of all parameters of all runs, and of a table that is a file, a million rows of ten numbers.
+#: Most values in all parameters and runs, and in a table file, a million rows of ten numbers.
 _MOST_VALUES, _MOST_CELLS = 10**8, 2 * 10**7
 
 #: Largest table of runs [bytes].
@@ -41,10 +41,10 @@ _LARGEST_TABLE = 2**27
 
 Column = npt.NDArray[Any]
 
-#: What a parameter of a design may take: a range, or values.
+#: Allowed for a design parameter: a range, or values.
 _Free = Union["Range", tuple[Any, ...]]
 
-#: What a parameter that varies is.
+#: Allowed for a parameter that varies.
 _Varied = Union["Range", tuple[Any, ...], Expression]
 
 
@@ -76,12 +76,12 @@ class Range(Plan):
 
 @dataclass(frozen=True)
 class Design(Plan):
-    """Choice of the runs of a campaign."""
+    """Choice of a campaign's runs."""
 
     kind: Annotated[DesignKind, Option("Kind, by default table with a file")] = "sobol"
     count: Annotated[int | None, Option("Number of runs", 1, MOST_RUNS)] = None
     shots: Annotated[int, Option("Places on each sea", 1, MOST_SHOTS)] = 1
-    seed: Annotated[int, Option("Seed of the random numbers", 0, 2**32 - 1)] = 0
+    seed: Annotated[int, Option("Random seed", 0, 2**32 - 1)] = 0
     file: Annotated[str | None, Option("CSV file with a row for each run", form="the name of a CSV file")] = None
 
     def __post_init__(self) -> None:
@@ -97,19 +97,19 @@ class Design(Plan):
 
 @dataclass(frozen=True, kw_only=True)
 class Campaign(Plan):
-    """A campaign, as its file describes it; `folder` is that from which its relative paths count.
+    """A campaign, as its file describes it; its relative paths start from `folder`.
 
     A parameter that varies is a `Range`, a tuple of values, or an `Expression` of the others. `text` is the campaign as
     JSON, from which `from_json` returns it.
     """
 
     scene: Annotated[str, Option("Scene", form="the name of a shipped scene or the path of an XML file")]
-    target_error: Annotated[float, positive_option("Relative standard error of the median bin of each run")] = 0.05
+    target_error: Annotated[float, positive_option("Relative standard error of each run's median bin")] = 0.05
     max_time: Annotated[
         float | None,
         positive_option("Longest time for the passes of each run; one that it ends has other bits elsewhere", "s"),
     ] = None
-    keep: Annotated[tuple[str, ...], Option(f"What the store holds, of {', '.join(KEPT)}")] = ("waveform", "truth")
+    keep: Annotated[tuple[str, ...], Option(f"Store contents, of {', '.join(KEPT)}")] = ("waveform", "truth")
     instrument: Annotated[str | None, Option("Instrument instead of the scene's lidar")] = None
     derivatives: Annotated[
         tuple[str, ...], Option("Parameters by which waveforms are differentiated, kept as waveform_derivative")
@@ -143,7 +143,7 @@ class Campaign(Plan):
 
     @classmethod
     def of_file(cls, given: Mapping[str, Any], folder: Path | None = None) -> Campaign:
-        """Check a campaign given as a dict of the contents of its file; raise `UserError` if it is invalid."""
+        """Check a campaign given as a dict with its file's contents; raise `UserError` if it is invalid."""
         folder = Path.cwd() if folder is None else folder
         values = dict(given)
         if isinstance(values.get("scene"), (str, os.PathLike)):
@@ -170,7 +170,7 @@ class Campaign(Plan):
 
     @property
     def needed_names(self) -> set[str]:
-        """Names of the parameters of the scene that the runs set, without those of a table."""
+        """Names of the scene parameters that the runs set, without a table's."""
         return {*self.fixed, *self.parameters}
 
     def table(self) -> dict[str, Column]:
@@ -188,7 +188,7 @@ class Campaign(Plan):
         return self._with_expressions(columns)
 
     def _from_file(self) -> dict[str, Column]:
-        """Return the columns of the table of a design."""
+        """Return the columns of a design's table."""
         assert self.design.file is not None
         path = Path(_resolved(self.design.file, self.folder))
         if free := [name for name, one in self.parameters.items() if not isinstance(one, Expression)]:
@@ -200,7 +200,7 @@ class Campaign(Plan):
         try:
             rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(map(str.strip, row))]
         except csv.Error as error:
-            raise UserError(f"{path} is not a CSV file.") from error
+            raise UserError(f"{path} is not a CSV file") from error
         if len(rows) < 2:
             raise UserError(f"{path} must have a heading with the names of parameters, and a row for each run")
         names = rows[0]
@@ -246,7 +246,7 @@ class Campaign(Plan):
 
 
 def _run_count(free: Mapping[str, _Free], design: Design) -> int:
-    """Return the number of runs of a design other than a table."""
+    """Return the number of runs in a design other than a table."""
     if design.kind != "grid":
         assert design.count is not None
         return design.count
@@ -284,7 +284,7 @@ def _designed(free: Mapping[str, _Free], design: Design) -> dict[str, Column]:
 
 
 def _shares(kind: str, count: int, dimensions: int, seed: int) -> FloatArray:
-    """Return points of the unit cube, shape (count, dimensions)."""
+    """Return points in the unit cube, shape (count, dimensions)."""
     rng = np.random.default_rng(seed)
     if kind == "random":
         return rng.random((count, dimensions))
@@ -292,7 +292,7 @@ def _shares(kind: str, count: int, dimensions: int, seed: int) -> FloatArray:
 
     if kind == "latin_hypercube":
         return np.asarray(qmc.LatinHypercube(dimensions, seed=rng).random(count))
-    # Whole powers of two keep the balance of the sequence; the first points of the next one are taken.
+    # Whole powers of two keep the sequence balanced; the first points of the next one are taken.
     sampler = qmc.Sobol(dimensions, seed=rng)
     return np.asarray(sampler.random_base2(max(count - 1, 0).bit_length())[:count])
 
@@ -306,7 +306,7 @@ def _grid_axis(one: _Free) -> Column:
 
 
 def _parameter(name: str, value: Any) -> _Varied:
-    """Return what a parameter takes: a range, values, or an expression."""
+    """Return a parameter's range, values, or expression."""
     if isinstance(value, Mapping):
         return Range.of_parameter(name, value)
     if isinstance(value, str):
@@ -324,7 +324,7 @@ def _parameter(name: str, value: Any) -> _Varied:
 
 
 def _resolved(name: str, folder: Path) -> str:
-    """Return the absolute path of a file beside that of the campaign, any other name as it is."""
+    """Return the absolute path of a file beside the campaign's, and any other name unchanged."""
     path = folder / name
     return str(path.resolve()) if path.suffix and is_there(path) else name
 

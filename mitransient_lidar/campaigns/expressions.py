@@ -1,4 +1,4 @@
-"""Arithmetic expressions of parameters that depend on others."""
+"""Arithmetic expressions for parameters that depend on others."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "max": np.maximum,
 }
 
-#: Most characters of an expression: its evaluation is recursive.
+#: Most characters in an expression: its evaluation is recursive.
 _LONGEST = 500
 
 _ALLOWED = f"numbers, parameters, + - * / ** ( ) and {', '.join(_FUNCTIONS)}"
@@ -42,7 +42,7 @@ _ALLOWED = f"numbers, parameters, + - * / ** ( ) and {', '.join(_FUNCTIONS)}"
 class Expression:
     """An arithmetic expression of named quantities, such as ``0.8 * attenuation``.
 
-    It may hold numbers, names, ``+ - * / **``, parentheses, and the functions ``sqrt``, ``exp``, ``log``, ``sin``,
+    It may contain numbers, names, ``+ - * / **``, parentheses, and the functions ``sqrt``, ``exp``, ``log``, ``sin``,
     ``cos``, ``tan`` (of radians), ``min`` and ``max`` (of two arguments).
 
     Parameters
@@ -60,7 +60,7 @@ class Expression:
     Raises
     ------
     UserError
-        If it holds anything else.
+        If it contains anything else.
     """
 
     def __init__(self, name: str, text: str) -> None:

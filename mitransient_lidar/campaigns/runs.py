@@ -1,4 +1,4 @@
-"""Runs of a campaign: the shots of one set of parameters, and the arrays that are stored of them."""
+"""Campaign runs: the shots for one parameter set, and the arrays stored from them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.variables import described
 
-#: Half of the side of the square of the places of a sea [m].
+#: Half the side of the square that contains a sea's locations [m].
 _REACH = 256.0
 
 #: Relative margin of a shared record on both sides.
 _MARGIN = 0.05
 
-#: Number of the random sea, which each run has of its own unless the campaign gives it.
+#: Number of the random sea; each run has its own unless the campaign gives it.
 _SEA = "surface_seed"
 
 #: Whole numbers for random seas.
@@ -40,7 +40,7 @@ _SEAS = 2**31 - 1
 
 
 class Array(NamedTuple):
-    """Array of a run, or of all: names of its dimensions, values, and attributes."""
+    """Array for one run, or for all: dimension names, values, and attributes."""
 
     dims: tuple[str, ...]
     values: npt.NDArray[Any]
@@ -48,13 +48,13 @@ class Array(NamedTuple):
 
     @classmethod
     def of(cls, values: xr.DataArray | xr.Variable, dtype: npt.DTypeLike | None = None) -> Array:
-        """Return the array of a variable, of another type if one is given."""
+        """Return a variable's array, with another type if one is given."""
         return cls(tuple(map(str, values.dims)), np.asarray(values.values, dtype=dtype), plain(values.attrs))
 
 
 @dataclass(frozen=True, eq=False)
 class Renderer(ABC):
-    """What renders the runs of a store, each with the same bits wherever and whenever.
+    """Renderer for the runs in a store, each with the same bits wherever and whenever.
 
     Attributes
     ----------
@@ -63,26 +63,26 @@ class Renderer(ABC):
     scene
         Its scene, with its instrument.
     axis
-        Time bins of all runs; None where each has its own.
+        Time bins for all runs; None where each has its own.
     """
 
     plan: Any
     scene: SceneSource
     axis: TimeAxis | None = None
 
-    #: Class of the plan, name of one that is rendered, and of what a store of them is.
+    #: Plan class, unit name, and title of a store of such units.
     plan_type: ClassVar[Any]
     unit: ClassVar[str]
     kind: ClassVar[str]
 
     @property
     def shots(self) -> int:
-        """Number of shots of a run, where they have a dimension."""
+        """Shots per run, where they have a dimension."""
         return 1
 
     @abstractmethod
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
-        """Return the rows of the runs of a shard, those that are rendered together in one list."""
+        """Return the row numbers of a shard's runs; runs rendered together share a list."""
 
     def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
         """Return arrays that are known of runs before they are rendered, and not from their inputs."""
@@ -94,7 +94,7 @@ class Renderer(ABC):
 
     @abstractmethod
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
-        """Return the attributes of a parameter of the runs."""
+        """Return the attributes of a run parameter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,12 +106,12 @@ class RunRenderer(Renderer):
 
     @property
     def shots(self) -> int:
-        """Number of shots of a run."""
+        """Shots per run."""
         return self.plan.design.shots
 
     @classmethod
     def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
-        """Return the renderer of a new campaign with the columns of its runs, with a record that holds all of them.
+        """Return the renderer for a new campaign with its run columns, with a record that contains all runs.
 
         Raises
         ------
@@ -123,13 +123,13 @@ class RunRenderer(Renderer):
         return cls(campaign, source, cls(campaign, source)._longest_record(columns))
 
     def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the parameters of a run that are its own: those of the table, and the random sea."""
+        """Return a run's own parameters: the table's, and the random sea."""
         if _SEA in values or _SEA in self.plan.fixed or _SEA not in self.scene.values:
             return dict(values)
         return {**values, _SEA: int(self._random(number).integers(1, _SEAS))}
 
     def series(self, number: int, values: Mapping[str, Any], **options: Any) -> xr.Dataset:
-        """Return the shots of a run, as of `render_shots`, whose number is that of its row, with its parameters.
+        """Return a run's shots, as from `render_shots`, from its row number and parameters.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class RunRenderer(Renderer):
         return render_shots(self.scene, params, **{**wanted, **options})
 
     def record(self, number: int, series: xr.Dataset) -> xr.Dataset | None:
-        """Return the record of the receiver of the shots of a run, None without a receiver."""
+        """Return the receiver's record for a run's shots, None without a receiver."""
         from mitransient_lidar.analysis.receiver import detect_waveforms
 
         campaign = self.plan
@@ -175,7 +175,7 @@ class RunRenderer(Renderer):
         )
 
     def arrays(self, number: int, values: Mapping[str, Any]) -> dict[str, Array]:
-        """Return what the store holds of a run, without its dimension; raises as `series`, or if shots are missing."""
+        """Return a run's stored arrays, without its dimension; raises as `series`, or if shots are missing."""
         series, planned = self.series(number, values), self.plan.design.shots
         if series.sizes["shot"] < planned:
             done = f"ended after {series.sizes['shot']} of {planned} shots of the run"
@@ -196,13 +196,13 @@ class RunRenderer(Renderer):
         return self.inputs(int(numbers[0]), {name: column[0].item() for name, column in inputs.items()})
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
-        """Return the attributes of a parameter of the runs."""
+        """Return the attributes of a run parameter."""
         text = {"long_name": f"parameter {name} of the scene"}
         unit = unit_of(name) if column.dtype.kind in "iuf" else None
         return text if unit is None else {"units": unit, **text}
 
     def sample(self, number: int, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Return `arrays` of few paths, and the coordinates of their dimensions; raises as `series`."""
+        """Return `arrays` from few paths, and the coordinates of their dimensions; raises as `series`."""
         series = self.series(number, values, target_error=None, max_time=None, passes=2, pass_share=SMALLEST_SHARE)
         return self._stored(number, values, series), self._coordinates(number, series)
 
@@ -256,7 +256,7 @@ class RunRenderer(Renderer):
         return found
 
     def _random(self, number: int) -> np.random.Generator:
-        """Return the random numbers of a run: its sea, then its places, then the seed of its shots."""
+        """Return a run's random numbers: its sea, then its locations, then the seed of its shots."""
         return np.random.default_rng([self.plan.design.seed, number])
 
     def _longest_record(self, columns: Mapping[str, Column]) -> TimeAxis | None:
@@ -277,7 +277,7 @@ class RunRenderer(Renderer):
                     try:
                         axis = self.own_axis({**chosen, name: value})
                     except UserError:
-                        # A combination of extremes that the scene refuses; runs of it fail by themselves.
+                        # A combination of extremes that the scene refuses; such runs fail by themselves.
                         continue
                     end = axis.end_ns if sign > 0 else -axis.start_ns
                     if best is None or end > best[0]:
@@ -292,7 +292,7 @@ class RunRenderer(Renderer):
 
     @alone
     def own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
-        """Return the automatic time bins of a run."""
+        """Return a run's automatic time bins."""
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         session = open_scene(self.scene, {**self.plan.fixed, **values})
@@ -300,15 +300,15 @@ class RunRenderer(Renderer):
 
 
 def source_of(campaign: Campaign) -> SceneSource:
-    """Return the source of the scene of a campaign, with its instrument; raise `UserError` if it cannot be read.
+    """Return the source of a campaign's scene, with its instrument; raise `UserError` if it cannot be read.
 
-    It is not loaded: files that are its defaults may be missing where the runs have others.
+    It is not loaded: its default files may be missing where the runs have others.
     """
     return read_source(campaign.scene, campaign.fixed, campaign.instrument)
 
 
 def check_names(campaign: Campaign) -> None:
-    """Raise `UserError` for a parameter of a campaign that its scene does not have, before the table of its runs."""
+    """Raise `UserError` for a campaign parameter that its scene lacks, before the table of its runs."""
     document = read_document(scene_path(campaign.scene))
     if campaign.instrument is not None:
         document = mount(campaign.instrument, document)
@@ -330,12 +330,12 @@ def _check_parameters(campaign: Campaign, columns: Collection[str], document: Sc
 
 
 def _values(columns: Mapping[str, Column], row: int) -> dict[str, Any]:
-    """Return the parameters of a row."""
+    """Return a row's parameters."""
     return {name: column[row].item() for name, column in columns.items()}
 
 
 def _extremes(column: Column) -> Sequence[Any]:
-    """Return the values of a parameter that may make a record longer: both ends of numbers, all texts."""
+    """Return the parameter values that may make a record longer: both ends of numbers, all texts."""
     values = np.unique(column)
     return [one.item() for one in (values[[0, -1]] if column.dtype.kind in "if" else values)]
 
@@ -347,7 +347,7 @@ def _single(values: xr.DataArray) -> Array:
 
 
 def _number(name: str, values: Mapping[str, Any], dtype: npt.DTypeLike) -> Array:
-    """Return a number of each run."""
+    """Return one number per run."""
     return Array((), np.asarray(values[name], dtype=dtype), described(name))
 
 
@@ -357,7 +357,7 @@ def _renamed_time(signal: xr.DataArray, series: xr.Dataset) -> xr.DataArray:
 
 
 def _truth(series: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return what is known of each shot, and of the lines of sight of each pixel."""
+    """Return the known truth for each shot, and each pixel's lines of sight."""
     of_pixels = set(series["angle_x"].dims)
     return {
         str(name): values

@@ -1,10 +1,10 @@
-"""Rendering of a shard of a campaign in a process of its own.
+"""Rendering of a campaign's shard in its own process.
 
-The process ends with its shard, and with it the memory that Mitsuba does not give back. It ends, too, when the process
-that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. One
-that hangs is ended. Its standard input holds the store, the shard, the versions that it must have, and the runs that
-are not to be rendered, with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run,
-``done``, ``error``, ``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
+The process ends with its shard, and with it the memory that Mitsuba does not return. It also ends when its parent
+process does, and after a program error, since Dr.Jit's recording is then in an unknown state. A hanging process is
+ended. Its standard input contains the store, the shard, the required versions, and the runs that are not to be
+rendered, with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run, ``done``,
+``error``, ``bug``, or ``differs`` for other versions. After SIGTERM it writes its completed runs, and ends.
 
 A log beside the store, ``NAME.zarr.log``, holds the messages of processes that ended before their shard.
 """
@@ -44,27 +44,27 @@ _INTERVAL_S = 60.0
 #: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
 _MOST_DEATHS, _MOST_STARTS = 2, 3
 
-#: Number of runs with an error of the program, or that hang, after which the rest of a shard is left.
+#: Number of runs with a program error, or that hang, after which the rest of a shard is left.
 _MOST_BUGS = 3
 
-#: Length of the reason of an error of the program, whose traceback is in the log.
+#: Longest program error reason; the log contains the traceback.
 _LONGEST_REASON = 200
 
-#: Variables of the environment with numbers of threads of numerical libraries.
+#: Environment variables with thread numbers for numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 #: Time for a process to write the runs that it has when the campaign ends [s].
 _WRITE_S = 10.0
 
-#: Time between two looks at a process [s], and number of looks without any processor time after which it hangs; while
-#: it waits for a disk, which may be that of a server, they do not count.
+#: Time between two checks of a process [s], and number of checks without any processor time after which it hangs;
+#: checks while it waits for a disk, which may be a server's, do not count.
 _LOOK_S, _MOST_STILL = 10.0, 30
 
 Report = Callable[[int, int], None]
 
 
 class Outcome(NamedTuple):
-    """Numbers of runs of a shard that are done and that have failed, and why the others are left, empty if none are."""
+    """Numbers of done and failed runs in a shard, and the reason why the others are left, empty if none are."""
 
     done: int
     failed: int
@@ -72,7 +72,7 @@ class Outcome(NamedTuple):
 
 
 class _End(NamedTuple):
-    """End of a process before that of its shard: the run that it was rendering, why, and whether the run is left.
+    """Process end before its shard's end: the run in progress, the reason, and whether the run is left.
 
     Runs that meet a bug or hang are left: they stay planned.
     """
@@ -83,14 +83,14 @@ class _End(NamedTuple):
 
 
 class Processes:
-    """Processes of the shards of a campaign, which `end` ends together.
+    """Processes of a campaign's shards, which `end` ends together.
 
     Parameters
     ----------
     versions
-        Versions that they must have, as of `versions.own_versions`; by default any.
+        Required versions, as from `versions.own_versions`; by default any.
     place
-        Where they are, for messages.
+        Their machine, for messages.
     """
 
     def __init__(self, versions: Mapping[str, str] | None = None, place: str = "this machine") -> None:
@@ -134,7 +134,7 @@ class Processes:
 def render_in_process(
     path: str, shard: int, retry: bool = False, report: Report | None = None, processes: Processes | None = None
 ) -> Outcome:
-    """Render the runs of a shard that are not done in a new process.
+    """Render a shard's unfinished runs in a new process.
 
     A run in which the process ends twice has failed. Runs that meet an error of the program or hang stay planned, and
     so do all where the process ends three times before the first run.
@@ -142,9 +142,9 @@ def render_in_process(
     Parameters
     ----------
     path
-        Folder of the store.
+        Store folder.
     shard
-        Number of the shard.
+        Shard number.
     retry
         Whether to render runs that have failed, too.
     report
@@ -185,13 +185,13 @@ def render_in_process(
 
 
 def log_path(store: str | os.PathLike[str]) -> Path:
-    """Return the path of the log of a store."""
+    """Return the path of a store's log."""
     path = Path(store)
     return path.with_name(f"{path.name}.log")
 
 
 def _log(store: str, shard: int, text: str) -> None:
-    """Add what a process has told to the log of its store, which must not be a link; the run has its reason anyway."""
+    """Add a process's report to its store's log, which must not be a link; the run has its reason anyway."""
     with contextlib.suppress(OSError, UserError), open_log(log_path(store)) as file:
         file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} shard {shard}\n{printable(text.rstrip(), kept=LINES)}\n\n")
 
@@ -199,7 +199,7 @@ def _log(store: str, shard: int, text: str) -> None:
 def _one_process(order: dict[str, Any], report: Report | None, processes: Processes) -> Outcome | _End:
     """Return the outcome of a shard, or how its process ended before."""
     environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
-    # A session of its own: Ctrl-C is for the process that has started it.
+    # Its own session: Ctrl-C is for the process that has started it.
     with subprocess.Popen(
         [sys.executable, "-m", "mitransient_lidar.campaigns.shard"],
         stdin=subprocess.PIPE,
@@ -266,7 +266,7 @@ def _watching(process: subprocess.Popen[str]) -> Iterator[threading.Event]:
 def _events(
     process: subprocess.Popen[str], order: dict[str, Any], report: Report | None, place: str
 ) -> Outcome | _End | int | None:
-    """Return what a process tells of its end; of one that ends before, the run that it was rendering."""
+    """Return a process's report on its end; for one that ends before, the run in progress."""
     assert process.stdin is not None
     assert process.stdout is not None
     run: int | None = None
@@ -372,7 +372,7 @@ def _main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # What a run tells belongs to its result; a campaign has thousands.
+    # A run's messages belong to its result; a campaign has thousands.
     logging.getLogger("mitransient_lidar").setLevel(logging.ERROR)
     dr.set_thread_count(1)
     # Mitsuba may write to standard output, too.

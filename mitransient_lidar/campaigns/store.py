@@ -1,7 +1,7 @@
 """The Zarr store of a campaign or a flight: made whole at first, then filled shard by shard.
 
-Every chunk ends in its CRC32C, and the attributes that a store is read by have a SHA-256, so that damage is found where
-it is read. Chunks of a shard are written even where all values are fill values: one that is missing is lost.
+Every chunk ends in its CRC32C, and the attributes that identify a store have a SHA-256, so that damage is found on
+reading. A shard's chunks are written even where all values are fill values: a missing chunk is lost.
 """
 
 from __future__ import annotations
@@ -41,32 +41,32 @@ _LOG = logging.getLogger(__name__)
 #: Values of the variable ``status``.
 PLANNED, DONE, FAILED = 0, 1, 2
 
-#: Fewest and most runs of a shard, and the number of shards that a campaign has if its runs allow.
+#: Fewest and most runs per shard, and number of shards in a campaign if its runs allow.
 _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 
 #: Largest size of a shard in memory [bytes], by default.
 _MOST_BYTES = 2**29
 
-#: Memory of a byte of a shard: itself, and its chunk while that is written.
+#: Memory per byte of a shard: itself, and its chunk while that is written.
 BYTES_PER_BYTE = 2
 
-#: Most runs of a shard that is asked for, and of a chunk of an array of all runs.
+#: Most runs in a requested shard, and in a chunk of an array for all runs.
 LARGEST_SHARD = 10**6
 
-_INPUT = "_input"  # suffix of parameters of the scene that have the name of a variable
+_INPUT = "_input"  # suffix of scene parameters with the name of a variable
 
-#: Attributes that a store is read by, and that of their SHA-256.
+#: Attributes by which a store is read, and the attribute with their SHA-256.
 _SEALED, _SEAL = ("campaign", "flight", "scene", "record", "runs", "shard_size", "inputs", "variables"), "sha256"
 
-#: What zarr and its codecs raise for damaged files.
+#: Errors that zarr and its codecs raise for damaged files.
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, MemoryError)
 
-_WRITING = {"array.write_empty_chunks": True}  # of a store's arrays
+_WRITING = {"array.write_empty_chunks": True}  # for a store's arrays
 
 _STATUS = {**described("status"), "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
 
 
-#: Module and class of the renderer, by the kind of a store.
+#: Module and class of the renderer, by store kind.
 _RENDERERS = {
     "campaign": ("mitransient_lidar.campaigns.runs", "RunRenderer"),
     "flight": ("mitransient_lidar.flights.renderer", "FlightRenderer"),
@@ -74,15 +74,15 @@ _RENDERERS = {
 
 
 class Store:
-    """The store of a campaign or a flight.
+    """Store of a campaign or a flight.
 
-    Arrays of a run have the dimension ``run`` first, in chunks of one shard. A shard is written by one process: its
-    arrays, and last the ``status`` of its runs. Files replace former ones as a whole.
+    Run arrays have the dimension ``run`` first, in chunks of one shard. One process writes a shard: its arrays, and
+    last the ``status`` of its runs. Files replace former ones as a whole.
 
     Parameters
     ----------
     path
-        Folder of the store.
+        Store folder.
 
     Raises
     ------
@@ -99,21 +99,21 @@ class Store:
             with zarr.config.set(_WRITING):
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
-            #: What the store is of, and that as JSON.
+            #: The store's kind, and its plan as JSON.
             self.kind = "flight" if "flight" in self.attributes else "campaign"
             self.text = str(self.attributes[self.kind])
             module, name = _RENDERERS[self.kind]
             self._type: type[Renderer] = getattr(importlib.import_module(module), name)
             self._plan = self._type.plan_type.from_json(self.text)
-            #: Number of runs, and of runs of a shard.
+            #: Number of runs, and of runs per shard.
             self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
             self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, LARGEST_SHARD)
             self.variables = [str(name) for name in self.attributes["variables"]]
         except _DAMAGE as error:
-            raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
+            raise UserError(f"{path} is no store of a campaign or a flight, or is damaged") from error
         if self.attributes.get(_SEAL) != seal(self.attributes):
             reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
-            raise UserError(f"{path} cannot be used: {reason}.")
+            raise UserError(f"{path} cannot be used: {reason}")
         self._arrays: dict[str, zarr.Array[Any]] = {}
         self._check_arrays()
 
@@ -128,7 +128,7 @@ class Store:
         shard_size: int | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> Store:
-        """Make a store, for arrays like those of one run, with more attributes; nothing is left of it on a failure.
+        """Make a store, for arrays like one run's, with more attributes; nothing is left of it on a failure.
 
         Where another process has just made one, that one is returned.
 
@@ -157,13 +157,13 @@ class Store:
         except OSError as error:
             if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
                 return cls(path)
-            raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
+            raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
         return cls(path)
 
     def renderer(self) -> Any:
-        """Return the `Renderer` of the runs; warn if the store is of other versions."""
+        """Return the `Renderer` for the runs; warn if the store has other versions."""
         compare_versions(self.attributes)
         axis, scene = self.attributes["record"], SceneSource.from_attributes(self.attributes["scene"])
         return self._type(self._plan, scene, None if axis is None else TimeAxis(*axis))
@@ -180,7 +180,7 @@ class Store:
         scene: Callable[[], SceneSource],
         shard_size: int | None = None,
     ) -> Store:
-        """Return the store; raise `UserError` unless it is that of a plan.
+        """Return the store; raise `UserError` unless it belongs to a plan.
 
         Parameters
         ----------
@@ -189,9 +189,9 @@ class Store:
         columns
             Parameters of its runs, None where they follow from the plan.
         scene
-            Its scene as it is now.
+            Its current scene.
         shard_size
-            Number of runs of a shard, None for any.
+            Runs per shard, None for any.
         """
         own, source = self.inputs(slice(0, self.count)), SceneSource.from_attributes(self.attributes["scene"])
         if (
@@ -214,16 +214,16 @@ class Store:
         return {name: self._values(stored, runs) for name, stored in names.items()}
 
     def runs_of(self, shard: int) -> slice:
-        """Return the runs of a shard."""
+        """Return a shard's runs."""
         return slice(shard * self.shard_size, min((shard + 1) * self.shard_size, self.count))
 
     @property
     def shards(self) -> range:
-        """Numbers of the shards."""
+        """Shard numbers."""
         return range(-(-self.count // self.shard_size))
 
     def status(self, runs: slice = slice(None)) -> npt.NDArray[np.uint8]:
-        """Return the status of runs; those of a shard that has lost an array are planned."""
+        """Return the status of runs; runs in a shard that has lost an array are planned."""
         status = np.array(self.stored("status", runs))
         first = runs.start or 0
         for shard in np.unique((first + np.flatnonzero(status != PLANNED)) // self.shard_size):
@@ -237,7 +237,7 @@ class Store:
         return self._values("error", runs).astype(object)
 
     def read(self, shard: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[Any], dict[str, npt.NDArray[Any]]]:
-        """Return status, errors and arrays of a shard; all runs of one that cannot be read are planned."""
+        """Return a shard's status, errors and arrays; all runs in one that cannot be read are planned."""
         runs = self.runs_of(shard)
         names = ("error", *self.variables)
         try:
@@ -251,12 +251,12 @@ class Store:
         return status, _texts(arrays.pop("error")).astype(object), arrays
 
     def mend(self) -> None:
-        """Plan the runs of shards that are damaged or have lost an array again, and warn of them.
+        """Plan the runs in damaged shards, or shards that have lost an array, again; warn about them.
 
         Raises
         ------
         UserError
-            If an array of all runs is damaged, or the operating system reports an error.
+            If an array for all runs is damaged, or the operating system reports an error.
         """
         self.inputs(slice(0, self.count))
         for shard in self.shards:
@@ -273,23 +273,23 @@ class Store:
                     self.array("status")[runs] = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
 
     def _check_arrays(self) -> None:
-        """Raise `UserError` if an array has another shape than the attributes say, or one of all runs is lost."""
+        """Raise `UserError` if an array's shape contradicts the attributes, or an array for all runs is lost."""
         with _reading(self.path, "the list of its arrays"):
             names = list(self._group.array_keys())
         of_runs = ("status", "error", *self.variables)
         for name in sorted({*self.attributes.get("arrays", ()), "run"} - {*names, *of_runs}):
-            raise UserError(f"{self.path} is damaged: it has lost {name}.")
+            raise UserError(f"{self.path} is damaged: it has lost {name}")
         for name in {*names, *of_runs}:
             array = self.array(name)
             if name not in of_runs:
                 lost = [one for one in range(-(-[*array.shape, 1][0] // LARGEST_SHARD)) if not self._has(name, one)]
                 if lost and array.size:
-                    raise UserError(f"{self.path} is damaged: it has lost {name}.")
+                    raise UserError(f"{self.path} is damaged: it has lost {name}")
             elif array.shape[:1] != (self.count,) or array.chunks[:1] != (min(self.shard_size, self.count),):
-                raise UserError(f"{self.path} is damaged: {name} has the shape {array.shape}.")
+                raise UserError(f"{self.path} is damaged: {name} has the shape {array.shape}")
 
     def _has(self, name: str, chunk: int) -> bool:
-        """Return whether a chunk of an array is there."""
+        """Return whether an array's chunk exists."""
         array = self.array(name)
         key = array.metadata.encode_chunk_key((chunk, *[0] * (array.ndim - 1)) if array.ndim else ())
         return (self.path / name / key).is_file()
@@ -332,7 +332,7 @@ class Store:
             self.array("status")[runs] = status
 
     def _values(self, name: str, runs: slice) -> Column:
-        """Return values of runs."""
+        """Return values for runs."""
         values = self.stored(name, runs)
         return values if values.dtype.kind in "biuf" else _texts(values)
 
@@ -356,24 +356,24 @@ class Store:
 
 @contextlib.contextmanager
 def reporting_damage(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Convert the error of an array of `open_campaign` that is damaged to a `UserError`."""
+    """Convert the error by a damaged array in `open_campaign` to a `UserError`."""
     try:
         yield
     except ValueError as error:
         if "checksum" not in str(error):
             raise
-        raise UserError(f"{path} is damaged: the same command of the campaign renders what cannot be read.") from error
+        raise UserError(f"{path} is damaged: the same command of the campaign renders what cannot be read") from error
 
 
 @contextlib.contextmanager
 def _reading(path: str | os.PathLike[str], name: str) -> Iterator[None]:
-    """Convert what zarr raises for a damaged store to a `UserError`."""
+    """Convert zarr errors for a damaged store to a `UserError`."""
     try:
         yield
     except UserError:
         raise
     except _DAMAGE as error:
-        raise UserError(f"{path} is damaged: {name} cannot be read.") from error
+        raise UserError(f"{path} is damaged: {name} cannot be read") from error
 
 
 @contextlib.contextmanager
@@ -382,23 +382,23 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
+        raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Return the dataset of a campaign, whose arrays are read when they are needed.
+    """Return a campaign's dataset, whose arrays are read when they are needed.
 
-    Over ``run``: the parameters of the scene as coordinates; ``status`` (0 planned, 1 done, 2 failed), ``error`` (why a
-    run failed), ``error_median`` (relative standard error of the median bin) and ``passes``; then ``shot`` if runs have
-    several, the dimensions of the pixels, and those of each variable: what `campaigns.design.Campaign` keeps. All have
-    ``long_name``, and numbers ``units``, but for parameters whose names are not those of shipped scenes. Values of runs
-    that are not done are NaN, or 0 for integers. Runs of which the store has lost an array are planned; a damaged
-    array raises ``ValueError`` when it is read.
+    Over ``run``: the scene parameters as coordinates; ``status`` (0 planned, 1 done, 2 failed), ``error`` (why a run
+    failed), ``error_median`` (relative standard error of the median bin) and ``passes``; then ``shot`` if runs have
+    several, the pixel dimensions, and each variable's own: the contents that `campaigns.design.Campaign` keeps. All
+    have ``long_name``, and numbers ``units``, except parameters whose names shipped scenes lack. Values for unfinished
+    runs are NaN, or 0 for integers. Runs that have lost an array in the store are planned; a damaged array raises
+    ``ValueError`` when it is read.
 
     Raises
     ------
     UserError
-        If there is no store of a campaign, or its coordinates are damaged.
+        If there is no campaign store, or its coordinates are damaged.
     """
     store = Store(path)
     with _reading(path, "a coordinate"):
@@ -417,7 +417,7 @@ def _fill(
     size: int,
     attributes: Mapping[str, Any],
 ) -> None:
-    """Make the arrays of a store."""
+    """Make a store's arrays."""
     taken = {"run", "shot", "row", "column", "status", "error", *coordinates, *arrays}
     inputs = {name: f"{name}{_INPUT}" if name in taken else name for name in columns}
 
@@ -492,6 +492,6 @@ def _texts(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _shard_size(count: int, bytes_of_run: int) -> int:
-    """Return the number of runs of a shard."""
+    """Return the number of runs per shard."""
     size = int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
     return max(min(size, _MOST_BYTES // max(bytes_of_run, 1)), 1)

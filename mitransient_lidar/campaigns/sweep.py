@@ -41,11 +41,11 @@ _AHEAD = 4
 #: Shards with runs that could not be rendered after which the campaign ends.
 _MOST_LEFT = 8
 
-#: Runs that are tried until one of them shows the arrays of a store.
+#: Runs that are tried until one shows a store's arrays.
 _TRIALS = 8
 
 
-#: Options of campaigns and flights.
+#: Options for campaigns and flights.
 ProcessCount = Annotated[
     int | None, Option("Processes on this machine, by default one for each processor that may be used", 1, 1024)
 ]
@@ -56,7 +56,7 @@ Scheduler = Annotated[Any, Option("A running Dask scheduler instead, as tcp://ho
 def campaign(
     campaign: Annotated[
         Campaign | Mapping[str, Any] | str | os.PathLike[str],
-        Option("TOML file of a campaign, or the store of one to complete it", form="CAMPAIGN", is_argument=True),
+        Option("TOML file of a campaign, or its store to complete it", form="CAMPAIGN", is_argument=True),
     ],
     store: str | os.PathLike[str],
     *,
@@ -72,35 +72,35 @@ def campaign(
     retry_failed: Annotated[bool, Option("Render runs that have failed again")] = False,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render the runs of a campaign into a Zarr store, or those that an interrupted one has left.
+    """Render a campaign's runs into a Zarr store, or the runs that an interrupted one has left.
 
     Parameters
     ----------
     campaign
-        A TOML file, or a dict of its contents; see docs/guide/campaigns.md.
+        A TOML file, or a dict with its contents; see docs/guide/campaigns.md.
     store
-        Folder of the store. One that holds the same campaign is completed.
+        Store folder. A store with the same campaign is completed.
     scheduler
         Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
         the same versions of this package, Mitsuba, Dr.Jit, NumPy and Python, and the store at the same path.
     shard_size
-        Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
-        8 to 1024, and fewer where a shard would take more than half a gigabyte.
+        Runs per shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but 8
+        to 1024, and fewer where a shard would need more than half a gigabyte.
     progress
         Called with a `rendering.passes.Progress` about every second.
 
     Returns
     -------
     xarray.Dataset
-        The store, as of `campaigns.store.open_campaign`.
+        The store, as from `campaigns.store.open_campaign`.
 
     Raises
     ------
     UserError
-        If the campaign is invalid, the store holds another one, was begun by other versions or cannot be written, the
-        first runs all fail, the shards of all workers exceed the memory of this machine, the scheduler or one of its
-        workers cannot be reached, a worker has other versions, or runs could not be rendered for another reason than
-        their parameters, after the others.
+        If the campaign is invalid; the store contains another one, was begun by other versions or cannot be written;
+        the first runs all fail; the shards of all workers exceed this machine's memory; the scheduler or one of its
+        workers cannot be reached; a worker has other versions; or, after the others, runs could not be rendered for
+        another reason than their parameters.
     KeyboardInterrupt
         After Ctrl-C; processes write the runs that they have, which stay.
     """
@@ -115,16 +115,16 @@ def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
 
 
 def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
-    """Render one run of a campaign: all shots with everything that `render_shots` returns, the bits of the store.
+    """Render one campaign run: all shots with everything that `render_shots` returns, with the bits in the store.
 
     Parameters
     ----------
     campaign
-        Folder of a store, a TOML file, or a dict of its contents.
+        Store folder, a TOML file, or a dict with its contents.
     row
-        Number of the run.
+        Run number.
     options
-        Options of `render_shots` instead of those of the campaign.
+        Options of `render_shots` instead of the campaign's.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
 
 
 def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
-    """Return lines on a campaign: the numbers of its runs by status, and the most frequent reasons of failures."""
+    """Return lines on a campaign: the numbers of its runs by status, and the most frequent failure reasons."""
     store = Store(path)
     status = store.status()
     done, failures, planned = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED, PLANNED))
@@ -202,7 +202,7 @@ def complete(
     retry_failed: bool,
     progress: ProgressCallback | None,
 ) -> Store:
-    """Render what is missing in a store, and return it; options as for `sweep`."""
+    """Render the missing runs of a store, and return it; options as for `campaign`."""
     if workers is not None and scheduler is not None:
         raise UserError(f"workers = {workers} are of this machine, and the scheduler has its own: give one of both")
     number = usable_processors() if workers is None else integer("workers", workers, 1, 1024)
@@ -234,7 +234,7 @@ def complete(
 
 
 def _require_memory(store: Store, workers: int) -> None:
-    """Raise `UserError` if the shards of workers of this machine exceed its memory."""
+    """Raise `UserError` if the shards of workers on this machine exceed its memory."""
     bytes_of_shard = sum(one.dtype.itemsize * math.prod(one.chunks) for one in map(store.array, store.variables))
     what = f"shards of {store.shard_size} {store.unit}s, {workers} at a time,"
     require_memory(what, BYTES_PER_BYTE * workers * bytes_of_shard, "take fewer workers")
@@ -268,7 +268,7 @@ def _render(store: Store, shards: list[int], workers: Workers, tally: _Tally) ->
 
 
 class _Tally:
-    """Counts of the runs of a campaign, by shard; threads may call it."""
+    """Run counts in a campaign, by shard; threads may call it."""
 
     def __init__(self, store: Store, progress: ProgressCallback | None) -> None:
         self._store, self._progress = store, progress
@@ -290,7 +290,7 @@ class _Tally:
                 self._tell()
 
     def finish(self, shard: int, outcome: Outcome) -> None:
-        """Count the runs of a shard that is written."""
+        """Count the runs in a written shard."""
         with self._lock:
             self._finished.add(shard)
             self._shards[shard] = outcome.done, outcome.failed

@@ -25,7 +25,7 @@ FILES = "files of mitransient-lidar"
 
 
 def own_versions() -> dict[str, str]:
-    """Return the versions of this process by name, and the first digits of the SHA-256 of the package's files.
+    """Return this process's versions by name, and the first digits of the SHA-256 of the package's files.
 
     An installation from sources keeps its version while its files change.
     """
@@ -40,7 +40,7 @@ def own_versions() -> dict[str, str]:
 
 
 def difference(wanted: Mapping[str, str], found: Mapping[str, str]) -> str | None:
-    """Return in words what is found where another version is wanted, None where all are the same."""
+    """Return in words which version is found where another one is wanted, None where all are the same."""
     texts: list[str] = []
     for name, version in wanted.items():
         other = found.get(name, "unknown")
@@ -51,12 +51,12 @@ def difference(wanted: Mapping[str, str], found: Mapping[str, str]) -> str | Non
 
 
 def check_versions(store: Path, attributes: Mapping[str, Any]) -> None:
-    """Raise `UserError` if runs that are rendered now would not have the numbers of the versions that a store has.
+    """Raise `UserError` if current renders would give other numbers than the versions that a store has.
 
-    Files of the package that have changed since, as in a folder of sources, give a warning.
+    Package files that have changed since, as in a source folder, give a warning.
     """
     own = own_versions()
-    # Stores of version 0.2 have those of Mitsuba and Dr.Jit alone.
+    # Stores from version 0.2 state Mitsuba and Dr.Jit alone.
     first = {name: attributes.get(f"{name}_version", own[name]) for name in ("mitsuba", "drjit")}
     begun = attributes.get("versions", first)
     if differs := difference({**begun, FILES: own[FILES]}, own):

@@ -1,7 +1,7 @@
-"""Workers of a campaign, which render shards: threads of this process, or the workers of a Dask cluster.
+"""Campaign workers, which render shards: threads in this process, or the workers in a Dask cluster.
 
-Each shard is rendered in a process of its own on the machine of its worker. Threads need no connection, so that nothing
-listens on a port of this machine.
+Each shard is rendered in its own process on its worker's machine. Threads need no connection, so that nothing listens
+on a port on this machine.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ _LOST = "the scheduler was lost: what is written is kept, and the same command g
 #: Function that takes a shard and its numbers of runs done and failed.
 Tell = Callable[[int, int, int], None]
 
-#: Processes of the campaigns on this worker of a cluster.
+#: Campaign processes on this cluster worker.
 _PROCESSES: dict[str, Processes] = {}
 
 
 class Workers(Protocol):
-    """Workers that render shards of a store."""
+    """Workers that render a store's shards."""
 
     def count(self) -> int:
         """Return how many shards they render at a time; raise `UserError` for one that cannot be used."""
 
     def submit(self, shard: int) -> Future[Outcome | str]:
-        """Return the outcome of a shard when it is rendered, or the message of a `UserError`."""
+        """Return a shard's outcome when it is rendered, or a `UserError` message."""
 
 
 class _Threads:
-    """Threads of this process."""
+    """Threads in this process."""
 
     def __init__(self, number: int, path: str, retry_failed: bool, tell: Tell, processes: Processes) -> None:
         self._number, self._path, self._retry = number, path, retry_failed
@@ -64,7 +64,7 @@ class _Threads:
         return self._pool.submit(_outcome, self._path, shard, self._retry, self._tell, self._processes)
 
     def end(self) -> None:
-        """End the processes of shards, and then the threads."""
+        """End the shard processes, and then the threads."""
         try:
             self._processes.end()
         finally:
@@ -137,7 +137,7 @@ class _Cluster:
                     f"the scheduler cannot reach its worker at {address}: check its address and the firewall"
                 ) from answer
             else:
-                # Releases up to 0.2 do not know their versions.
+                # Releases up to 0.2 do not state their versions.
                 name = "mitransient-lidar"
                 found = self._client.run(importlib.metadata.version, name, workers=[address], on_error="return")
                 version, own = found.get(address), self._versions[name]
@@ -147,7 +147,7 @@ class _Cluster:
 
 @contextlib.contextmanager
 def on_this_machine(number: int, path: str, retry_failed: bool, tell: Tell) -> Iterator[Workers]:
-    """Yield workers of this machine; processes that render at the end of the context end with it."""
+    """Yield workers on this machine; processes that still render at the end of the context end with it."""
     workers = _Threads(number, path, retry_failed, tell, Processes(own_versions()))
     try:
         yield workers
@@ -157,7 +157,7 @@ def on_this_machine(number: int, path: str, retry_failed: bool, tell: Tell) -> I
 
 @contextlib.contextmanager
 def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Iterator[Workers]:
-    """Yield the workers of a Dask cluster; processes that render at the end of the context end with it.
+    """Yield the workers in a Dask cluster; processes that still render at the end of the context end with it.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Ite
             "the scheduler has no mitransient-lidar, or another version: it must have the same as its workers"
         ) from error
     except (CancelledError, OSError) as error:
-        # A connection that times out is an OSError, and so may be what a worker tells.
+        # A connection that times out is an OSError, and so may be a worker's own error.
         if client.status == "running" and not isinstance(error, (CancelledError, CommClosedError)):
             raise
         raise UserError(_LOST) from error
@@ -198,7 +198,7 @@ def connected(scheduler: Client | str) -> Iterator[Client]:
         yield scheduler
         return
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        # Dask tells of workers and connections that come and go.
+        # Dask reports workers and connections that come and go.
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
     class Connection(Client):  # type: ignore[misc]
@@ -207,7 +207,7 @@ def connected(scheduler: Client | str) -> Iterator[Client]:
         def __del__(self) -> None:
             pass
 
-    # Dask asserts what a scheduler answers, and that it closes: one that stops, and other servers, may answer anything.
+    # Dask asserts a scheduler's answers, and that it closes: one that stops, and other servers, may answer anything.
     try:
         client = Connection(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except Exception as error:
@@ -220,7 +220,7 @@ def connected(scheduler: Client | str) -> Iterator[Client]:
 
 
 def _task(path: str, shard: int, retry_failed: bool, topic: str, versions: Mapping[str, str]) -> Outcome | str:
-    """Render a shard on a worker of a cluster; return its outcome, or the message of a `UserError`.
+    """Render a shard on a cluster worker; return its outcome, or a `UserError` message.
 
     Dask would log the error itself with its traceback.
     """
@@ -237,12 +237,12 @@ def _task(path: str, shard: int, retry_failed: bool, topic: str, versions: Mappi
 
 
 def _end(topic: str) -> None:
-    """End the processes of a campaign on this worker."""
+    """End a campaign's processes on this worker."""
     _PROCESSES.setdefault(topic, Processes()).end()
 
 
 def _outcome(path: str, shard: int, retry_failed: bool, tell: Tell, processes: Processes) -> Outcome | str:
-    """Render a shard, tell its progress about every second, and return its outcome or the message of a `UserError`."""
+    """Render a shard, report its progress about every second, and return its outcome or a `UserError` message."""
     last = time.monotonic()
 
     def report(done: int, failed: int) -> None:

@@ -28,7 +28,7 @@ def _record(
     call: Call,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: a shot, a series, or gates.")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
+        Path | None, typer.Option("-o", "--output", help="NetCDF file to write, by default FILE_recorded.nc.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -66,13 +66,13 @@ def _echoes(
         str | None,
         typer.Option(
             metavar="FILE",
-            help="Subtract the mean errors of a table of depth-bias from the depths; auto for the shipped one of the "
+            help="Subtract the mean errors in a depth-bias table from the depths; auto for the shipped table of the "
             "result's instrument.",
         ),
     ] = None,
     wind_speed: Annotated[
         float | None,
-        typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
+        typer.Option(help="Wind speed for the corrections [m/s] (at least 0), by default the scene's."),
     ] = None,
     waveforms: Waveforms = None,
     channel: Channel = None,
@@ -83,11 +83,11 @@ def _echoes(
     if output is not None:
         check_suffix("--csv", output, ".csv")
     elif not table:
-        raise UserError("--no-table leaves nothing to do: give --csv OUT as well.")
+        raise UserError("--no-table leaves nothing to do: give --csv OUT as well")
     if correct is not None and mean_surface:
-        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
+        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes")
     if wind_speed is not None and correct is None:
-        raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
+        raise UserError(f"--wind-speed {wind_speed:g} needs --correct")
     from mitransient_lidar import results
     from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
     from mitransient_lidar.results.waveform_files import waveform_chunks
@@ -125,7 +125,7 @@ def _retrieve(
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
+        Path | None, typer.Option(help="PNG, PDF or SVG file for a series: estimates against the truth.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -138,7 +138,7 @@ def _retrieve(
 
     dataset = results.dataset_of("FILE", file, "result")
     if figure is not None and "true_slope_along" not in dataset.coords:
-        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
+        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none")
     found = call(dataset)
     name_subject(file, dataset.attrs, quiet)
     typer.echo("\n".join(describe_retrieval(found)))
@@ -198,9 +198,9 @@ COMMANDS = {
         """Record the waveforms of a result with a receiver, or its gates with a camera.
 
         Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
-        is saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
-        gain or the filter is chosen so that nothing is saturated. Of a camera they are the digital numbers of frames,
-        with mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
+        is saturated. With a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
+        gain or the filter is chosen so that nothing saturates. A camera gives the digital numbers of frames, with the
+        mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
         """,
     ),
     "echoes": Command(
@@ -210,7 +210,7 @@ COMMANDS = {
         """Measure the echoes in the waveforms of a result.
 
         Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
-        are those by noise, of depths also by the method.
+        include noise, and for depths the method, too.
         """,
         defaults={"estimators": None},
     ),
@@ -221,20 +221,20 @@ COMMANDS = {
         """Retrieve slopes, bottom and water from a result.
 
         Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
-        FILE; of a series, those of each shot beside the truth.
+        FILE; for a series, those of each shot beside the truth.
         """,
     ),
     "fit": Command(
         "Analyse results",
         "studies.fit:fit",
         _fit,
-        """Fit parameters of a scene to waveforms.
+        """Fit scene parameters to waveforms.
 
         Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc
-        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit whose chi-squared exceeds 5 times
-        the expected one is refused, or, where the noise is unknown, one that leaves 10 % of the squares of the samples:
-        it is printed and written with exit code 1. Ctrl-C ends the fit at its last step, which it prints and writes
-        (exit code 130).
+        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit is refused if its chi-squared
+        exceeds 5 times the expected one, or, with unknown noise, if it leaves 10 % of the samples' sum of squares.
+        Refused fits are printed and written with exit code 1. Ctrl-C ends the fit at its last step, which is printed
+        and written (exit code 130).
         """,
     ),
 }

@@ -1,8 +1,8 @@
 """The command line ``mitransient-lidar``.
 
-Invalid input ends a command with one sentence on stderr and exit code 2, Ctrl-C with exit code 130, SIGTERM with 143
-and SIGHUP with 129; 1 is a comparison that finds a difference, or failed runs. Results go to stdout, everything else to
-stderr. Commands import what they need when they run, so that help appears at once.
+Invalid input ends a command with one sentence on stderr and exit code 2. Ctrl-C gives exit code 130, SIGTERM 143 and
+SIGHUP 129; 1 means a comparison that finds a difference, or failed runs. Results go to stdout, everything else to
+stderr. Commands import modules when they run, so that help appears at once.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ COMMANDS: dict[str, Command] = {
 }
 
 
-#: Arguments of an example in the help of each command.
+#: Example arguments in each command's help.
 EXAMPLES = {
     "render": "table1 -D wind_speed=5 --target-error 0.05",
     "shots": "table1 --count 20 --passes 4 -o output/shots.nc",
@@ -72,7 +72,7 @@ EXAMPLES = {
 }
 
 
-#: Error of the parser of options, of the release of Click that Typer uses.
+#: Error of the option parser in Typer's release of Click.
 _UsageError: Any = typer.BadParameter.__base__
 
 
@@ -80,7 +80,7 @@ class _GroupedCommands(TyperGroup):
     """A command whose help lists the subcommands under headings, and whose usage errors are one sentence."""
 
     def get_command(self, ctx: Any, name: str) -> Any:
-        """Return a command; refuse a former name of one."""
+        """Return a command; refuse a former name."""
         if name in self.former:
             raise UserError(f"the command {name} is now {self.former[name]}")
         return super().get_command(ctx, name)
@@ -103,7 +103,7 @@ class _GroupedCommands(TyperGroup):
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
-        """Parse the options of the subcommand, and run it."""
+        """Parse the subcommand's options, and run it."""
         # One context alone: the exit code of a signal is known to the one that handles it.
         with _short_usage_errors():
             return super().invoke(ctx)
@@ -120,7 +120,7 @@ class _GroupedCommands(TyperGroup):
 
 
 class _SceneCommands(_GroupedCommands):
-    """The commands of scenes."""
+    """The scene commands."""
 
     commands_of, former = scenes.SCENES, {}
 
@@ -138,8 +138,8 @@ def _short_usage_errors() -> Iterator[None]:
 
 
 def _usage_sentence(error: Any) -> str:
-    """Return one sentence with the option, its value and what is allowed."""
-    details = getattr(error.__cause__, "errors", None)  # of Pydantic, which leaves out the value
+    """Return one sentence with the option, its value and the allowed values."""
+    details = getattr(error.__cause__, "errors", None)  # by Pydantic, which leaves out the value
     command = getattr(error.ctx, "command_path", "mitransient-lidar")
     if details is None or error.param is None:
         return f"{' '.join(error.format_message().split()).rstrip('.')}; see {command} --help."
@@ -172,10 +172,10 @@ def main() -> None:
 
 
 def _run() -> None:
-    """Run the command of the arguments."""
+    """Run the command that the arguments name."""
     # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
     os.environ["MPLBACKEND"] = "agg"
-    # Rasterio says it of a GeoTIFF that is then refused.
+    # Rasterio warns about a GeoTIFF that is then refused.
     warnings.filterwarnings("ignore", "Dataset has no geotransform")
     if sys.argv[1:2] not in (["campaign"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
         # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it. An

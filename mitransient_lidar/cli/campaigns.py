@@ -1,4 +1,4 @@
-"""Commands of many renders: campaigns, flights, and the figures of the publication."""
+"""Commands with many renders: campaigns, flights, and the published figures."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ def _campaign(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="Zarr store, by default beside the campaign; with --row .nc, with --show a figure."
+            "-o",
+            "--output",
+            help="Zarr store, by default beside the campaign; a NetCDF file with --row, a figure with --show.",
         ),
     ] = None,
     row: Annotated[
-        int | None, typer.Option(help="Render the run of this number alone, from 0, to a NetCDF file.")
+        int | None, typer.Option(help="Render only the run with this number, from 0, to a NetCDF file.")
     ] = None,
     show: Annotated[
-        bool, typer.Option("--show", help="Draw a sample of a store, its distributions and responses.")
+        bool, typer.Option("--show", help="Draw a sample of the store, its distributions and responses.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -38,7 +40,7 @@ def _campaign(
     given = {name: call.arguments[name] for name in ("workers", "scheduler")} | {"row": row, "show": show or None}
     used = [f"--{name}" for name, value in given.items() if value is not None]
     if len(used) > 1:
-        raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them.")
+        raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them")
     if row is not None:
         _render_row(call, campaign, row, output or campaign.with_name(f"{campaign.stem}_row{row}.nc"))
         return
@@ -94,7 +96,7 @@ def _fly(
     call: Call,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; output/FLIGHT by default."),
+        typer.Option("-o", "--output", metavar="DIR", help="Folder for the files, by default output/FLIGHT."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -118,7 +120,7 @@ def _fly(
 
 
 def _is_of_a_flight(path: Path) -> bool:
-    """Return whether a command has written a file of points, waveforms or pictures of a flight."""
+    """Return whether a command has written a flight's points, waveforms or pictures."""
     from mitransient_lidar.flights.las_header import is_simulated
 
     return (read_mark(path) or {}).get("command") == "fly" or is_simulated(path)
@@ -142,7 +144,7 @@ def _figures(
         typer.echo(line)
     if made.interrupted:
         done = max(len(made.files) - 1, 0)
-        raise KeyboardInterrupt(f"interrupted after {done} of {len(chosen)} figures, which are kept.")
+        raise KeyboardInterrupt(f"interrupted after {done} of {len(chosen)} figures, which are kept")
 
 
 COMMANDS = {
@@ -152,7 +154,7 @@ COMMANDS = {
         _campaign,
         """Render a campaign of many runs.
 
-        Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one
+        Each run has its own values of scene parameters. Runs use this machine's cores or a Dask cluster, and fill one
         Zarr store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
         docs/guide/campaigns.md describes the file.
         """,
@@ -163,8 +165,8 @@ COMMANDS = {
         _fly,
         """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
 
-        Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and
-        prints the errors of the points' heights against the truth [cm]. After an interruption, the same command goes
+        Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr with all pulses.
+        Prints the points' height errors against the truth [cm]. After an interruption, the same command goes
         on. Failed pulses end it with exit code 1. docs/guide/flights.md describes the file.
         """,
     ),
@@ -177,8 +179,8 @@ FIGURES = {
         _figures,
         """Make the figures of the published model again.
 
-        Writes a PNG file for each figure, and a table of the publication's statements with our numbers, their errors,
-        and whether they hold.
+        Writes a PNG file for each figure, and a table of the publication's statements with computed numbers, their
+        errors, and whether they hold.
         """,
     )
 }

@@ -1,4 +1,4 @@
-"""Output files of the commands: checks before a render, figures with their data, and files of gate stacks."""
+"""Output files of the commands: checks before a render, figures with their data, and gate stack files."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def check_targets(folder: Path, targets: list[Path], source: str = "", option: s
         with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
-        raise UserError(f"cannot write to folder {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot write to folder {folder}: {error.strerror}") from error
     for target in targets:
         if target.is_dir():
-            raise UserError(f"cannot write {target}: it is a folder.")
+            raise UserError(f"cannot write {target}: it is a folder")
         if source and target.exists() and Path(source).exists() and target.samefile(source):
             raise UserError(f"{source} would be overwritten with its repetition: choose another place with -o")
     check_kept(targets, option)
 
 
 def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
-    """Return name and text of a scene, or of that of a result of a command and then its attributes."""
+    """Return a scene's name and text; for a result its scene's, and its attributes. Refuse another command's result."""
     from mitransient_lidar.loading.catalogue import scene_path, scene_text
     from mitransient_lidar.loading.scene_source import SceneSource
     from mitransient_lidar.rendering import again
@@ -61,7 +61,7 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
 
 
 def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
-    """Check that a figure can be written, and files of its data beside it, of other suffixes."""
+    """Check that a figure can be written, and its data files beside it, with other suffixes."""
     if path is None:
         return
     from mitransient_lidar.plots.drawing import check_format
@@ -73,7 +73,7 @@ def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
 def check_suffix(option: str, path: Path, suffix: str) -> None:
     """Check that a file can be written and that its name ends with a suffix."""
     if path.suffix.lower() != suffix:
-        raise UserError(f"{option} {path} must end in {suffix}.")
+        raise UserError(f"{option} {path} must end in {suffix}")
     check_targets(path.parent, [path], option="-o" if option == "--output" else option)
 
 
@@ -109,7 +109,7 @@ PAGE_MB = 200.0
 
 @dataclass(frozen=True)
 class GateFiles:
-    """Files of a gate stack in a folder, with the beginning of their names.
+    """Files of a gate stack in a folder, with the stem of their names.
 
     Kinds in addition to the EXR stack: ``drawings`` (of gates and depths), ``sequence``, ``tiff``, ``images`` (PNG),
     ``gif``, ``mp4``, ``html``.
@@ -121,7 +121,7 @@ class GateFiles:
 
     @classmethod
     def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
-        """Return the files of a gate stack, given the options for the kinds of file; refuse a movie without ffmpeg."""
+        """Return a gate stack's files, given the file kind options; refuse a movie without ffmpeg."""
         if wanted.get("mp4"):
             from mitransient_lidar.plots.gates.images import find_ffmpeg
 
@@ -137,14 +137,14 @@ class GateFiles:
         check_targets(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
-        """Return the paths of the files, without those of a sequence."""
+        """Return the file paths, without sequence files."""
         endings = ["_gates.exr", *(["_gates.png", "_depth.png"] if "drawings" in self.wanted else [])]
         endings += [f"_gates.{kind}" for kind in ("gif", "mp4", "html") if kind in self.wanted]
         endings += ["_gates.tif"] * ("tiff" in self.wanted)
         return [self.folder / f"{self.stem}{ending}" for ending in endings]
 
     def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
-        """Write the files and print their paths; `result` provides the waveforms of the page."""
+        """Write the files and print their paths; `result` provides the waveforms for the page."""
         from mitransient_lidar import results
         from mitransient_lidar.plots.gates import images
         from mitransient_lidar.plots.viewer import view
@@ -188,4 +188,4 @@ def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:
         raise
     except UserError as error:
         if not quiet:
-            typer.echo(f"no drawing of depths: {error}", err=True)
+            typer.echo(f"no depth drawing: {error}", err=True)

@@ -24,17 +24,17 @@ def _gates(
         Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result, a gate stack or frames of a camera.")
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder for the files; by default that of STACK.")
+        Path | None, typer.Option("-o", "--output", help="Folder for the files, by default the folder of STACK.")
     ] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw all gates, and the depths seen in them.")] = True,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
     ] = False,
     tiff: Annotated[
-        bool, typer.Option("--tiff", help="Also write a TIFF file of 16 bits, a page for each frame and gate.")
+        bool, typer.Option("--tiff", help="Also write a 16-bit TIFF file, one page per frame and gate.")
     ] = False,
     images: Annotated[
-        bool, typer.Option("--images", help="Also write numbered PNG files of 16 bits, one for each frame and gate.")
+        bool, typer.Option("--images", help="Also write numbered 16-bit PNG files, one per frame and gate.")
     ] = False,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
     mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie, by ffmpeg.")] = False,
@@ -74,7 +74,7 @@ def _gates(
         if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
                 raise UserError(
-                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins."
+                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins"
                 )
             cut = result
         else:
@@ -100,9 +100,9 @@ COMMANDS = {
         _gates,
         """Cut gates from a result.
 
-        Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths; <stack>_cut_gates.exr and so on
-        of a STACK that has gates already. Without a start, the gates that it has, or the frames of a camera, are
-        written and drawn. TIFF and PNG images have the digital numbers of frames, or energies from 0 to 65535.
+        Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. A STACK with gates gives
+        <stack>_cut_gates.exr and so on. Without a start, its own gates or camera frames are written and drawn. TIFF
+        and PNG images contain the digital numbers of frames, or energies from 0 to 65535.
         """,
     ),
 }

@@ -1,4 +1,4 @@
-"""Commands made of the signatures of public functions, whose modules are imported when a command is used."""
+"""Commands made from the signatures of public functions, whose modules are imported when a command is used."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mitransient_lidar.cli.overwriting import keeping
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, declared
 
-#: Readers of texts, by their forms; those of options that are given once, and those of options that are repeated.
+#: Text readers by form, for options that are given once and for repeated options.
 _ONCE: dict[str, Callable[[str, str], Any]] = {
     "N,N,...": numbers,
     "NAME,NAME,...": names,
@@ -52,7 +52,7 @@ _PLAIN = (float, int, bool, Path, str)
 
 
 def function_at(place: str) -> Callable[..., Any]:
-    """Return the function at ``module:name`` of the package as it is now, and import its module for that."""
+    """Return the package's current function at ``module:name``, importing its module."""
     module, _, name = place.partition(":")
     found: Callable[..., Any] = getattr(importlib.import_module(f"mitransient_lidar.{module}"), name)
     return found
@@ -89,9 +89,9 @@ class Call:
 
 @dataclass(frozen=True)
 class Command:
-    """One command: heading and text of its help, public function as ``module:name``, and what is done with it.
+    """One command: help heading and text, public function as ``module:name``, and a body that uses its result.
 
-    `body` takes the `Call`, then options of the command itself, such as the output. `defaults` are those of the command
+    `body` takes the `Call`, then the command's own options, such as the output. `defaults` are the command's defaults
     where they differ from the function's. Without a function, `body` takes its own options alone.
     """
 
@@ -128,7 +128,7 @@ class Command:
 
 
 def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Parameter]) -> Callable[..., None]:
-    """Return a function as Typer takes it, that keeps files of others and is silent where it is asked to be."""
+    """Return a function for Typer that keeps other files and can be silent."""
     listed = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in listed]
     run.__name__, run.__annotations__ = name.replace("-", "_"), {}
     run.__signature__ = inspect.Signature(listed)  # type: ignore[attr-defined]
@@ -171,7 +171,7 @@ class LazyCommand(TyperCommand):
 
 
 def flag(name: str, option: Option) -> str:
-    """Return the name of an option."""
+    """Return an option's name."""
     return option.flag or f"--{name.replace('_', '-')}"
 
 
@@ -212,7 +212,7 @@ def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
 
 
 def _read(option: Option, name: str, given: Any, default: Any) -> Any:
-    """Return an argument of the function, from what Typer has read."""
+    """Return a function argument from Typer's value."""
     if given is None or given == []:
         return None if default is inspect.Parameter.empty else default
     if option.form in _ONCE:

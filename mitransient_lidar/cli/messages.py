@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
 _FAILED, _INVALID_INPUT = 1, 2  # exit codes
 _MOST_PIXELS = 12  # listed in the summary
-_REPORT_S = 15.0  # between two lines of progress
+_REPORT_S = 15.0  # between two progress lines
 
 
 class _PrintableStream:
-    """Text stream that writes only what is `printable`, and lines; `unfiltered` is the stream behind it."""
+    """Text stream that writes only `printable` text and line ends; `unfiltered` is the stream behind it."""
 
     def __init__(self, stream: Any) -> None:
         self.unfiltered = stream
 
     def write(self, text: str) -> int:
-        """Write a text, with escapes for what the encoding of the stream does not have."""
+        """Write a text, with escapes for characters that the stream's encoding lacks."""
         encoding = self.unfiltered.encoding or "utf-8"
         shown = printable(text, kept=LINES).encode(encoding, "backslashreplace").decode(encoding)
         return int(self.unfiltered.write(shown))
@@ -62,10 +62,10 @@ def printable_streams() -> Iterator[None]:
 
 
 class _PrintableLog(logging.Formatter):
-    """Format of log messages without control characters."""
+    """Log format without control characters."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the message of a record."""
+        """Return a record's message."""
         return printable(super().format(record), kept=LINES)
 
 
@@ -97,7 +97,7 @@ def exit_on_error() -> Iterator[None]:
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit as after an interruption if one ended the render of a result, a series of shots or frames, or a fit."""
+    """Exit as interrupted if an interruption ended the render of a result, series or frames, or a fit."""
     if dataset.attrs.get("interrupted"):
         if "shot" in dataset.dims:
             done = f"{dataset.sizes['shot']} of the shots"
@@ -107,11 +107,11 @@ def exit_if_interrupted(dataset: xr.Dataset) -> None:
             done = f"{dataset.attrs['renders']} renders, before the fit has converged"
         else:
             done = f"{dataset.attrs['passes']} passes"
-        raise KeyboardInterrupt(f"interrupted after {done}; their result is kept.")
+        raise KeyboardInterrupt(f"interrupted after {done}; their result is kept")
 
 
 def exit_if_failed(path: Path) -> None:
-    """Exit with code 1 and a sentence if runs of a campaign or shots of a flight have failed."""
+    """Exit with code 1 and a sentence if campaign runs or flight shots have failed."""
     import numpy as np
 
     from mitransient_lidar.campaigns.store import FAILED, Store
@@ -125,7 +125,7 @@ def exit_if_failed(path: Path) -> None:
 
 
 def name_subject(file: Path, attributes: Mapping[Hashable, Any], quiet: bool = False) -> None:
-    """Print on stderr what a command works on: a file, and scene, instrument and integrator of the result in it."""
+    """Print a command's subject on stderr: a file, and the scene, instrument and integrator of its result."""
     found = {name: str(attributes.get(name, "")) for name in ("scene", "instrument", "integrator")}
     found["scene"] = Path(found["scene"]).stem
     named = ", ".join(f"{name} {value}" for name, value in found.items() if value)
@@ -135,7 +135,7 @@ def name_subject(file: Path, attributes: Mapping[Hashable, Any], quiet: bool = F
 
 @contextlib.contextmanager
 def _logging(handler: logging.Handler, level: int, *, propagate: bool) -> Iterator[None]:
-    """Give log messages of the package to a handler, and to those of the root logger if `propagate`."""
+    """Send the package's log messages to a handler, and to the root logger's handlers if `propagate`."""
     logger = logging.getLogger("mitransient_lidar")
     before = logger.level, logger.propagate
     logger.addHandler(handler)
@@ -187,7 +187,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
             with _lines_of_progress() as show_line:
                 yield show_line
             return
-        # Rich would write what others print, with its control characters.
+        # Rich would write other output, with its control characters.
         bar = ProgressBar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
         with bar:
             task = bar.add_task("preparing", total=None)

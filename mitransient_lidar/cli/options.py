@@ -1,4 +1,4 @@
-"""Arguments and options of several commands, and their conversion."""
+"""Arguments and options that commands share, and their conversion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, number_list
 
 Define = Annotated[
-    list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
+    list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable.")
 ]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
-#: Default folder of the files that a command renders.
+#: Default folder for rendered files.
 OUTPUT = Path("output")
 #: Options of commands that read full-waveform files of lidars (`waveform_selection`).
 Waveforms = Annotated[
@@ -48,7 +48,7 @@ def parameters(definitions: list[str] | None) -> dict[str, str]:
     for definition in definitions or []:
         name, equals, value = definition.partition("=")
         if not (name.strip() and equals):
-            raise UserError(f"-D {definition} is not of the form name=value.")
+            raise UserError(f"-D {definition} is not of the form name=value")
         params[name.strip()] = value.strip()
     return params
 
@@ -98,7 +98,7 @@ def number_or_auto(option: str, text: str) -> float | str:
     try:
         return text if text == "auto" else finite(option, text)
     except UserError:
-        raise UserError(f"{option} {text} must be a number or auto.") from None
+        raise UserError(f"{option} {text} must be a number or auto") from None
 
 
 def name_and_value(option: str, text: str) -> tuple[str, float]:
@@ -112,7 +112,7 @@ def limits(option: str, text: str) -> tuple[str, tuple[float, float]]:
     name, value = _parted(option, text, "name=low:high")
     ends = value.split(":")
     if len(ends) != 2:
-        raise UserError(f"{option} {text} is not of the form name=low:high.")
+        raise UserError(f"{option} {text} is not of the form name=low:high")
     return name, (finite(f"{option} {name}", ends[0]), finite(f"{option} {name}", ends[1]))
 
 
@@ -134,5 +134,5 @@ def name_and_deviation(option: str, text: str) -> tuple[str, float]:
 def _parted(option: str, text: str, form: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not (name.strip() and equals and value.strip()):
-        raise UserError(f"{option} {text} is not of the form {form}.")
+        raise UserError(f"{option} {text} is not of the form {form}")
     return name.strip(), value.strip()

@@ -1,4 +1,4 @@
-"""Which existing files a command may replace: earlier ones of its own, of the same scene and instrument.
+"""Which existing files a command may replace: its own earlier files for the same scene and instrument.
 
 Every file that a command writes gets a mark (`core.marks`) with the command, its scene, instrument and options.
 """
@@ -36,7 +36,7 @@ Overwrite = Annotated[
 #: A file that took longer to make is kept [s].
 _LONG_S = 60.0
 
-#: Arguments that are results, whose scene and instrument count, and others that say what a command is about.
+#: Arguments that are results, whose scene and instrument count, and other arguments that name a command's subject.
 _RESULTS = ("file", "stack", "first", "second")
 _PLACES, _NAMES = ("scene", "campaign", "flight"), ("instrument", "kind")
 
@@ -78,7 +78,7 @@ def check_kept(targets: Iterable[Path], option: str = "-o") -> None:
         for target in targets:
             if reason := running.objection(target):
                 ways = f"choose another place with {option}, or replace it with --overwrite"
-                raise UserError(f"{target} is kept, since {reason}: {ways}.")
+                raise UserError(f"{target} is kept, since {reason}: {ways}")
 
 
 def replace_freely(targets: Iterable[Path]) -> None:
@@ -95,7 +95,7 @@ def draws_again(file: Path) -> None:
 
 
 class _Running:
-    """A command that runs: what its files are marked with, and which files it may replace."""
+    """A running command: the marks of its files, and the files that it may replace."""
 
     def __init__(self, command: str, options: Mapping[str, Any], overwrite: bool) -> None:
         self._given, self._overwrite, self._began = options, overwrite, time.perf_counter()
@@ -134,7 +134,7 @@ class _Running:
         return found
 
     def _read_parameters(self) -> dict[str, str]:
-        """Return the parameters of the scene, with defaults."""
+        """Return the scene parameters, with defaults."""
         known: dict[str, str] = {}
         scene = self._given.get("scene")
         if scene is not None and _is_result(scene):
@@ -166,7 +166,7 @@ class _Running:
         return None
 
     def _mark_of(self, path: Path) -> dict[str, Any] | None:
-        """Return the mark of a file, or that of the file beside it that vouches for it; None for other files."""
+        """Return a file's mark, or the mark in the neighbouring file that vouches for it; None for other files."""
         if (former := _mark_of_result(path)) is None:
             vouching = [one for one in self._former.values() if path.name in one["beside"]]
             return next((one for one in vouching if one["beside"][path.name] == _digest(path)), None)
@@ -182,7 +182,7 @@ class _Running:
         }
 
     def settle(self, moves: Moves) -> Moves:
-        """Mark complete files, say what they replace, and return their destinations.
+        """Mark complete files, report replaced ones, and return their destinations.
 
         A file that must be kept, and was not there when the command began, keeps its name; the new one gets another.
         """
@@ -202,12 +202,12 @@ class _Running:
                 try:
                     write_mark(temporary, {**mark, "subject": self._relative_subject(path), "beside": plain})
                 except OSError as error:
-                    raise WriteError(f"cannot write {path}: {error.strerror}.") from error
+                    raise WriteError(f"cannot write {path}: {error.strerror}") from error
         self.written.update(path for _, path in settled)
         return settled
 
     def _announce(self, paths: list[Path]) -> None:
-        """Print which files are replaced, and what differs."""
+        """Print which files are replaced, and the differences."""
         replaced = sorted(
             (path for path in paths if path not in self.written and os.path.lexists(path)),
             key=lambda path: path.suffix.lower() != ".nc",
@@ -221,12 +221,12 @@ class _Running:
         _tell(f"replaces {first}{more}: {reasons[first] or self._differences(former[first])}")
 
     def _differences(self, former: Mapping[str, Any] | None) -> str:
-        """Return the parameters and options that differ from those of a former file."""
+        """Return the parameters and options that differ from a former file's."""
         found: list[str] = []
         former = former or {"parameters": None, "options": None}
         for kind in ("parameters", "options"):
             before, now = former[kind], self.mark[kind]
-            # Attributes of earlier releases tell no options.
+            # Attributes from earlier releases contain no options.
             names = [name for name in {**now, **(before or now)} if before and before.get(name) != now.get(name)]
             found += [f"{_text(name)} {_text(before.get(name))} -> {_text(now.get(name))}" for name in names]
         if len(found) > _MOST_DIFFERENCES:
@@ -241,7 +241,7 @@ def _tell(text: str) -> None:
 
 
 def _subject_of_file(path: Path) -> dict[str, str | Path]:
-    """Return scene and instrument of a result; of another file its own name."""
+    """Return a result's scene and instrument; another file's own name."""
     if (mark := _mark_of_result(path)) is None:
         return {"scene": path.stem, "scene_file": path.resolve()}
     return {
@@ -251,7 +251,7 @@ def _subject_of_file(path: Path) -> dict[str, str | Path]:
 
 
 def _mark_of_result(path: Path) -> dict[str, Any] | None:
-    """Return the mark of a file, or what the attributes of a result of an earlier release or a script tell."""
+    """Return a file's mark, or the attributes of a result from an earlier release or a script."""
     types = {"command": str, "subject": dict, "parameters": dict, "options": dict, "beside": dict, "elapsed_s": float}
     mark = read_mark(path)
     if mark is not None and all(isinstance(mark.get(name), kind) for name, kind in types.items()):
@@ -263,7 +263,7 @@ def _mark_of_result(path: Path) -> dict[str, Any] | None:
 
     try:
         if path.suffix.lower() == ".nc" and not netcdf.check_sum(path):
-            return None  # of another program, which may have kept the attributes
+            return None  # from another program, which may have kept the attributes
         attributes = again.read_attributes(path)
         command = again.result_kind(attributes)
     except UserError:
@@ -307,14 +307,14 @@ def _free_name(path: Path) -> Path:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value of an option in types of JSON."""
+    """Return an option's value as JSON types."""
     if isinstance(value, (list, tuple)):
         return [_plain(one) for one in value]
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def _text(value: Any) -> str:
-    """Return a value of a mark for a message."""
+    """Return a mark's value for a message."""
     if value is None:
         return "default"
     return shown(value).strip("'\"")

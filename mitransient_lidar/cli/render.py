@@ -34,8 +34,8 @@ def _render(
     call: Call,
     output: Folder = OUTPUT,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
-    gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates, by ffmpeg.")] = False,
+    gif: Annotated[bool, typer.Option("--gif", help="Also write a gate animation.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a gate movie, by ffmpeg.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -44,7 +44,7 @@ def _render(
     name, text, _ = scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in text:
-        raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
+        raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     targets += [output / f"{name}_components.png"] if plot and call.arguments["components"] else []
     targets += [output / f"{name}_derivatives.png"] if plot and call.arguments["derivatives"] else []
@@ -65,7 +65,7 @@ def _render(
     exit_if_interrupted(dataset)
 
 
-#: Functions that draw a result, by the ends of the names of their files.
+#: Functions that draw a result, by their file name endings.
 _DRAWINGS = {
     "_components": "plots.waveforms:plot_components",
     "_derivatives": "plots.derivatives:plot_derivatives",
@@ -75,7 +75,7 @@ _DRAWINGS = {
 
 
 def _write(dataset: xr.Dataset, target: Path) -> None:
-    """Write a result or a figure of it, except EXR files beyond the memory, and a layout of pixels beside the sea."""
+    """Write a result or its figure, but no EXR file beyond the memory, and no layout of pixels that miss the sea."""
     from mitransient_lidar import results
 
     dispensable = {".exr": "EXR file"}.get(target.suffix, "drawing of the pixels" * target.stem.endswith("_layout"))
@@ -144,7 +144,7 @@ def _passive(
     if not quiet:
         typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
         if "background_power" in image:
-            typer.echo(f"mean power of a pixel: {float(image['background_power'].mean()):.4g} W")
+            typer.echo(f"mean power per pixel: {float(image['background_power'].mean()):.4g} W")
     exit_if_interrupted(image)
 
 
@@ -152,9 +152,9 @@ def _shots(
     call: Call,
     places: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="CSV file of places, columns x and y [m], instead of random ones."),
+        typer.Option(metavar="FILE", help="CSV file with shot locations, columns x and y [m], instead of random ones."),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = OUTPUT / "shots.nc",
+    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file for all shots.")] = OUTPUT / "shots.nc",
     figure: Annotated[
         Path | None,
         typer.Option(help="PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc."),
@@ -164,11 +164,11 @@ def _shots(
     """Render a series, and write it."""
     scene, given = call.arguments["scene"], call.arguments
     if given["positions"] and places is not None:
-        raise UserError("--at and --places are alternatives: give one of them.")
+        raise UserError("--at and --places are alternatives: give one of them")
     check_suffix("--output", output, ".nc")
     check_figure(figure, ".nc", option="--figure")
     if figure is not None and figure.with_suffix(".nc") == output:
-        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name.")
+        raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name")
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
@@ -182,9 +182,9 @@ def _shots(
     if is_result(scene):
         own = {name: given[name] for name in ("count", "positions", "move_target", "seed")}
         if where := [call.flags[name].lstrip("-") for name, value in own.items() if value]:
-            raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}.")
+            raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}")
         if given["instrument"] is not None:
-            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument.")
+            raise UserError(f"{scene} has the lidar that it was rendered with: leave out --instrument")
     else:
         given = {"count": 20, **{name: value for name, value in given.items() if value is not None}}
     with DeferredInterrupt(at_once=False):
@@ -205,7 +205,7 @@ def _shots(
 
 
 def _again(call: Call) -> Call:
-    """Return a call without what is not given, of the function that renders a result again if the scene is one."""
+    """Return a call without the arguments not given, with the function that renders a result again for a result."""
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.render import render_again
 
@@ -238,7 +238,7 @@ COMMANDS = {
         _shots,
         """Render a series of shots over one sea.
 
-        Writes one file of all waveforms, with the true slope, height and depth at each place, which record, echoes,
+        Writes one file with all waveforms, and the true slope, height and depth at each location, which record, echoes,
         retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
         """,
         defaults={"count": None, "seed": None},
@@ -249,7 +249,7 @@ COMMANDS = {
         _frames,
         """Render frames of gate images, each with its own pulses.
 
-        Each gate of each frame has pulses of its own, between which waves and platform move. Writes
+        Each gate in each frame has its own pulses, between which waves and platform move. Writes
         DIR/<scene>_frames.nc, and the mean over the frames as <scene>_frames_gates.exr, _gates.png and _depth.png.
         Ctrl-C keeps the completed frames.
         """,

@@ -42,12 +42,14 @@ def _view(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="HTML file of the page, by default a temporary one; PNG, PDF or SVG of a drawing."
+            "-o",
+            "--output",
+            help="HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing.",
         ),
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     shot: Annotated[
-        int | None, typer.Option(help="Number of a shot of a series, from 0; by default the mean of all.")
+        int | None, typer.Option(help="Number of a shot in a series, from 0; by default their mean.")
     ] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Draw the waveforms instead, to FILE.png.")] = False,
     log: Annotated[bool, typer.Option("--log", help="Draw them with a logarithmic power axis only.")] = False,
@@ -80,11 +82,11 @@ def _view(
         _show(file, output, shot, browser, define, quiet, selection)
         return
     if layout and (log or linear):
-        raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
+        raise UserError("--layout does not go with --log or --linear: a layout has no power axis")
     if components and (log or linear or layout):
-        raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales.")
+        raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales")
     if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise UserError(f"--output {output} must end in .png, .pdf or .svg, or .html for a page.")
+        raise UserError(f"--output {output} must end in .png, .pdf or .svg, or .html for a page")
     target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
     draws_again(file)
     check_figure(target)
@@ -155,12 +157,12 @@ def _show(
 
 
 def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
-    """Return one shot of a series."""
+    """Return one shot from a series."""
     if "shot" not in dataset.dims:
-        raise UserError(f"--shot {number} needs a series of shots, but {file} holds a single shot.")
+        raise UserError(f"--shot {number} needs a series of shots, but {file} holds a single shot")
     if number not in dataset["shot"].values:
         first, last = (int(end) for end in dataset["shot"].values[[0, -1]])
-        raise UserError(f"--shot {number} must be one of the shots of {file}, {first} to {last}.")
+        raise UserError(f"--shot {number} must be one of the shots in {file}, {first} to {last}")
     return dataset.sel(shot=number)
 
 

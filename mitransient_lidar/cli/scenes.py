@@ -20,7 +20,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped sce
 
 
 def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
-    """Print rows of texts in columns."""
+    """Print text rows in columns."""
     typer.echo("\n".join(aligned_lines(rows, right)))
 
 
@@ -72,9 +72,11 @@ def _copy(
 
 def _instruments(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of an instrument.")] = None,
-    xml: Annotated[bool, typer.Option("--xml", help="Print XML of laser and receiver, to be included.")] = False,
+    xml: Annotated[
+        bool, typer.Option("--xml", help="Print the XML of laser and receiver, to include in a scene.")
+    ] = False,
 ) -> None:
-    """List the instruments, or print the parameters of one."""
+    """List the instruments, or print one instrument's parameters."""
     from mitransient_lidar.loading import instruments as shipped
 
     if name is None:
@@ -112,15 +114,15 @@ def _bench(
     call: Call,
     images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
     beams: Annotated[
-        bool, typer.Option("--beams", help="Compare beams of 0.1 to 20 mrad in all views instead.")
+        bool, typer.Option("--beams", help="Compare beams from 0.1 to 20 mrad in all views instead.")
     ] = False,
 ) -> None:
-    """Run one of the benchmarks."""
+    """Run one benchmark."""
     from mitransient_lidar.studies.bench import beams as narrow
     from mitransient_lidar.studies.bench import images as imagers
 
     if images and beams:
-        raise UserError("--images and --beams: give one of them")
+        raise UserError("--images and --beams are alternatives: give one of them")
     if images:
         imagers.run(json=call.arguments["json"])
     elif beams:
@@ -135,10 +137,10 @@ COMMANDS = {
         _HEADING,
         "",
         _info,
-        """Print versions, the Mitsuba variant and the path of LLVM, or the parameters of a result.
+        """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
 
-        Of a result: its attributes, then every object of its scene with the values of all parameters, defaults too; a
-        dash for those that are not given and have no default, or are not used.
+        A result gives its attributes, then every object in its scene with all parameter values, defaults too. A dash
+        marks parameters that are not given and have no default, or are not used.
         """,
     ),
     "bench": Command(_HEADING, "studies.bench.integrators:run", _bench, "Measure the time to a given accuracy."),

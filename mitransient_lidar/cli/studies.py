@@ -1,4 +1,4 @@
-"""Commands of studies: a public function, its figure with the data, and its lines; and tables of an instrument."""
+"""Study commands: a public function, its figure with the data, and its lines; and instrument tables."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG fi
 def _study(
     name: str, plot: str, describe: str, text: str, *, function: str = "", table: str = "", has_data: bool = True
 ) -> Command:
-    """Return the command of a module of studies, and of its function, by default that of the same name.
+    """Return the command for a study module and its function, which by default share their name.
 
-    `plot` is the function that draws the result, as ``module:name`` of ``plots``; `describe` returns its lines; `table`
+    `plot` is the function in ``plots`` that draws the result, as ``module:name``; `describe` returns its lines; `table`
     writes a CSV file.
     """
     suffixes = (".nc",) * has_data + (".csv",) * bool(table)
@@ -44,7 +44,7 @@ def _study(
 
 
 def _water(call: Call, output: DrawingOnly = None) -> None:
-    """Print the properties of a water, and draw it."""
+    """Print and draw a water's properties."""
     check_figure(output)
     with announced():
         lines = call()
@@ -56,10 +56,10 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
 def _depth_bias(
     call: Call,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file; output/INSTRUMENT_depths.nc by default.")
+        Path | None, typer.Option("-o", "--output", help="NetCDF file, by default output/INSTRUMENT_depths.nc.")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file of the biases of all estimators against the angle.")
+        Path | None, typer.Option(help="PNG, PDF or SVG file: biases of all estimators against the angle.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -83,10 +83,10 @@ def _depth_bias(
 
 def _tpu(
     call: Call,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
-    """Write the uncertainties of an instrument, with figures and fits of each altitude and angle."""
+    """Write an instrument's uncertainties, with figures and fits for each altitude and angle."""
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
     from mitransient_lidar.loading.instruments import read_instrument
     from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
@@ -104,7 +104,7 @@ def _tpu(
         for height in found["altitude"].values:
             for angle in found["off_nadir_deg"].values:
                 one = found.sel(altitude=height, off_nadir_deg=angle)
-                if one["found"].isnull().all():  # for lack of time
+                if one["found"].isnull().all():  # no time was left
                     continue
                 stem = f"{instrument}_{height:g}m_{angle:g}deg"
                 plot_uncertainty(one, output / f"{stem}_tvu.png")
@@ -121,9 +121,9 @@ STUDIES = {
         "find_shots",
         "studies.shots:plot_found_shots",
         "describe_found_shots",
-        """Find places of the sea where the beam meets given slopes.
+        """Find sea locations where the beam meets given slopes.
 
-        Lists places whose slope faces the lidar (towards, away), is level or sideways, and draws them.
+        Lists and draws locations whose slope faces the lidar or turns away from it, is level, or sideways.
         """,
         has_data=False,
     ),
@@ -131,7 +131,7 @@ STUDIES = {
         "target_signal",
         "studies.targets:plot_target_signal",
         "describe_target",
-        """Measure the signal of a target in each pixel.
+        """Measure a target's signal in each pixel.
 
         Renders the scene with and without the target on the same random numbers, and combines the pixels.
         """,
@@ -140,7 +140,7 @@ STUDIES = {
         "detection",
         "studies.targets:plot_detection",
         "describe_detection",
-        """Compute how well a target is detected.
+        """Compute the detection probability of a target.
 
         Compares one pixel, the sum and the best combination of pixels.
         """,
@@ -150,7 +150,7 @@ STUDIES = {
         "estimate",
         "waveforms:plot_components",
         "describe_estimate",
-        """Estimate the waveforms in a second, over a level sea and without targets.
+        """Estimate the waveforms in one second, over a level sea and without targets.
 
         Lidar equation with sampled forward scattering: a first look, and a second opinion on a render.
         """,
@@ -159,10 +159,10 @@ STUDIES = {
         "bounds",
         "studies.parameters:plot_bounds",
         "describe_bounds",
-        """Compute the least errors of parameters from a shot, and rank designs.
+        """Compute Cramer-Rao bounds of parameters from one shot, and rank designs.
 
-        Cramer-Rao bounds: no unbiased estimate from the record of one shot, with the noise of a receiver, has a smaller
-        standard deviation. Renders the scene with derivatives by the free parameters, for each combination of values.
+        No unbiased estimate from one shot's record, with the receiver's noise, has a smaller standard deviation.
+        Renders the scene with derivatives by the free parameters, for each combination of values.
         """,
         table="write_table",
     ),
@@ -170,7 +170,7 @@ STUDIES = {
         "beam_spread",
         "studies.light:plot_beam_spread",
         "describe_spread",
-        """Measure the spread of the laser's light at depths.
+        """Measure how the laser beam spreads with depth.
 
         Horizontal spread, delays, and share of the light within the field of view.
         """,
@@ -179,15 +179,15 @@ STUDIES = {
         "fov_sweep",
         "studies.light:plot_fov_sweep",
         "describe_fov_sweep",
-        "Measure the water's attenuation for several fields of view.",
+        "Measure the water's attenuation at several fields of view.",
     ),
     "scattering-orders": _study(
         "scattering_orders",
         "studies.light:plot_scattering_orders",
         "describe_orders",
-        """Separate the received light by the number of scatterings.
+        """Separate the received light by scattering order.
 
-        Each order is also separated by the number of reversals of the vertical direction: one, or several.
+        Each order is also separated by its vertical reversals: one, or several.
         """,
     ),
     "water": Command(
@@ -200,11 +200,11 @@ STUDIES = {
         "Study",
         "studies.depth_bias:depth_bias",
         _depth_bias,
-        """Measure the errors of the depths in an instrument's records.
+        """Measure the depth errors in an instrument's records.
 
-        Renders the instrument over known bottoms, by angle, wind, water and depth, records it with the noise of its
-        receiver, measures the depths, and prints share found, bias, spread and stated error of the estimator gaussian
-        [cm]. The file holds all estimators; echoes --correct takes it.
+        Renders the instrument over known bottoms at each angle, wind, water and depth, and records it with its
+        receiver's noise. Measures the depths, and prints share found, bias, spread and stated error [cm] for the
+        estimator gaussian. The file contains all estimators; echoes --correct reads it.
         """,
     ),
     "tpu": Command(
@@ -213,10 +213,10 @@ STUDIES = {
         _tpu,
         """Determine the vertical and horizontal uncertainty of an instrument's soundings.
 
-        Renders the instrument over known bottoms, by altitude, angle, wind, water and depth, and writes uncertainties
-        of single soundings, measured and corrected, and the orders of IHO S-44 that they meet as NetCDF file, figures,
-        and the fits of the part below the sea surface as CSV files for uncertainty tools. Prints TVU at 95 % [cm] and
-        the fits.
+        Renders the instrument over known bottoms at each altitude, angle, wind, water and depth. Writes a NetCDF file
+        and figures with the uncertainties of single soundings, measured and corrected, and the IHO S-44 orders that
+        they meet. CSV files for uncertainty tools contain fits of the part below the sea surface. Prints TVU at 95 %
+        [cm] and the fits.
         """,
     ),
 }

@@ -2,11 +2,11 @@
 
 import re
 
-#: Characters that steer a terminal or change the order of what it shows: C0 and C1 controls, DEL, marks of writing
-#: direction, separators of lines; and lone surrogates, which stand for bytes of file names that are no text.
+#: Characters that steer a terminal or change its display order: C0 and C1 controls, DEL, writing direction marks, line
+#: separators; and lone surrogates, which represent file name bytes that are no text.
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
-#: Controls that a text of several lines keeps.
+#: Controls that a text with several lines keeps.
 LINES = "\n\t"
 
 #: Longest message, and the parts at its ends that are kept of a longer one, in characters.
@@ -22,7 +22,7 @@ class UserError(ValueError):
     """Invalid user input: a wrong name, value or file.
 
     Its message is one sentence that names the parameter or path, its value, and the allowed values; it is `printable`,
-    and its middle is left out beyond 2000 characters. The command line prints it without a traceback and exits with
+    and beyond 2000 characters its middle is left out. The command line prints it without a traceback and exits with
     code 2.
     """
 
@@ -42,7 +42,7 @@ def is_interruption(error: BaseException) -> bool:
 
 
 def raise_if_out_of_memory(error: BaseException) -> None:
-    """Raise `UserError` for an exception that says that memory ran out, of Python, NumPy or Dr.Jit."""
+    """Raise `UserError` for an exception by Python, NumPy or Dr.Jit when memory runs out."""
     if isinstance(error, MemoryError) or re.search(r"out of memory|(?i:jit)_malloc|bad_alloc", str(error)):
         reason = " ".join(str(error).split()) or "no detail is known"
         raise UserError(

@@ -1,4 +1,4 @@
-"""Opening of files that others name, and atomic writing of files, one alone or several together."""
+"""Opening of files named by others, and atomic writing of one file or several together."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from mitransient_lidar.core.errors import UserError, WriteError, printable
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.validation import shown
 
-#: Beginning of the names of temporary files and folders; host, process space, process and a unique number follow, which
-#: tell leftovers of processes that were killed from files of running ones.
+#: Beginning of the names of temporary files and folders. Host, process space, process and a unique number follow; they
+#: distinguish leftovers of killed processes from the files of running ones.
 _PREFIX = ".mitransient-lidar."
 _TEMPORARY = re.compile(
     re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<space>[0-9a-f]{12})\.(?P<process>\d{1,9})\.[0-9a-f]{32}(?P<suffix>\..*)?"
 )
 
-#: Time after which a temporary file of another process space that nobody has changed is a leftover [s]. None is open as
-#: long as that; without it, those of a machine that has lost its power would stay for ever.
+#: Time after which a temporary file from another process space that nobody has changed is a leftover [s]. None is open
+#: as long as that; without it, files from a machine that has lost its power would stay for ever.
 _FORGOTTEN_S = 7 * 24 * 3600.0
 
-#: What is not read, besides folders: its end may never come.
+#: Paths that are not read, besides folders: their end may never come.
 _OTHERS = {stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
 
 #: Longest name of a file [bytes], which leaves room for endings.
@@ -54,11 +54,11 @@ def check_encodable(path: Path) -> None:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise UserError(f"cannot write {text!a}: its name is not valid UTF-8.") from error
+        raise UserError(f"cannot write {text!a}: its name is not valid UTF-8") from error
     if "\0" in text:
-        raise UserError(f"cannot write {text!a}: its name contains the character NUL.")
+        raise UserError(f"cannot write {text!a}: its name contains the character NUL")
     if printable(text) != text:
-        raise UserError(f"cannot write {text!a}: its name must have no control characters, such as a line break.")
+        raise UserError(f"cannot write {text!a}: its name must have no control characters, such as a line break")
 
 
 def is_file_name(name: object) -> bool:
@@ -70,8 +70,8 @@ def is_file_name(name: object) -> bool:
 def open_file(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a regular file for reading; a link to one, too.
 
-    Every reader of a file that a user or another file names opens it here, or gives a library that takes a path one of
-    `check_regular`: a named pipe or a device would wait for ever, or never end.
+    Every reader of a file that a user or another file names opens it here, or gives a library that takes a path a
+    `check_regular` path: a named pipe or a device would wait for ever, or never end.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def open_file(path: str | os.PathLike[str]) -> BufferedReader:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     try:
         _check_mode(path, os.fstat(descriptor).st_mode)
         os.set_blocking(descriptor, True)
@@ -94,13 +94,13 @@ def open_file(path: str | os.PathLike[str]) -> BufferedReader:
 
 
 def check_regular(path: str | os.PathLike[str]) -> None:
-    """Raise `UserError` if a path is not that of a regular file, or of a link to one."""
+    """Raise `UserError` if a path is no regular file, and no link to one."""
     try:
         mode = os.stat(path).st_mode
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     except ValueError as error:
-        raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL.") from error
+        raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL") from error
     _check_mode(path, mode)
 
 
@@ -112,10 +112,10 @@ def checked_path(name: str, path: object) -> Path:
 
 
 def is_there(path: Path) -> bool:
-    """Return whether a path is that of anything but a folder, which may not be a regular file."""
+    """Return whether a path is anything but a folder, which may not be a regular file."""
     try:
         return path.exists() and not path.is_dir()
-    except (OSError, ValueError):  # of a text that is too long for a name, or contains NUL
+    except (OSError, ValueError):  # the text is too long for a name, or contains NUL
         return False
 
 
@@ -127,10 +127,10 @@ def check_tree(folder: str | os.PathLike[str]) -> None:
             with os.scandir(folders.pop()) as found:
                 entries = list(found)
         except OSError as error:
-            raise UserError(f"cannot read {error.filename}: {error.strerror}.") from error
+            raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
         for entry in entries:
             if entry.is_symlink():
-                raise UserError(f"cannot read {folder}: {entry.path} is a link, and no link in it is followed.")
+                raise UserError(f"cannot read {folder}: {entry.path} is a link, and no link in it is followed")
             if entry.is_dir():
                 folders.append(entry.path)
             elif not entry.is_file():
@@ -153,9 +153,9 @@ def _check_mode(path: str | os.PathLike[str], mode: int) -> None:
     """Raise `UserError` for the mode of something that is not a regular file."""
     kind = stat.S_IFMT(mode)
     if kind == stat.S_IFDIR:
-        raise UserError(f"cannot read {path}: {os.strerror(errno.EISDIR)}.")
+        raise UserError(f"cannot read {path}: {os.strerror(errno.EISDIR)}")
     if kind in _OTHERS:
-        raise UserError(f"cannot read {path}: it is {_OTHERS[kind]}, and only regular files are read.")
+        raise UserError(f"cannot read {path}: it is {_OTHERS[kind]}, and only regular files are read")
 
 
 def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
@@ -172,10 +172,10 @@ def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
         if len(data) <= most_bytes:
             return data.decode("utf-8-sig")
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file in UTF-8.") from error
-    raise UserError(f"{path} is larger than {most_bytes / 2**20:g} MiB, the most for a file of this kind.")
+        raise UserError(f"{path} is not a text file in UTF-8") from error
+    raise UserError(f"{path} is larger than {most_bytes / 2**20:g} MiB, the most for a file of this kind")
 
 
 @contextlib.contextmanager
@@ -207,10 +207,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         except (OSError, RuntimeError) as error:
             # HDF5 and OpenEXR report a full disk by their own errors, with the operating system's message in them.
             if os.strerror(errno.ENOSPC) in str(error):
-                raise WriteError(f"cannot write {path}: {os.strerror(errno.ENOSPC)}.") from error
+                raise WriteError(f"cannot write {path}: {os.strerror(errno.ENOSPC)}") from error
             if isinstance(error, RuntimeError):
                 raise
-            raise WriteError(f"cannot write {path}: {_reason(error, temporary, path)}.") from error
+            raise WriteError(f"cannot write {path}: {_reason(error, temporary, path)}") from error
         finally:
             if moves is None or (temporary, path) not in moves:
                 _remove(temporary)
@@ -269,7 +269,7 @@ def _move(moves: Moves) -> None:
             else:
                 _remove(changed)
         if isinstance(error, OSError):
-            raise WriteError(f"cannot write {path}: {_reason(error, path, path)}.") from error
+            raise WriteError(f"cannot write {path}: {_reason(error, path, path)}") from error
         raise
     finally:
         for _, former in moved:
@@ -278,7 +278,7 @@ def _move(moves: Moves) -> None:
 
 
 def _kept(path: Path) -> Path | None:
-    """Return another name of the contents of a file, None if there is no such file."""
+    """Return another name for a file's contents, None if there is no such file."""
     if not path.exists():
         return None
     kept = temporary_beside(path)
@@ -290,7 +290,7 @@ def _kept(path: Path) -> Path | None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed processes of this user and machine have left in a folder: temporary files and folders.
+    """Remove the leftovers of this user's killed processes in a folder: temporary files and folders.
 
     Process numbers have a meaning only in their process space: files of others stay until nobody has changed them for a
     week.
@@ -313,12 +313,12 @@ def sweep(folder: Path) -> None:
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return the name of a temporary file or folder beside a path, of the same type."""
+    """Return the name of a temporary file or folder beside a path, with the same type."""
     return path.with_name(f"{temporary_prefix()}{uuid.uuid4().hex}{path.suffix}")
 
 
 def temporary_prefix() -> str:
-    """Return the beginning of the names of the temporary files of this process."""
+    """Return the beginning of this process's temporary file names."""
     return f"{_PREFIX}{_host_name()}.{_process_space()}.{os.getpid()}."
 
 
@@ -349,7 +349,7 @@ def _remove(path: Path) -> None:
 
 
 def _reason(error: OSError, temporary: Path, path: Path) -> str:
-    """Return the reason of an error in one line, with the name of the file instead of the temporary one."""
+    """Return an error's reason in one line, with the file's name instead of the temporary one."""
     # HDF5 gives a number and a long text with the state of its file.
     text = os.strerror(error.errno) if error.errno else str(error).replace(str(temporary), str(path)).rstrip(".")
     return text.partition("\n")[0]

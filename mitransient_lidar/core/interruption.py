@@ -1,4 +1,4 @@
-"""Handling of the signals that interrupt: SIGINT (Ctrl-C), and for commands SIGTERM and SIGHUP."""
+"""Handling of the interrupting signals: SIGINT (Ctrl-C), and for commands SIGTERM and SIGHUP."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class TerminationAsInterrupt:
 
 
 class DeferredInterrupt:
-    """Context in which an interruption waits for `check` or the end of the context; a second one takes effect at once.
+    """Context in which an interruption waits for `check` or the context's end; a second one takes effect at once.
 
-    An interruption during a pass would become a ``RuntimeError`` of the loop that Dr.Jit is recording, and one while
-    files are written would lose a render. It applies to Ctrl-C, and to the signals of `TerminationAsInterrupt`. Of
-    nested contexts, the outermost one defers. Outside the main thread, and with other handlers of the signals, nothing
-    changes.
+    An interruption during a pass would become a ``RuntimeError`` in the loop that Dr.Jit is recording, and one while
+    files are written would lose a render. The context applies to Ctrl-C, and to the signals of
+    `TerminationAsInterrupt`. The outermost of nested contexts defers. Outside the main thread, and with other handlers
+    for the signals, nothing changes.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class DeferredInterrupt:
         if cls._pending and threading.current_thread() is threading.main_thread():
             number, cls._pending = cls._pending, 0
             handler = cls._handlers[number]
-            # The next one waits, too: what this one ends has results to keep.
+            # The next one waits, too: the code that this one ends has results to keep.
             cls._install()
             handler(number, None)
 

@@ -1,8 +1,8 @@
-"""Marks that tell what made a file, in a place that readers of its format skip.
+"""Marks that identify a file's origin, where readers of its format skip them.
 
-A mark is text of JSON near the end of a file: in a comment of PNG, GIF, PDF, SVG and HTML files, in a free box of MP4
-files, and behind the data of NetCDF and EXR files, whose readers know where the data end. It holds its own position, so
-that it no longer counts once another program has changed the length of the file.
+A mark is JSON text near the end of a file: in a comment in PNG, GIF, PDF, SVG and HTML files, in a free box in MP4
+files, and after the data in NetCDF and EXR files, whose readers find the end of the data. It contains its own position:
+it ceases to count once another program has changed the file's length.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 _KEY = b"mitransient-lidar made this file: "
-LONGEST_TAIL = 2**16  # bytes at the end of a file that hold the mark and what follows it
+LONGEST_TAIL = 2**16  # bytes at the end of a file that contain the mark and its end
 _LONGEST = 2**15
-_TEXT_OF_LENGTHS = bytes([1, *range(255, -1, -1), 0])  # ends blocks of a GIF whose lengths are characters of a text
+_TEXT_OF_LENGTHS = bytes([1, *range(255, -1, -1), 0])  # ends GIF blocks whose lengths are characters in a text
 
 
 def _png_chunk(text: bytes) -> bytes:
@@ -27,7 +27,7 @@ def _png_chunk(text: bytes) -> bytes:
     return struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
 
 
-#: What encloses the text of a mark, by the suffix of the file.
+#: Enclosure of a mark's text, by file suffix.
 _FORMATS: dict[str, Callable[[bytes], bytes]] = {
     ".png": _png_chunk,
     ".gif": lambda text: b"!\xff\x0bmitransient" + text + _TEXT_OF_LENGTHS,
@@ -37,17 +37,17 @@ _FORMATS: dict[str, Callable[[bytes], bytes]] = {
     **dict.fromkeys((".nc", ".exr"), lambda text: text),
 }
 
-#: What follows the mark, by the suffix of the file.
+#: Bytes after the mark, by file suffix.
 _ENDS = {".png": b"\0\0\0\0IEND", ".gif": b";", ".pdf": b"startxref"}
 
 
 def holds_mark(path: Path) -> bool:
-    """Return whether files of the suffix of a path hold marks."""
+    """Return whether files with the suffix of a path contain marks."""
     return path.suffix.lower() in _FORMATS
 
 
 def write_mark(path: Path, mark: Mapping[str, Any]) -> None:
-    """Add a mark, of types of JSON, to a complete file of a suffix that `holds_mark`; raise OSError if that fails."""
+    """Add a mark, in JSON types, to a complete file with a suffix as in `holds_mark`; raise OSError if that fails."""
     suffix = path.suffix.lower()
     enclosed = _FORMATS[suffix]
     with path.open("r+b") as file:
@@ -65,7 +65,7 @@ def write_mark(path: Path, mark: Mapping[str, Any]) -> None:
 
 
 def read_mark(path: Path) -> dict[str, Any] | None:
-    """Return the mark of a file; None if it has none, is no regular file, or has been changed by another program."""
+    """Return a file's mark; None if it has none, is no regular file, or another program has changed it."""
     try:
         if not holds_mark(path) or not stat.S_ISREG(path.stat().st_mode):
             return None

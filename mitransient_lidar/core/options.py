@@ -1,4 +1,4 @@
-"""What the parameters of public functions mean and allow: checked in calls, and shown as options of commands."""
+"""Meanings and ranges of public function parameters: checked in calls, and shown as command options."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ class Option:
     meaning
         Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
     low, high
-        Limits of a number, or of each number of a list; None where there is none. `low` itself is excluded if `above`.
+        Limits of a number, or of each number in a list; None where there is none. `low` itself is excluded if `above`.
     unit
         Unit of numbers.
     ascending
-        Whether the numbers of a list must increase.
+        Whether the numbers in a list must increase.
     form
         Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
         they are.
     flag
-        Name of the option of commands, where it is not that of the parameter.
+        Option name in commands, where it differs from the parameter's name.
     is_argument
         Whether commands take it by its place.
     """
@@ -92,7 +92,7 @@ class Option:
         return f"{meaning}{f' ({limits})' if limits else ''}."
 
     def check(self, name: str, value: Any, kind: Any) -> Any:
-        """Return a value of a type as a number or a list of numbers; raise `UserError` if it is out of range."""
+        """Return a typed value as a number or a list of numbers; raise `UserError` if it is out of range."""
         kinds = parts(kind)
         if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
@@ -102,7 +102,7 @@ class Option:
             assert isinstance(self.low, int)
             assert isinstance(self.high, int)
             return integer(name, value, self.low, self.high)
-        # Errors of other limits would state what these functions allow.
+        # Errors for other limits would state the range that these functions allow.
         assert self.low == 0 or not (self.above or self.high is None)
         assert not self.above or self.high in (None, 1)
         if self.above:
@@ -120,29 +120,29 @@ class Option:
 
 
 def positive_option(meaning: str, unit: str = "") -> Option:
-    """Return the declaration of a number greater than 0."""
+    """Return the declaration for a number greater than 0."""
     return Option(meaning, 0, unit=unit, above=True)
 
 
-#: Arguments and options of several functions.
+#: Arguments and options that functions share.
 Scene = Annotated[Any, Option("Name of a shipped scene, or path of a Mitsuba XML file", form="SCENE", is_argument=True)]
 SceneOrResult = Annotated[
     Any,
     Option(
-        "Name of a shipped scene, path of a Mitsuba XML file, or a result (.nc, .exr) to render again, with its own "
-        "options unless others are given",
+        "Name of a shipped scene, path of a Mitsuba XML file, or result (.nc, .exr) to render again with its own "
+        "options, unless others are given",
         form="SCENE",
         is_argument=True,
     ),
 ]
-Seed = Annotated[int, Option("Seed of the random numbers", 0, 2**53)]
+Seed = Annotated[int, Option("Random seed", 0, 2**53)]
 FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
-TargetId = Annotated[str, Option("Id of the shape that is the target")]
-BackgroundPower = Annotated[float, Option("Power of the daylight on each pixel", 0, unit="W")]
-Instrument = Annotated[str | None, Option("Instrument instead of the scene's lidar, from the list of instruments")]
-Sensor = Annotated[str | None, Option("Receiver of a scene that has several, by its id, instead of the first one")]
+TargetId = Annotated[str, Option("Id of the target's shape")]
+BackgroundPower = Annotated[float, Option("Daylight power on each pixel", 0, unit="W")]
+Instrument = Annotated[str | None, Option("Instrument that replaces the scene's lidar, as listed by instruments")]
+Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
 
-#: Beginning of the meaning of a receiver.
+#: Beginning of a receiver's meaning.
 RECEIVERS = (
     "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
     "file"
@@ -155,7 +155,7 @@ RECEIVERS_OR_CAMERAS = (
 
 
 def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
-    """Return types and `Option` of those parameters of a function, or fields of a class, that have one."""
+    """Return types and `Option` for those parameters of a function, or fields of a class, that have one."""
     found: dict[str, tuple[Any, Option]] = {}
     hinted: Any = inspect.unwrap(function)
     if isinstance(function, type):
@@ -216,7 +216,7 @@ def _documented(text: str, options: Mapping[str, Option]) -> str:
 
 
 def documented_parameters(text: str, options: Mapping[str, Option]) -> str:
-    """Return the documentation of a class with a section of parameters, behind its first paragraphs."""
+    """Return a class documentation with a parameter section, after its first paragraphs."""
     if not options:
         return text
     beginning, *sections = re.split(r"\n\n(?=    \w+\n    -{4,}\n)", text.rstrip())
@@ -234,13 +234,13 @@ def is_unset(value: Any, default: Any) -> bool:
 
 
 def _is_list(kinds: tuple[Any, ...]) -> bool:
-    """Return whether one of the types is that of a list or an array."""
+    """Return whether one of the types is a list or array type."""
     origins = [get_origin(one) for one in kinds]
     return any(isinstance(one, type) and issubclass(one, Sequence | np.ndarray) for one in origins)
 
 
 def parts(kind: Any) -> tuple[Any, ...]:
-    """Return the types of a union, and the words of a literal."""
+    """Return the types in a union, and the words in a literal."""
     if get_origin(kind) in (Union, types.UnionType, Literal):
         return tuple(part for one in get_args(kind) for part in parts(one))
     return (kind,)

@@ -46,12 +46,12 @@ class Plan:
 
     @classmethod
     def keys(cls) -> list[str]:
-        """Return the keys of a table, in their order."""
+        """Return a table's keys, in their order."""
         return [one.name for one in fields(cls) if one.name in cls._kinds]
 
     @classmethod
     def of(cls, given: object, where: str = "", prefix: str = "", **others: Any) -> Self:
-        """Return the object of a table of a file.
+        """Return the object for a table in a file.
 
         Parameters
         ----------
@@ -60,7 +60,7 @@ class Plan:
         where
             Name of the table in messages, such as ``[design]``.
         prefix
-            What names of values begin with in messages, such as ``design.``.
+            Beginning of value names in messages, such as ``design.``.
         others
             Fields that are no keys.
 
@@ -82,7 +82,7 @@ class Plan:
 
 
 def of_kind(name: str, given: object, kinds: Mapping[str, type[_P]]) -> _P:
-    """Return the object of a table of a plan whose ``kind`` names its class; raise `UserError` as `Plan.of`."""
+    """Return the object for a plan table whose ``kind`` names its class; raise `UserError` as `Plan.of`."""
     values = dict(table(name, given))
     kind = required(f"[{name}]", values, "kind")
     if not isinstance(kind, str) or kind not in kinds:
@@ -98,7 +98,7 @@ def one_of(name: str, value: Any, allowed: Any) -> Any:
 
 
 def _checked(field: Field[Any], value: Any, name: str, kind: Any, option: Option) -> Any:
-    """Return a value of a type, or the default of its field; raise `UserError` for another."""
+    """Return a typed value, or its field's default; raise `UserError` for another."""
     default = field.default
     if type(value) is type(default) and value == default:
         return value
@@ -144,7 +144,7 @@ def _list(name: str, value: Any, kinds: tuple[Any, ...], option: Option) -> tupl
 
 
 def _number(name: str, value: Any, option: Option, whole: bool) -> float | int:
-    """Return a number within the limits of an `Option`."""
+    """Return a number within an `Option`'s limits."""
     low, high = option.low, option.high
     if whole:
         assert isinstance(low, int)

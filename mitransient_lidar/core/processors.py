@@ -15,8 +15,8 @@ _GROUPS, _MOUNT = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 def usable_processors() -> int:
     """Return the number of processors that this process may use, at least 1.
 
-    It is the smallest of: the processors of the machine, those of the affinity (``taskset``, batch systems), and the
-    quotas of the control groups (containers), rounded up.
+    It is the smallest of: the machine's processors, the affinity's (``taskset``, batch systems), and the control group
+    quotas (containers), rounded up.
     """
     # macOS has no affinity.
     number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -24,7 +24,7 @@ def usable_processors() -> int:
 
 
 def _quotas(groups: Path, mount: Path) -> Iterator[float]:
-    """Yield the numbers of processors that the control groups of a process and the groups above them allow."""
+    """Yield the numbers of processors that a process's control groups and the groups above them allow."""
     for line in _text(groups).splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers and "cpu" not in controllers.split(","):
@@ -41,12 +41,12 @@ def _quotas(groups: Path, mount: Path) -> Iterator[float]:
 
 
 def _mounted(mount: Path, controllers: str) -> Path:
-    """Return the folder of controllers of the first version."""
+    """Return the folder of first-version controllers."""
     return next((mount / name for name in (controllers, "cpu", "cpu,cpuacct") if (mount / name).is_dir()), mount)
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file of the system, empty if it cannot be read."""
+    """Return a system file's text, empty if it cannot be read."""
     try:
         return path.read_text()
     except OSError:

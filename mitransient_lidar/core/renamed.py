@@ -9,7 +9,7 @@ COMMANDS = {
     "instruments": "scenes instruments",
 }
 
-#: Public functions of the package.
+#: Public functions in the package.
 FUNCTIONS = {
     "depth_uncertainty": "tpu",
     "sweep": "campaign",

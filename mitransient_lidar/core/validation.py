@@ -128,7 +128,7 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
 
 
 def number_list(name: str, given: object) -> FloatArray:
-    """Return one number, a sequence of numbers, or a text of numbers separated by commas or spaces, shape (N,), N > 0.
+    """Return one number, a sequence, or a text with numbers separated by commas or spaces, shape (N,), N > 0.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def is_number(text: str) -> bool:
 
 
 def non_negative_array(name: str, values: npt.ArrayLike) -> FloatArray:
-    """Return `values` as a new float64 array of finite numbers of at least 0."""
+    """Return `values` as a new float64 array with finite numbers of at least 0."""
     array = finite_array(name, values)
     if np.any(array < 0):
         raise UserError(f"{name} = {array.min():g} must not be negative")
@@ -192,7 +192,7 @@ def checked(check: Callable[..., object], *limits: float, default: Any = MISSING
 
 @dataclass(frozen=True)
 class Checked:
-    """Dataclass whose fields by `checked` hold what their validators return; None may stay where it is the default."""
+    """Dataclass whose fields by `checked` contain their validators' results; None may stay where it is the default."""
 
     def __post_init__(self) -> None:
         for one in fields(self):
@@ -206,14 +206,14 @@ def usable_memory() -> float:
     limits = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
     soft = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
     limits += [float(limit) for limit in soft if limit != resource.RLIM_INFINITY]
-    # Of a container: a number, or "max".
+    # Limit in a container: a number, or "max".
     with contextlib.suppress(OSError, ValueError):
         limits.append(float(Path("/sys/fs/cgroup/memory.max").read_text("ascii")))
     return min(limits) / 2
 
 
 def require_memory(what: str, size: float, advice: str, least: float | None = None) -> float:
-    """Raise `UserError` if arrays of a size [bytes] exceed `usable_memory`; `what` is their name in the plural.
+    """Raise `UserError` if arrays with a size [bytes] exceed `usable_memory`; `what` is their name in the plural.
 
     Return their size: arrays that work with less, down to `least`, are cut to that memory.
     """

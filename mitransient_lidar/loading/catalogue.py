@@ -25,12 +25,12 @@ def scene_names() -> list[str]:
 
 
 def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the path of a shipped scene, which has priority over a file of the same name, or of an XML file.
+    """Return the path of a shipped scene, which has priority over a file with the same name, or of an XML file.
 
     Raises
     ------
     UserError
-        If there is no such scene; the message lists shipped scenes of similar names.
+        If there is no such scene; the message lists shipped scenes with similar names.
     """
     names = scene_names()
     if not isinstance(name_or_path, (str, os.PathLike)):
@@ -39,13 +39,13 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
         return folder_of_scenes() / f"{name_or_path}.xml"
     path = Path(name_or_path)
     if path.is_dir():
-        raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene.")
+        raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene")
     if path.exists():
         check_regular(path)
         return path
     close = difflib.get_close_matches(path.stem, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(close)}" if close else f"shipped scenes are {', '.join(names) or 'none'}"
-    raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}.")
+    raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}")
 
 
 def scene_text(name: str | os.PathLike[str]) -> str:
@@ -63,10 +63,10 @@ def scene_summary(name: str | os.PathLike[str]) -> str:
 
 
 def scene_parameters(name: str | os.PathLike[str], *, by_id: bool = False) -> dict[str, str]:
-    """Return names and values of the parameters of a scene: its own (``<default>`` tags), and those of its plugins.
+    """Return names and values of a scene's parameters: its own (``<default>`` tags), and its plugins'.
 
-    Values are texts, empty for those without one. With `by_id`, those of plugins have their names with ids, too. Name
-    and errors as in `scene_text`.
+    Values are texts, empty for parameters without one. With `by_id`, plugin parameters have their names with ids, too.
+    Name and errors as in `scene_text`.
     """
     return values_of(read_document(scene_path(name)), by_id=by_id)
 
@@ -117,5 +117,5 @@ def copy_scene(
 
 
 def folder_of_scenes() -> Path:
-    """Return the folder of the shipped scenes."""
+    """Return the folder with the shipped scenes."""
     return Path(str(importlib.resources.files("mitransient_lidar.scenes")))

@@ -1,4 +1,4 @@
-"""Checks of the values of a scene before Mitsuba reads it."""
+"""Checks of scene values before Mitsuba reads them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, is_number, shown
 from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
 
-#: Name of a plugin, and endings of the libraries of plugins.
+#: Name of a plugin, and endings of plugin libraries.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
 
-#: Plugins of Mitsuba that are refused, and why.
+#: Refused Mitsuba plugins, and the reasons.
 _REFUSED = {
     "blender": "it reads places of the memory",
     "serialized": "its indices are not checked; convert the mesh to PLY or OBJ",
@@ -62,14 +62,14 @@ _AT_ONE_WAVELENGTH = "must be one number, the value at the laser's wavelength: o
 
 
 def check(document: SceneDocument) -> None:
-    """Check the types of the objects of an XML scene and its numbers, with the values of its parameters in place.
+    """Check the object types and the numbers in an XML scene, with its parameter values in place.
 
     Raises
     ------
     UserError
-        If the root is no scene; a type is not the name of a plugin; a library of plugins lies where `check_libraries`
-        forbids it, in a folder of `document.folders`; a number is not finite, not a number or out of its declared
-        range, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
+        If the root is no scene; a type is not the name of a plugin; a plugin library lies in a folder of
+        `document.folders` where `check_libraries` forbids it; a number is not finite, not a number or out of its
+        declared range, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
     """
     root = document.root
     if root.tagName != "scene" or root.getAttribute("type") not in ("", "scene"):
@@ -87,7 +87,7 @@ def check(document: SceneDocument) -> None:
 
 
 def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
-    """Check the numbers of an attribute of an element."""
+    """Check the numbers in an element's attribute."""
     element, attribute, value, owner = setting.element, setting.attribute, setting.value, setting.owner
     own = owner if attribute == "value" else f"{owner} {attribute}"
     first = setting.referred[:1]
@@ -114,7 +114,7 @@ def check_libraries(*folders: Path) -> None:
     """Raise `UserError` if a folder has a subfolder ``plugins`` with libraries.
 
     Mitsuba loads plugins from there, its own ones last: beside a scene, or in the current folder, they would run the
-    code of whoever made the scene.
+    scene author's code.
     """
     import mitsuba as mi
 
@@ -177,7 +177,7 @@ def check_dict(scene: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class _Label:
-    """Name and value of what sets a number, a parameter of the scene or an attribute, and the attribute's text."""
+    """Name and value of a setting for a number, a scene parameter or an attribute, and the attribute's text."""
 
     name: str
     value: str
@@ -220,7 +220,7 @@ def _check_numbers(label: _Label, tag: str, attribute: str, value: str) -> None:
 
 
 def _check_value(label: str, name: str, plugin: str, value: Any) -> None:
-    """Check a value, the numbers of a list, or those of a text that holds nothing else, as a plugin declares them."""
+    """Check a value, the numbers in a list, or in a text that contains nothing else, as a plugin declares them."""
     if name in FILE_PARAMETERS and isinstance(value, (int, float)):
         raise UserError(f"{label} = {value} must be a text, the name of a file")
     numbers = value if isinstance(value, (list, tuple)) else str(value).replace(",", " ").split()
@@ -235,14 +235,14 @@ def is_transform(value: object) -> bool:
 
 
 def matrix_of(matrix: Any) -> FloatArray:
-    """Return a matrix of Dr.Jit as an array: 4x4 of transforms, 3x3 of those of textures."""
-    # Dr.Jit pads the rows of a 3x3 matrix of plain numbers, and NumPy would take the padding for numbers.
+    """Return a Dr.Jit matrix as an array: 4x4 for transforms, 3x3 for texture transforms."""
+    # Dr.Jit pads the rows of a 3x3 matrix with plain numbers, and NumPy would read the padding as numbers.
     size = range(len(matrix))
     return np.array([[np.array(matrix[row, column]).item() for column in size] for row in size], dtype=np.float64)
 
 
 def _check_matrix(label: str, matrix: Any) -> None:
-    """Check the matrix of a transform."""
+    """Check a transform's matrix."""
     if not np.isfinite(matrix).all():
         raise UserError(f"{label} holds {matrix[~np.isfinite(matrix)][0]}: every number of a transform must be finite")
     if np.abs(matrix).max() > LARGEST_COORDINATE:

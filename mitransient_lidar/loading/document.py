@@ -1,8 +1,8 @@
-"""Documents of XML scenes: a tree of elements without includes, its parameters, and the values of its attributes.
+"""XML scene documents: an element tree without includes, its parameters, and its attribute values.
 
 A scene goes one way: a document is read from a file or a source, an instrument may be mounted (`instruments.mount`),
 its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_source`),
-and Mitsuba loads it (`scenes.open_scene`). Each step takes the document of the step before.
+and Mitsuba loads it (`scenes.open_scene`). Each step takes the previous step's document.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from mitransient_lidar.core.validation import shown
 #: Most files that a scene and its parts include.
 _MOST_FILES = 256
 
-#: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
+#: Deepest nesting of scene objects; Mitsuba's parser is recursive.
 DEEPEST_NESTING = 64
 
-#: Stands for a dollar sign that is part of a value in what Mitsuba parses, which takes every other one for a parameter.
+#: Represents a dollar sign that is part of a value in the text that Mitsuba parses; there every other dollar sign
+#: begins a parameter.
 DOLLAR = "\ue024"
 
-#: Most characters of an attribute with the values of parameters in place.
+#: Most characters in an attribute with its parameter values in place.
 _LONGEST_TEXT = 10**6
 
 
 class Setting(NamedTuple):
-    """Attribute of an element: its text, the text with parameters in place, and the names of those parameters."""
+    """Element attribute: its text, the text with parameters in place, and the names of those parameters."""
 
     element: minidom.Element
     attribute: str
@@ -44,7 +45,7 @@ class Setting(NamedTuple):
 
     @property
     def owner(self) -> str:
-        """Name of the parameter of a plugin that the element sets, else its tag."""
+        """Name of the plugin parameter that the element sets, else its tag."""
         return self.element.getAttribute("name") or self.element.tagName
 
 
@@ -55,11 +56,11 @@ class SceneDocument:
     Attributes
     ----------
     name
-        Name of the scene.
+        Scene name.
     root
         Root element; it is not changed.
     folder
-        Folder that names of files refer to.
+        Folder that file names refer to.
     parameters
         Values of its own parameters (``<default>``), as text.
     given
@@ -93,7 +94,7 @@ class SceneDocument:
 
     @cached_property
     def settings(self) -> list[Setting]:
-        """Attributes of all elements but ``<default>``, with the values of parameters in place.
+        """Attributes of all elements but ``<default>``, with parameter values in place.
 
         Defaults may refer to other parameters; other values are taken as they are.
         """
@@ -111,7 +112,7 @@ class SceneDocument:
 
     @cached_property
     def paths(self) -> dict[int, Path]:
-        """Folders of the elements ``<path>``, absolute, by the ids of their settings; raise UserError without one.
+        """Folders in the elements ``<path>``, absolute, by the ids of their settings; raise UserError without one.
 
         Mitsuba would look for a relative one in those before, too.
         """
@@ -178,11 +179,11 @@ def _refuse_includes(root: minidom.Element, place: Path | str) -> None:
     """Raise `UserError` if an element within a root includes a file, or the root does."""
     for include in [root] if root.tagName == "include" else root.getElementsByTagName("include"):
         name = include.getAttribute("filename")
-        raise UserError(f"scene {place} includes {name!r}: only the file of a scene may include others.")
+        raise UserError(f"scene {place} includes {name!r}: only the file of a scene may include others")
 
 
 def parameters_of(root: minidom.Element) -> dict[str, str]:
-    """Return names and default values of the parameters of an XML scene without includes, in their order."""
+    """Return names and default values of the parameters in an XML scene without includes, in their order."""
     parameters: dict[str, str] = {}
     for tag in root.getElementsByTagName("default"):
         parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
@@ -237,7 +238,7 @@ def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]
 
 
 def parse_part(text: str, place: Path | str) -> minidom.Element:
-    """Return the root element of the text of a scene or of a part; raise UserError as `parse_document`."""
+    """Return the root element of a scene or part text; raise UserError as `parse_document`."""
     check_xml(text, f"scene {place}")
     root = minidom.parseString(text).documentElement
     assert root is not None
@@ -258,7 +259,7 @@ def text_of(root: minidom.Element) -> str:
 
 
 def _written(node: minidom.Node, values: Mapping[int, Mapping[str, str]] | None = None) -> str:
-    """Return the XML of a node; with the attributes of elements by their ids, without parameters and comments."""
+    """Return a node's XML; with element attributes by their ids, without parameters and comments."""
     if not isinstance(node, minidom.Element):
         text: str = node.toxml() if values is None else "\n" * (node.nodeValue or "").count("\n")
         return text
@@ -273,9 +274,9 @@ def _written(node: minidom.Node, values: Mapping[int, Mapping[str, str]] | None 
 
 
 def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | None = None) -> minidom.Element:
-    """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them.
+    """Return a scene file's root element, with the parts that Mitsuba uses in place of includes.
 
-    `count` holds the number of files that are included so far.
+    `count` contains the number of files included so far.
     """
     root = parse_part(read_text(path), path)
     count = [0] if count is None else count
@@ -284,12 +285,12 @@ def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | N
         name = include.getAttribute("filename")
         part = next((found for file in files if is_there(found := file.parent / name)), None)
         if part is None:
-            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
+            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}")
         if part.resolve() in files:
-            raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
+            raise UserError(f"scene {path} includes {name!r}, which includes it in turn")
         count[0] += 1
         if count[0] > _MOST_FILES:
-            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit.")
+            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit")
         included = _expanded(part, files, count)
         content = list(included.childNodes)
         if included.tagName != "scene":

@@ -1,8 +1,8 @@
 """One thread at a time uses Mitsuba and Dr.Jit; others wait. It leaves Mitsuba's variant as it finds it.
 
-Where a kernel adds to an array, each thread of Dr.Jit's pool has its own copy. All other threads of the process share
+Where a kernel adds to an array, each thread in Dr.Jit's pool has its own copy. All other threads in the process share
 one copy, and they help with kernels while they wait: two that wait at once overwrite each other's sums and lose light.
-The virtual function calls that one thread records also see the objects of a scene that another thread is still loading.
+The virtual function calls that one thread records also see the objects in a scene that another thread is still loading.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class _Turn:
     def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
         try:
             if self._depth == 1 and kind is None and (drjit := sys.modules.get("drjit")):
-                # Arrays that another thread uses later must not wait for what this one has queued.
+                # Arrays that another thread uses later must not wait for this thread's queue.
                 drjit.eval()
                 drjit.sync_thread()
         finally:
@@ -62,8 +62,8 @@ def alone(
 ) -> Callable[_P, _R]:
     """Return a function that runs in one thread at a time, alone among all of these functions.
 
-    It may call others of them. The first one leaves the active variant of Mitsuba as it found it (`within`).
-    A Ctrl-C in the main thread ends its waiting.
+    It may call others of them. The first one leaves Mitsuba's active variant as it found it (`within`). A Ctrl-C in the
+    main thread ends its waiting.
     """
 
     @functools.wraps(function)

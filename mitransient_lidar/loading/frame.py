@@ -1,8 +1,8 @@
 """Coordinates relative to the lidar's aim: single precision is exact in scenes far from their origin.
 
 Mitsuba stores a parsed scene in double precision. Its objects, which compute in single precision, are then made in a
-frame whose origin is near the aim. Plugins of this package that know places take the place of the frame's origin, and
-keep their parameters as places in the scene; other objects are displaced by their ``to_world``.
+frame whose origin is near the aim. This package's plugins with locations take the frame's origin, and keep their
+parameters as scene coordinates; other objects are displaced by their ``to_world``.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 
-#: Distance of the aim from the origin of the scene up to which the frame is that of the scene [m].
+#: Distance from the scene's origin to the aim up to which the scene's own frame is used [m].
 _NEAR = 250.0
 
-#: Plugins of this package that know places, the first ones by their aim.
+#: This package's plugins with locations, the first ones by their aim.
 _LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
 _MESHES = ("ocean_surface", "seabed")
 _OWN = (*_LIDAR, *_MESHES, "layered_water")
 
-#: Plugins of Mitsuba that ``to_world`` places, and the points that place some of them before it.
+#: Mitsuba plugins that ``to_world`` places, and the points that place some of them before it.
 _PLACED = (
     *("bsplinecurve", "cube", "cylinder", "disk", "gridvolume", "instance"),
     *("linearcurve", "obj", "orthographic", "perspective", "ply", "projector", "radiancemeter", "rectangle"),
@@ -32,10 +32,10 @@ _PLACED = (
 )
 _POINTS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 
-#: Textures of Mitsuba by texture coordinates.
+#: Mitsuba textures that use texture coordinates.
 _BY_COORDINATES = ("bitmap", "checkerboard")
 
-#: Plugins of Mitsuba without a place of their own, of kinds that have one.
+#: Mitsuba plugins without a location of their own, in kinds that have one.
 _WITHOUT_PLACE = (
     *("area", "batch", "constant", "constvolume", "directional", "directionalarea", "envmap", "heterogeneous"),
     *("flat_sensor", "homogeneous", "irradiancemeter", "merge", "shapegroup", "sky", "sun", "sunsky", "timed_sunsky"),
@@ -43,10 +43,10 @@ _WITHOUT_PLACE = (
 
 
 def move_to_aim(parsed: Any) -> None:
-    """Place the objects of a parsed scene in a frame about its lidar's aim, if that is far from the scene's origin.
+    """Place a parsed scene's objects in a frame about its lidar's aim, if that is far from the scene's origin.
 
-    A scene with loaded objects, with plugins whose places are unknown, or with a texture on an ``ocean_surface``, or on
-    a seabed and another shape, stays where it is.
+    A scene with loaded objects, with plugins whose locations are unknown, or with a texture on an ``ocean_surface``, or
+    on a seabed and another shape, stays unmoved.
     """
     import mitsuba as mi
 
@@ -64,7 +64,7 @@ def move_to_aim(parsed: Any) -> None:
         return
     origin = round(aim[0]), round(aim[1]), 0
     to_scene = mi.ScalarAffineTransform4d().translate(list(origin))
-    # Members of a group lie about their instances.
+    # The members of a group lie about their instances.
     grouped = {index for node in nodes if _name(node) == "shapegroup" for index in _children(node)}
     for number, node in enumerate(nodes):
         if _name(node) in _OWN:
@@ -90,7 +90,7 @@ def _name(node: Any) -> str:
 
 
 def _aim(nodes: list[Any]) -> tuple[float, float] | None:
-    """Return the point (x, y) in view of the laser [m], of the receiver in a scene without one; None without both."""
+    """Return the point (x, y) [m] at which the laser aims, or without a laser the receiver; None without both."""
     lidars = sorted((node for node in nodes if _name(node) in _LIDAR), key=lambda node: _LIDAR.index(_name(node)))
     if not lidars:
         return None
@@ -105,7 +105,7 @@ def _aim(nodes: list[Any]) -> tuple[float, float] | None:
 
 
 def _is_movable(node: Any) -> bool:
-    """Return whether the place of a node is known."""
+    """Return whether a node's location is known."""
     import mitsuba as mi
 
     kinds = mi.ObjectType.Shape, mi.ObjectType.Sensor, mi.ObjectType.Emitter, mi.ObjectType.Medium, mi.ObjectType.Volume
@@ -121,7 +121,7 @@ def _is_movable(node: Any) -> bool:
 
 
 def _placement(node: Any) -> Any:
-    """Return the transform to the scene of a node of Mitsuba, whose points are then relative to the first of them."""
+    """Return the transform of a Mitsuba node to the scene, whose points are then relative to the first of them."""
     import drjit.scalar as ds
     import mitsuba as mi
 
@@ -143,7 +143,7 @@ def _transform(node: Any, name: str) -> Any:
 
 
 def _wrapped(to_uv: Any, node: Any) -> Any:
-    """Return the transform of a texture's coordinates by less than 2, the period of those that repeat or mirror."""
+    """Return a texture coordinate transform, shifted by less than 2, the period of textures that repeat or mirror."""
     if _name(node) == "bitmap" and node.props.get("wrap_mode", "repeat") == "clamp":
         return to_uv
     matrix = np.array(to_uv.matrix, dtype=np.float64)

@@ -1,8 +1,8 @@
-"""Instruments: transmitters and receivers of real lidars by name, with the source of each parameter.
+"""Instruments: real lidars' transmitters and receivers by name, with the source of each parameter.
 
-An instrument is an XML file in ``scenes/instruments``, a part of a scene: parameters (``<default>``), emitter and
-sensor. The first line of its first comment is the title; the rest describes the instrument and numbers its sources as
-[1], [2], ... The comment on the line of a parameter refers to a source, or says "assumed" if there is none.
+An instrument is an XML file in ``scenes/instruments``, a scene part: parameters (``<default>``), emitter and sensor.
+The first line of its first comment is the title; the rest describes the instrument and numbers its sources as [1], [2],
+... A parameter's comment on its own line refers to a source, or reads "assumed" if there is none.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mitransient_lidar.loading.document import (
 )
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
 
-#: Parameters of a scene that fit its own lidar: the limits of the time axis, and the resolution of the sea.
+#: Scene parameters that fit its own lidar: the limits of the time axis, and the resolution of the sea.
 _TIME_AXIS = ("time_start_ns", "bin_count")
 _SEA = ("refined_size", "cell_size", "shortest_wave")
 
@@ -50,9 +50,9 @@ class InstrumentParameter:
 
 @dataclass(frozen=True)
 class Instrument:
-    """Transmitter and receiver of a lidar.
+    """A lidar's transmitter and receiver.
 
-    `description` holds the sources; `channels` are the names of the pixels.
+    `description` contains the sources; `channels` are the pixel names.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Instrument:
 
 
 def instrument_names() -> list[str]:
-    """Return the names of the instruments in alphabetical order."""
+    """Return the instrument names in alphabetical order."""
     return sorted(path.stem for path in _folder().glob("[!_]*.xml"))
 
 
@@ -102,11 +102,11 @@ def receiver_text(name: str) -> str:
 
 
 def mount(name: str, scene: SceneDocument) -> SceneDocument:
-    """Replace laser and receiver of a scene by those of an instrument.
+    """Replace a scene's laser and receiver by an instrument's.
 
     The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
     its other emitters. Limits of the time axis and resolution of the sea, which fit the scene's own lidar, return to
-    their defaults, and parameters that nothing uses any longer are removed.
+    their defaults. Parameters that have become unused are removed.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     document, first = root.ownerDocument, root.firstChild
     assert document is not None
     document.insertBefore(document.createComment(_head(own).data), root)
-    # Of several defaults of a parameter, the first one counts.
+    # Of several defaults for a parameter, the first one counts.
     sources = {parameter.name: parameter.source for parameter in _parameters(own)}
     for key, value in values.items():
         default = document.createElement("default")
@@ -160,12 +160,12 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
 
 
 def _own_part(path: Path) -> minidom.Element:
-    """Return the root of an instrument's file without what it includes."""
+    """Return the root of an instrument's file without its includes."""
     return parse_part(read_text(path), path)
 
 
 def _keep_film(film: minidom.Element, own: minidom.Element) -> None:
-    """Replace the film of an instrument by the one of a scene, with the parameters of the instrument's."""
+    """Replace an instrument's film by a scene's, with the parameters of the instrument's film."""
     for child in [node for node in own.childNodes if isinstance(node, minidom.Element)]:
         for former in _named(film, child.getAttribute("name")):
             film.removeChild(former)
@@ -213,5 +213,5 @@ def _path(name: str) -> Path:
 
 
 def _folder() -> Path:
-    """Return the folder of the instruments."""
+    """Return the folder with the instruments."""
     return Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"

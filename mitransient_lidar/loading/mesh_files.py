@@ -1,8 +1,8 @@
-"""Checks of PLY files and grids before Mitsuba reads them: it trusts their counts and the indices of faces.
+"""Checks of PLY files and grids before Mitsuba reads them: it trusts their counts and face indices.
 
-A PLY file (Turk, 1994, "The PLY polygon file format") has a header of elements with counts and properties, and their
-values as text or as binary records. Mitsuba reads lists of three alone, so that all records of an element have one
-length, and names the vertices ``vertex`` and the triangles ``face``.
+A PLY file (Turk, 1994, "The PLY polygon file format") has a header that lists elements with counts and properties, and
+their values as text or as binary records. Mitsuba reads lists of three alone, so that all records of an element have
+one length, and names the vertices ``vertex`` and the triangles ``face``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from mitransient_lidar.core.validation import FloatArray
 #: Plugins that read PLY files, and those that read grids.
 PLY_PLUGINS, GRID_PLUGINS = ("ply", "ellipsoids", "ellipsoidsmesh"), ("gridvolume", "sdfgrid")
 
-#: Header of a grid: mark and version, type of the numbers, cells along x, y, z, channels, bounding box.
+#: Grid header: mark and version, number type, cells along x, y, z, channels, bounding box.
 _GRID_HEADER = struct.Struct("<3sB5i6f")
 
-#: Types of NumPy by the names of those in a header.
+#: NumPy types by their names in a header.
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -42,10 +42,10 @@ _TYPES = {
     "ulong": "u8",
 }
 
-#: Byte orders of NumPy by the formats of a file; text has none.
+#: NumPy byte orders by file format; text has none.
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-#: Longest header and line of it [bytes].
+#: Longest header and header line [bytes].
 _LONGEST_HEADER, _LONGEST_LINE = 2**20, 2**12
 
 #: Records that are checked at a time.
@@ -53,7 +53,7 @@ _AT_ONCE = 2**17
 
 
 class _Element(NamedTuple):
-    """Kind of records of a file: its name, their number, the types of their values, and which of these are in lists."""
+    """Record kind in a file: its name, their number, their value types, and which values are in lists."""
 
     name: str
     number: int
@@ -62,7 +62,7 @@ class _Element(NamedTuple):
 
 
 def check_ply(path: Path) -> None:
-    """Raise `UserError` if a PLY file is damaged, shorter or longer than its header says, or a face lacks a vertex."""
+    """Raise `UserError` if a PLY file is damaged, its length contradicts its header, or a face lacks a vertex."""
     damaged = f"{path} is damaged, or is not a PLY file of triangles."
     with damaged_file(damaged), open_file(path) as file:
         order, elements = _header(file)
@@ -77,7 +77,7 @@ def check_ply(path: Path) -> None:
 
 
 def check_grid(path: Path) -> None:
-    """Raise `UserError` if a file of Mitsuba's ``gridvolume`` has other than the numbers that its header says."""
+    """Raise `UserError` if the numbers in a file for Mitsuba's ``gridvolume`` differ from its header."""
     with damaged_file(f"{path} is damaged, or is not a grid of Mitsuba."), open_file(path) as file:
         _, _, _, *counts, channels = _GRID_HEADER.unpack(file.read(_GRID_HEADER.size))[:7]
         size = 4 * math.prod(counts) * channels + _GRID_HEADER.size
@@ -93,7 +93,7 @@ def _check_faces(path: Path, indices: FloatArray, vertices: int) -> None:
     """Raise `UserError` for an index of a face without a vertex."""
     # Not by index < 0 or index >= vertices, which are false for NaN.
     for index in indices[~((indices >= 0) & (indices < vertices))][:1]:
-        raise UserError(f"{path} has a face with the vertex {index:.15g}, and the vertices 0 to {vertices - 1} alone.")
+        raise UserError(f"{path} has a face with the vertex {index:.15g}, and the vertices 0 to {vertices - 1} alone")
 
 
 def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
@@ -101,7 +101,7 @@ def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
     order, elements = "", list[_Element]()
     while file.tell() < _LONGEST_HEADER:
         line = file.readline(_LONGEST_LINE).decode("utf-8", "replace").rstrip("\r\n")
-        # Mitsuba prints names that it does not know.
+        # Mitsuba prints unknown names.
         if printable(line, kept="\t") != line:
             raise ValueError(line)
         match line.split():
@@ -134,7 +134,7 @@ def _binary(file: BinaryIO, element: _Element, order: str) -> Iterator[FloatArra
 
 
 def _of_text(words: Iterator[bytes], element: _Element) -> Iterator[FloatArray]:
-    """Yield the values of records as `_binary`, of the words of a text."""
+    """Yield record values as `_binary`, from the words of a text."""
     width = len(element.types)
     for first in range(0, element.number, _AT_ONCE):
         count = min(_AT_ONCE, element.number - first)

@@ -21,10 +21,10 @@ from mitransient_lidar.loading.document import SceneDocument, Setting, drop_line
 from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE
 from mitransient_lidar.physics.water.water_types import default_water
 
-#: Plugins of Mitsuba that lidar scenes use.
+#: Mitsuba plugins that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
 
-#: Elements of XML that set a parameter of a plugin, which are the kinds of parameters.
+#: XML elements that set a plugin parameter, which are the parameter kinds.
 _TAGS = ("float", "integer", "boolean", "string")
 
 #: Plugins that an instrument brings.
@@ -33,7 +33,7 @@ _LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
 
 @dataclass(frozen=True)
 class ScenePlugin:
-    """A plugin of this package in a scene.
+    """A plugin from this package in a scene.
 
     Attributes
     ----------
@@ -42,11 +42,11 @@ class ScenePlugin:
     declared
         Declaration of its parameters.
     settings
-        Attributes that set parameters, by the names of these.
+        Attributes that set parameters, by parameter name.
     ids
-        Ids of the plugin and of the objects around it, and the name of the plugin.
+        Ids of the plugin and of the objects around it, and the plugin's name.
     is_fixed
-        Whether its parameters are those of an instrument, and have no names.
+        Whether its parameters are an instrument's, and have no names.
     """
 
     element: minidom.Element
@@ -63,11 +63,11 @@ class ScenePlugin:
                 yield one, [f"{prefix}{one.name}" for prefix in (prefixes if one.by_id else ["", *prefixes])]
 
     def value(self, parameter: Parameter) -> str:
-        """Return the value of a parameter as text, with parameters of the scene in place; empty without one."""
+        """Return a parameter's value as text, with scene parameters in place; empty without one."""
         setting = self.settings.get(parameter.name)
         if setting is not None and setting.value != "":
             return setting.value
-        # What the plugin chooses at another wavelength is no value of the scene.
+        # The plugin's choices at another wavelength are no scene values.
         if parameter.name in self._replaced:
             return ""
         given = self.settings.get("wavelength_nm")
@@ -87,7 +87,7 @@ class ScenePlugin:
         )
 
     def refer(self, parameter: Parameter, name: str) -> str:
-        """Take a parameter from that of the scene with a name; return the text of the value that it had."""
+        """Take a parameter from the scene parameter with a name; return the text of its former value."""
         setting, document = self.settings.get(parameter.name), self.element.ownerDocument
         assert document is not None
         element = document.createElement(parameter.tag)
@@ -101,7 +101,7 @@ class ScenePlugin:
 
 
 def plugins_of(document: SceneDocument) -> list[ScenePlugin]:
-    """Return the plugins of this package in a scene."""
+    """Return the plugins from this package in a scene."""
     settings: dict[int, dict[str, Setting]] = {}
     for one in document.settings:
         if one.attribute == "value" and one.element.tagName in _TAGS:
@@ -120,9 +120,9 @@ def plugins_of(document: SceneDocument) -> list[ScenePlugin]:
 
 
 def values_of(document: SceneDocument, *, by_id: bool = True) -> dict[str, str]:
-    """Return the values of all parameters of a scene as text: its own, and those that its plugins declare.
+    """Return the values of all parameters in a scene as text: its own, and those that its plugins declare.
 
-    They are empty for those without a value, and have names with ids, too, unless `by_id` is false.
+    They are empty for parameters without a value, and have names with ids, too, unless `by_id` is false.
     """
     found: dict[str, str] = {}
     for plugin in plugins_of(document):
@@ -134,11 +134,11 @@ def values_of(document: SceneDocument, *, by_id: bool = True) -> dict[str, str]:
 
 
 def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocument:
-    """Return a scene with given values of parameters in place of its own.
+    """Return a scene with given parameter values in place of its own.
 
-    These are the scene's own parameters, and those of its plugins: ``wind_speed`` of all plugins that have one, or
-    ``sea.wind_speed`` (in formulas ``sea_wind_speed``) of the one with this id, and of those inside it, or
-    ``sediment.model`` of all plugins of this name.
+    These are the scene's own parameters, and its plugins': ``wind_speed`` for all plugins that have one, or
+    ``sea.wind_speed`` (in formulas ``sea_wind_speed``) for the one with this id, and for those inside it, or
+    ``sediment.model`` for all plugins with this name.
 
     Raises
     ------
@@ -185,16 +185,16 @@ def _with_declared(document: SceneDocument, names: Sequence[str]) -> SceneDocume
         default = root.ownerDocument.createElement("default")
         default.setAttribute("name", name)
         default.setAttribute("value", value := next(filter(None, former), ""))
-        # Before its use, and behind what its value refers to.
+        # Before its use, and after the parameters that its value refers to.
         others = root.getElementsByTagName("default") if "$" in value else []
         root.insertBefore(default, others[-1].nextSibling if others else root.firstChild)
     return replace(document, parameters={**parameters_of(root), **document.parameters})
 
 
 def without_replaced(document: SceneDocument, given: Mapping[str, str]) -> SceneDocument:
-    """Return a scene without values in place of which given ones describe the same; plugins refuse two of them.
+    """Return a scene without values that describe the same as given ones; plugins refuse two of them.
 
-    Parameters of the scene that set such values are empty.
+    Scene parameters that set such values are empty.
     """
     replaced: list[Setting] = []
     for plugin in plugins_of(document):
@@ -229,15 +229,15 @@ def unknown_parameters(message: str) -> str | None:
 
 
 def value_of(parameters: Mapping[str, str], name: str) -> float:
-    """Return the value of a number among the parameters of a scene, in the unit of `core.parameters.catalogue.unit_of`.
+    """Return a number's value among a scene's parameters, in the unit of `core.parameters.catalogue.unit_of`.
 
     Parameters
     ----------
     parameters
-        Parameters of a scene with their values as text.
+        Scene parameters with their values as text.
     name
-        Name of a parameter; of a list, such as "0.9, 0.5", with the index of an element from 0 on (``attenuation[1]``).
-        A list of one value holds for every layer of ``layer_tops``, and has their indices, too.
+        Parameter name; for a list, such as "0.9, 0.5", with the index of an element from 0 on (``attenuation[1]``). A
+        list with one value holds for every layer of ``layer_tops``, and has their indices, too.
 
     Raises
     ------
@@ -249,9 +249,9 @@ def value_of(parameters: Mapping[str, str], name: str) -> float:
 
 
 def with_value(parameters: Mapping[str, str], name: str, value: float) -> dict[str, str]:
-    """Return a copy of the parameters of a scene in which the number `name` of `value_of` has another value.
+    """Return a copy of a scene's parameters in which the number `name`, as in `value_of`, has another value.
 
-    A list of one value that holds for several layers gets one value for each of them.
+    A list with one value that holds for several layers gets one value for each.
     """
     words, index = _words(parameters, name)
     words[index] = repr(finite(name, value))
@@ -259,12 +259,12 @@ def with_value(parameters: Mapping[str, str], name: str, value: float) -> dict[s
 
 
 def parameter_of(name: str) -> str:
-    """Return the name of the parameter that holds a number: without the index of an element."""
+    """Return the name of the parameter that contains a number: without the element's index."""
     return name.partition("[")[0]
 
 
 def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
-    """Return the numbers of a parameter as text, and the index of the one with a name."""
+    """Return a parameter's numbers as text, and the index of the one with a name."""
     known = parameter_of(name)
     index = re.fullmatch(r"\[(\d{1,9})\]", name[len(known) :])
     if known not in parameters or (index is None and known != name):
@@ -286,7 +286,7 @@ def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
 
 
 def _closest(name: object, known: Collection[str], own: Collection[str] = ()) -> str:
-    """Return what to say of an unknown name: known ones that are close to it or longer, or the scene's own, if any."""
+    """Return a hint about an unknown name: close or longer known names, or the scene's own, if any."""
     alike = [one for one in known if ("." in one) == ("." in str(name))]
     longer = [one for one in alike if one.startswith(f"{name}_")]
     close = list(dict.fromkeys([*difflib.get_close_matches(str(name), alike, n=3), *longer[:3]]))
@@ -301,7 +301,7 @@ def check_params(params: object) -> None:
 
 
 def _text(name: str, value: Any) -> str:
-    """Return the value of a parameter as in XML."""
+    """Return a parameter's value as in XML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (list, tuple)):

@@ -1,7 +1,7 @@
-"""Values of a scene given as a dict in types of JSON, and back.
+"""Values of a dict scene in JSON types, and back.
 
-A transform is {"matrix": 4x4, "inverse_transpose": 4x4}, with 3x3 numbers of a texture. An image, a volume or a tensor,
-which no file holds, is {"stored": its type, "data": its bytes, compressed, as text of base 64} with shape and format.
+A transform is {"matrix": 4x4, "inverse_transpose": 4x4}, with 3x3 numbers for a texture. An image, a volume or a tensor
+without a file is {"stored": its type, "data": its bytes, compressed, as base 64 text} with shape and format.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MOST_STORED, _MOST_IN_MEMORY = 2**20, 2**26
 
 
 def to_json(value: Any) -> Any:
-    """Return a value of a dict scene in types of JSON; raise TypeError for an unknown one."""
+    """Return a dict scene's value in JSON types; raise TypeError for an unknown one."""
     import mitsuba as mi
 
     if isinstance(value, Mapping):
@@ -48,7 +48,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(value: Any) -> Any:
-    """Return a value of a dict scene from `to_json`."""
+    """Return a dict scene's value from `to_json`."""
     if isinstance(value, list):
         return [tuple(item) if isinstance(item, list) else item for item in value]
     if not isinstance(value, dict):
@@ -83,7 +83,7 @@ def _stored(value: Any) -> dict[str, Any]:
 
 
 def _file_of(volume: mi.VolumeGrid) -> bytes:
-    """Return the bytes of the file of a volume."""
+    """Return the bytes of a volume's file."""
     import mitsuba as mi
 
     stream = mi.MemoryStream()
@@ -92,7 +92,7 @@ def _file_of(volume: mi.VolumeGrid) -> bytes:
 
 
 def _restored(value: Mapping[str, Any]) -> Any:
-    """Return the image, volume or tensor of `_stored`."""
+    """Return the image, volume or tensor from `_stored`."""
     import mitsuba as mi
 
     raw = zlib.decompressobj().decompress(base64.b64decode(value["data"], validate=True), _MOST_IN_MEMORY)

@@ -1,22 +1,22 @@
-"""The scene of a result: its text, the files that it names, and the values of all parameters of its plugins.
+"""The scene of a result: its text, its files, and the values of all its plugin parameters.
 
 A result has these attributes:
 
 ``scene_xml``
     Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters,
-    and of those that its plugins declare.
+    including the parameters that its plugins declare.
 ``scene_dict``
     Instead, a scene given as a dict, as JSON (`scene_json`).
 ``instrument``
-    Name of the instrument whose laser and receiver the XML holds in place of the scene's own.
+    Name of the instrument whose laser and receiver the XML contains in place of the scene's own.
 ``sensor``
-    Id of the receiver that was chosen among several.
+    Id of the chosen receiver among several.
 ``scene_files``
-    JSON list of the files that the scene names: ``plugin``, ``name`` as in the scene, absolute ``path``, ``sha256``.
+    JSON list of the scene's files: ``plugin``, ``name`` as in the scene, absolute ``path``, ``sha256``.
 ``plugin_parameters``
-    JSON object of the objects of the scene and the integrator: ``type`` (of Mitsuba's own plugins ``class``) and values
+    JSON object with the scene's objects and the integrator: ``type`` (for Mitsuba's own plugins ``class``) and values
     of all parameters, nested objects included; null for one that is not given and has no default, or is not used.
-    ``used`` holds values that were chosen for automatic ones.
+    ``used`` contains values that were chosen for automatic ones.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from mitransient_lidar.loading.scene_json import from_json, to_json
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Origin of a frame that is that of the scene.
+#: Origin of the scene's own frame.
 _ORIGIN = np.zeros(3)
 
 #: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
@@ -60,24 +60,25 @@ _MOST_VALUES = 16
 
 @dataclass(frozen=True)
 class SceneSource:
-    """What loads a scene again.
+    """The information that loads a scene again.
 
     Parameters
     ----------
     name
-        Name of the scene.
+        Scene name.
     text
         XML with includes in place, or JSON of a dict.
     is_xml
         Whether the text is XML.
     parameters
-        Own parameters of an XML scene with their values as text; of a result those that its plugins declare, too.
+        Own parameters of an XML scene with their values as text; for a result also the parameters that its plugins
+        declare.
     files
         Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     instrument
-        Name of the instrument of an XML scene; empty if its laser and receiver are its own.
+        Name of an XML scene's instrument; empty if its laser and receiver are its own.
     sensor
-        Id of a receiver of the scene; empty for the first one.
+        Id of a receiver in the scene; empty for the first one.
     """
 
     name: str
@@ -90,7 +91,7 @@ class SceneSource:
 
     @classmethod
     def of_document(cls, document: SceneDocument, former: SceneSource | None = None) -> SceneSource:
-        """Return the source of an XML scene, with the files of the source that it was read from.
+        """Return an XML scene's source, with the files of the source that it was read from.
 
         Files that given parameters name are found as in any scene. Raises UserError for a file that is no regular one,
         or a damaged mesh.
@@ -117,13 +118,13 @@ class SceneSource:
     def from_attributes(cls, attributes: Mapping[str, Any], folder: Path | None = None) -> SceneSource:
         """Return the source that `attributes` has written.
 
-        A file that is missing or has changed is looked for by its name and SHA-256 in the `folder` of the result, and
-        in the working folder.
+        A missing or changed file is looked for by its name and SHA-256 in the result's `folder`, and in the working
+        folder.
 
         Raises
         ------
         UserError
-            If the attributes hold no scene, or are damaged, or the name of the scene is not that of a file.
+            If the attributes contain no scene, or are damaged, or the scene's name is no file name.
         """
         kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
         if not kinds:
@@ -147,7 +148,7 @@ class SceneSource:
         files = {key: (_copy_of(*file, folders), file[1]) for key, file in found.items()}
         name = attributes.get("scene", "scene")
         instrument, sensor = (str(attributes.get(one, "")) for one in ("instrument", "sensor"))
-        # Names of outputs begin with it.
+        # Output names begin with it.
         if not is_file_name(name):
             raise UserError(
                 f"the attribute scene = {shown(name)} of the result is damaged: it must be the name of a file, without "
@@ -157,7 +158,7 @@ class SceneSource:
 
     @cached_property
     def values(self) -> dict[str, str]:
-        """Values of all parameters of an XML scene as text: its own and those that its plugins declare."""
+        """Values of all parameters in an XML scene as text: its own and those that its plugins declare."""
         return values_of(self.document()) if self.is_xml else {}
 
     def attributes(self) -> dict[str, str]:
@@ -176,13 +177,13 @@ class SceneSource:
         return described
 
     def document(self) -> SceneDocument:
-        """Return the document of an XML scene, with the values of its parameters; raise UserError if it is damaged."""
+        """Return an XML scene's document, with its parameter values; raise UserError if it is damaged."""
         document = parse_document(self.name, self.text)
         parameters = {name: self.parameters.get(name, value) for name, value in document.parameters.items()}
         return replace(document, parameters=parameters, instrument=self.instrument)
 
     def place_files(self, document: SceneDocument) -> str:
-        """Return the XML of a scene without parameters, with the paths of its files.
+        """Return a scene's XML without parameters, with the paths of its files.
 
         Raises
         ------
@@ -217,7 +218,7 @@ class SceneSource:
 
 
 def json_attribute(attributes: Mapping[str, Any], name: str) -> Any:
-    """Return the value of an attribute of JSON; raise UserError if it is missing or damaged."""
+    """Return a JSON attribute's value; raise UserError if it is missing or damaged."""
     if name not in attributes:
         raise UserError(f"the result has no attribute {name}, without which it is not rendered again")
     return parse_json(attributes[name], f"the attribute {name} of the result")
@@ -240,7 +241,7 @@ def plugin_values(scene: mi.Scene, integrator: Any = None, used: Used = ()) -> s
 
 
 def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray, used: Used) -> dict[str, Any]:
-    """Return the parameters of objects by their ids or names, else by the names of their plugins."""
+    """Return the objects' parameters by their ids or names, else by their plugins' names."""
     described: dict[str, Any] = {}
     for given, part in objects:
         values = object_values(part, origin, used)
@@ -253,9 +254,9 @@ def _named(objects: Iterable[tuple[str, mi.Object]], origin: FloatArray, used: U
 
 
 def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()) -> dict[str, Any]:
-    """Return the parameters of an object, and its nested objects, in types of JSON.
+    """Return an object's parameters, and its nested objects, in JSON types.
 
-    `origin` is the place of the frame's origin in the scene [m]: places are in the scene.
+    `origin` is the frame's origin in the scene [m]: positions are scene coordinates.
     """
     import drjit as dr
     import mitsuba as mi
@@ -268,7 +269,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
         small = {name: _plain(value) for name, value in values.items() if dr.width(value) <= _MOST_VALUES}
         if isinstance(part, (mi.Shape, mi.Sensor)):
             small = {name: _in_scene(name, value, origin) for name, value in small.items()}
-        # Members of a group lie about their instances.
+        # The members of a group lie about their instances.
         inner = _ORIGIN if part.class_name() == "ShapeGroup" else origin
         return {"class": part.class_name(), **small, **_named(objects, inner, used)}
     own = part.parameters
@@ -281,7 +282,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
 
 
 def _in_scene(name: str, value: Any, origin: FloatArray) -> Any:
-    """Return a value of a shape or a sensor of Mitsuba with its places in the scene, not in a frame there."""
+    """Return a value of a Mitsuba shape or sensor with its positions in the scene, not in a frame there."""
     if not origin.any():
         return value
     if name == "to_world":
@@ -292,7 +293,7 @@ def _in_scene(name: str, value: Any, origin: FloatArray) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value of a parameter in types of JSON: a number, a text, or a list; a transform as its matrix."""
+    """Return a parameter's value in JSON types: a number, a text, or a list; a transform as its matrix."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if is_transform(value):
@@ -317,7 +318,7 @@ def _files_of(document: SceneDocument) -> Iterator[tuple[str, Setting]]:
 
 
 def _files_of_dict(scene: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the plugin and the name of each file of a scene given as a dict."""
+    """Yield the plugin and the name of each file in a dict scene."""
     for key, value in scene.items():
         if isinstance(value, Mapping):
             yield from _files_of_dict(value)
@@ -328,8 +329,8 @@ def _files_of_dict(scene: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> dict[tuple[str, str], tuple[str, str]]:
     """Return path and SHA-256 of the files that exist, relative to the working folder.
 
-    Files of Mitsuba's plugins are looked for in the folders of the scene before, and in those of its file resolver.
-    Raises UserError if one of the files is no regular one, has control characters in its name, or is a damaged mesh.
+    Files for Mitsuba's plugins are first looked for in the scene's folders and in Mitsuba's file resolver. Raises
+    UserError if a file is no regular one, has control characters in its name, or is a damaged mesh.
     """
     import mitsuba as mi
 
@@ -360,7 +361,7 @@ def _check_file(plugin: str, path: Path, _digest: str) -> None:
 
 
 def _copy_of(path: str, digest: str, folders: Sequence[Path]) -> str:
-    """Return the path of a file, or of its copy in one of some folders where it is missing or has another SHA-256."""
+    """Return a file's path; if it is missing or has another SHA-256, the path of its copy in one of some folders."""
     places = [Path(path), *(folder / Path(path).name for folder in folders)]
     same = (place for place in places if place.is_file() and _sha256(place) == digest)
     return str(next(same, places[0]).absolute())
@@ -388,6 +389,6 @@ def _sha256(path: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _hashed(path: Path, size: int, modified_ns: int) -> str:
-    """Return the SHA-256 of a file in a state, which a series of renders computes once."""
+    """Return a file's SHA-256 in a state, computed once in a series of renders."""
     with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

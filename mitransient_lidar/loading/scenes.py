@@ -1,4 +1,4 @@
-"""Loading of scenes, with error messages of one sentence."""
+"""Scene loading, with error messages of one sentence."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A loaded scene, its name, all parameters of an XML scene with their values as text, and what loads it again.
+    """A loaded scene, its name, all XML parameters with their values as text, and the source that loads it again.
 
-    The source is None for a scene from loaded objects. `sensor_id` is that of the receiver, empty for the first one.
+    The source is None for a scene from loaded objects. `sensor_id` is the receiver's id, empty for the first one.
     """
 
     scene: mi.Scene
@@ -63,10 +63,10 @@ class LoadedScene:
         used: Mapping[str, float] | None = None,
         **others: Any,
     ) -> dict[str, Any]:
-        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_source`.
+        """Return a result's attributes: scene, versions, integrator, others, and the attributes from `scene_source`.
 
-        ``record_end`` is what the last light of a time axis of automatic length comes from. `used` are the values that
-        were chosen for automatic parameters of the integrator.
+        ``record_end`` is the source of the last light on a time axis with automatic length. `used` are the values that
+        were chosen for automatic integrator parameters.
         """
         again = {} if self.source is None else self.source.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
@@ -80,7 +80,7 @@ class LoadedScene:
         return {"scene": self.name, **variants.versions(), **own, **others, **again}
 
     def tell_axis(self, axis: TimeAxis, end: str) -> None:
-        """Log time bins, and what ends them, where the film leaves their start or number to the scene."""
+        """Log time bins, and the reason for their end, where the film leaves their start or number to the scene."""
         if self.sensor.film().axis is None:
             text = f"{axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
             logger.info("time axis: %s%s", text, f"; it ends {end}" if end else "")
@@ -101,25 +101,25 @@ def open_scene(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the source of a
-        scene. A `LoadedScene` is returned as it is, without `params` and `sensor`.
+        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or a scene source.
+        A `LoadedScene` is returned unchanged, without `params` and `sensor`.
     params
-        Values for the parameters of an XML scene, its own (``<default>``) and those of its plugins, as of
+        Values for the parameters of an XML scene, its own (``<default>``) and its plugins', as in
         `loading.parameters.fill`, and of the instrument.
     instrument
-        Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
+        Name of the instrument whose laser and receiver replace an XML scene's; see `instruments.mount`.
     variant
         Mitsuba variant, as for `variants.set_variant`.
     model
         Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
     sensor
-        Id of a receiver, by default that of a source, or the first one.
+        Id of a receiver, by default the source's, or the first one.
 
     Raises
     ------
     UserError
-        If there is no such scene, instrument or receiver, a parameter is unknown, not used or empty, a value is
-        invalid, a part is missing, or a file of a source is missing or has changed.
+        If there is no such scene, instrument or receiver; a parameter is unknown, not used or empty; a value is
+        invalid; a part is missing; or a source file is missing or has changed.
     """
     if isinstance(scene, LoadedScene) and not params and not sensor:
         return scene
@@ -157,9 +157,9 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[True]) -> D
 
 
 def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator | DaylightIntegrator:
-    """Return an integrator from its name, a dict or itself, by default that of the scene.
+    """Return an integrator from its name, a dict or itself, by default the scene's.
 
-    For `passive` the default is ``passive_volpath`` if that of the scene is not one for daylight.
+    For `passive` the default is ``passive_volpath`` if the scene's integrator does not render daylight.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
             raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
         given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
         check_dict(given)
-        # The files of objects in it, which no integrator of ours has, are checked as well.
+        # Files of objects in it, which no integrator of this package has, are checked as well.
         SceneSource.of_dict(given)
         with as_user_error():
             chosen = mi.load_dict(given, parallel=False)
@@ -206,11 +206,11 @@ def read_source(
     instrument: str | None,
     origin: tuple[float, float] | None = None,
 ) -> SceneSource:
-    """Return the source of an XML scene with an instrument, and of its files with given parameters, without loading it.
+    """Return the source of an XML scene with an instrument, and its files with given parameters, without loading it.
 
     Its parameters have the values of the scene and the instrument. Where the scene has an origin in map coordinates
-    [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments, and
-    errors, are those of `open_scene`, but for what only loading finds.
+    [m], height maps in such coordinates lie about it, unless their seabeds have an ``origin_x``. Other arguments and
+    errors as in `open_scene`, except errors that only loading finds.
     """
     check_params(params)
     document = _document(scene, instrument)
@@ -238,12 +238,12 @@ def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> Sc
             number.setAttribute("name", name)
             number.setAttribute("value", repr(value))
             seabed.appendChild(number)
-    # Settings of the copy are those before its change.
+    # The copy has the settings before its change.
     return replace(changed) if placed else document
 
 
 def _document(scene: SceneSource | str | os.PathLike[str], instrument: str | None) -> SceneDocument:
-    """Return the document of an XML scene, with the laser and the receiver of an instrument."""
+    """Return an XML scene's document, with an instrument's laser and receiver."""
     document = scene.document() if isinstance(scene, SceneSource) else read_document(scene_path(scene))
     return document if instrument is None else mount(instrument, document)
 
@@ -261,7 +261,7 @@ def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
 
     given = scene.scene_dict() if isinstance(scene, SceneSource) else scene
     check_dict(given)
-    # Of a source, too: its files are those that it names, not those that it lists.
+    # A source's files are the files in the scene, too, not the files in its list.
     found = SceneSource.of_dict(given)
     source = scene if isinstance(scene, SceneSource) else found
     with as_user_error(), _own_file_resolver():
@@ -271,7 +271,7 @@ def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
 
 
 def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a dict with other tensors of the same numbers: Mitsuba empties those of which it makes textures."""
+    """Return a dict with copies of its tensors: Mitsuba empties tensors that become textures."""
     import mitsuba as mi
 
     def own(value: Any) -> Any:
@@ -285,7 +285,7 @@ def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
 def _load_xml(
     scene: SceneSource | str | os.PathLike[str], params: Mapping[str, Any] | None, instrument: str | None
 ) -> LoadedScene:
-    """Load an XML scene by the steps of `loading.document`."""
+    """Load an XML scene by the steps in `loading.document`."""
     import mitsuba as mi
 
     document = _filled(_document(scene, instrument), params)
@@ -303,7 +303,8 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
     from mitransient_lidar.plugins.ocean_surface import WAITS
 
     config = mi.parser.ParserConfig(mi.variant())
-    # Merging would make of a bottom and a target of one material a shape without a name. Several threads save no time.
+    # Merging would turn a bottom and a target with one material into a shape without a name. Several threads save no
+    # time.
     config.merge_equivalent = config.merge_meshes = config.parallel = False
     parsed = parse(config)
     for node in parsed.nodes:
@@ -326,7 +327,7 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
 
 @contextlib.contextmanager
 def _own_file_resolver(folder: Path | None = None) -> Iterator[None]:
-    """Add a folder to those in which Mitsuba looks for files; remove it, and those of ``<path>``, afterwards."""
+    """Add a folder to Mitsuba's search path for files; remove it, and the ``<path>`` folders, afterwards."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()
@@ -343,12 +344,12 @@ def _own_file_resolver(folder: Path | None = None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_user_error(document: SceneDocument | None = None) -> Iterator[None]:
-    """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
+    """Convert a ``RuntimeError`` from Mitsuba's parser to a `UserError` with one sentence.
 
-    Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
-    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. A message that quotes bytes of a
-    file which are no UTF-8 comes as a ``UnicodeDecodeError``. Where a message names a parameter
-    of a plugin that a given parameter of the document sets under another name, that name is added.
+    Mitsuba wraps an exception from a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError``
+    or Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. A message that quotes file
+    bytes outside UTF-8 arrives as a ``UnicodeDecodeError``. A message may name a plugin parameter that a given document
+    parameter sets under another name; that name is then added.
     """
     try:
         yield

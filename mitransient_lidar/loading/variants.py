@@ -1,4 +1,4 @@
-"""Mitsuba variants: search for LLVM, choice of a variant, registration of the plugins."""
+"""Mitsuba variants: search for LLVM, variant choice, plugin registration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OLDEST_USABLE_LLVM = 17
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
-#: Modules of the plugins, below ``mitransient_lidar.plugins``, each with the kind of its plugin.
+#: Plugin modules, below ``mitransient_lidar.plugins``, each with its plugin's kind.
 PLUGIN_MODULES = {
     "bases": None,  # first, with phase.tabulated: others derive from them
     "phase.tabulated": None,
@@ -209,10 +209,10 @@ def kept() -> Iterator[None]:
 
 
 def leave_the_gpu(what: str) -> None:
-    """Go on with ``llvm_ad_mono``, and say so once, where ``cuda_ad_mono`` is active, or would be chosen.
+    """Go on with ``llvm_ad_mono``, and report it once, where ``cuda_ad_mono`` is active, or would be chosen.
 
-    `what` is rendered through several Mitsuba scenes in one kernel. OptiX traces rays through the first of them only:
-    the light of the others would be missing without a word.
+    `what` is rendered through several Mitsuba scenes in one kernel. OptiX traces rays through the first scene only:
+    light in the other scenes would be missing without a message.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Integrals and crossings of functions that are linear between nodes, and the inside of polygons."""
+"""Integrals and crossings for functions that are linear between nodes, and the inside of polygons."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def first_crossing(t: FloatArray, values: FloatArray, level: float) -> float:
 
 
 def inside_polygon(corners: FloatArray, x: Any, y: Any) -> Any:
-    """Return whether points, arrays of any library, have an odd number of edges between them and x = infinity.
+    """Return whether points, in arrays of any library, have an odd number of edges between them and x = infinity.
 
     Corners (x, y) have the shape (n, 2), at least three that are not on one line.
     """

@@ -1,4 +1,4 @@
-"""Leaves of plants on a bottom: blades that stand on it, or a layer of leaves at random, and their gaps."""
+"""Plant leaves on a bottom: blades that stand on it, or a layer of random leaves, and their gaps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitransient_lidar.core.validation import FloatArray, require_memory
 #: Memory of a leaf: its two triangles, their copy in Mitsuba and the tree in which rays meet them [bytes].
 _BYTES_PER_LEAF = 500
 
-#: Corners of a leaf in halves of its width and shares of its length, and its triangles.
+#: Leaf corners in half widths and shares of the length, and its triangles.
 _CORNERS = (-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0)
 _TRIANGLES = (0, 1, 2), (0, 2, 3)
 
@@ -22,25 +22,25 @@ _TRIANGLES = (0, 1, 2), (0, 2, 3)
 class Canopy:
     """Leaves in a layer over a bottom.
 
-    Leaves lie at random places, so that light passes them unhindered in a direction at the angle theta from the
-    vertical with the probability exp(-G L / cos theta), for the leaf area index L and the mean projection G of leaves
-    on that direction (Nilson 1971, Agric. Meteorol. 8, 25, doi:10.1016/0002-1571(71)90092-6).
+    Leaves lie at random locations. Light at the angle theta from the vertical passes them unhindered with the
+    probability exp(-G L / cos theta), for the leaf area index L and the mean leaf projection G on that direction
+    (Nilson 1971, Agric. Meteorol. 8, 25, doi:10.1016/0002-1571(71)90092-6).
 
     Attributes
     ----------
     leaf_area_index
-        Area of leaves, of one side, per area of the bottom, above 0.
+        One-sided leaf area per bottom area, above 0.
     height
-        Height of their tips above the bottom [m], above 0.
+        Height of the tips above the bottom [m], above 0.
     leaf_width
-        Width of a leaf [m]; without blades side of a square leaf.
+        Leaf width [m]; without blades the side of a square leaf.
     bending
-        Angle of blades with the vertical [rad], 0 to 1.4; None for square leaves that look in all directions alike,
+        Blade angle from the vertical [rad], 0 to 1.4; None for square leaves that look in all directions alike,
         everywhere in the layer.
     bending_azimuth
-        Azimuth towards which they lean, from +x to +y [rad]; None for any.
+        Azimuth towards which blades lean, from +x to +y [rad]; None for any.
     shoot_density
-        Shoots per area [1/m^2], whose blades stand at one place; None for blades that stand alone.
+        Shoots per area [1/m^2], whose blades stand at one location; None for blades that stand alone.
     """
 
     leaf_area_index: float
@@ -61,19 +61,19 @@ class Canopy:
 
     @property
     def leaf_length(self) -> float:
-        """Length of a leaf [m]."""
+        """Leaf length [m]."""
         return self.leaf_width if self.bending is None else self.height / math.cos(self.bending)
 
     @property
     def density(self) -> float:
-        """Number of leaves per area of the bottom [1/m^2]."""
+        """Leaves per bottom area [1/m^2]."""
         return self.leaf_area_index / (self.leaf_length * self.leaf_width)
 
     def projection(self, zenith: float) -> float:
         """Return the mean projection of leaves on a direction at an angle from the vertical [rad].
 
-        1/2 for leaves in all directions alike; 2/pi times the mean sine of the angle to blades that lean in any
-        direction and face any way (Warren Wilson 1960, doi:10.1111/j.1469-8137.1960.tb06210.x).
+        1/2 for leaves that look in all directions alike; 2/pi times the mean sine of the angle to blades that lean in
+        any direction and face any way (Warren Wilson 1960, doi:10.1111/j.1469-8137.1960.tb06210.x).
         """
         if self.bending is None:
             return 0.5
@@ -94,15 +94,15 @@ class Canopy:
         Parameters
         ----------
         side
-            Side of the square in which blades stand, or leaves have their centres [m].
+            Side of the square that contains the blades, or the leaf centres [m].
         seed
-            Seed of the random numbers.
+            Random seed.
 
         Returns
         -------
         feet, width, length : ndarray
-            Middle of the lower edge of each leaf [m], and vectors along that edge and away from it, as long as the leaf
-            is wide and long [m]; shape (leaves, 3).
+            Middle of each leaf's lower edge [m], and vectors along that edge and away from it, as long as the leaf is
+            wide and long [m]; shape (leaves, 3).
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Figure of a campaign: a sample of its records, the distributions of its parameters, and its responses."""
+"""Campaign figure: sample records, parameter distributions, and responses."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
 
-#: Records of the sample, most parameters and pairs of them that are drawn, and runs that the responses are taken from.
+#: Sample records, most parameters and parameter pairs that are drawn, and runs that give the responses.
 _SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
 
-#: Cells of a response surface along each side.
+#: Cells per side of a response surface.
 _CELLS = 10
 
-#: Range that is drawn below the peak, of powers and of noisy signals.
+#: Range drawn below the peak, for powers and for noisy signals.
 _DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}
 
 #: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
@@ -36,23 +36,23 @@ _DONE = 1
 def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, seed: int = 0) -> Figure:
     """Draw a campaign.
 
-    Above: a random sample of records, the first pixel of each. In the middle: the distributions of the parameters.
-    Below, over pairs of parameters: the mean over runs of the share of records with a bottom echo, else of the peak
-    power, else of the error.
+    Above: a random sample of records, the first pixel of each. In the middle: the parameter distributions. Below, over
+    parameter pairs: the mean over runs of the share of records with a bottom echo, else of the peak power, else of the
+    error.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A campaign as of `campaigns.store.open_campaign`.
+        A campaign as from `campaigns.store.open_campaign`.
     path : path-like, optional
         PNG, PDF or SVG file to write.
     seed : int
-        Seed of the sample.
+        Sample seed.
 
     Raises
     ------
     UserError
-        If no run is done, or the name of the file has another suffix.
+        If no run is done, or the file name has another suffix.
     """
     figure = drawing.new_figure(path, 11.0, 9.6)
     done = np.flatnonzero(dataset["status"].values == _DONE)
@@ -82,7 +82,7 @@ def _inputs(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> dict[str, npt.ND
 
 
 def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> None:
-    """Draw records of runs."""
+    """Draw the records of runs."""
     name = next((name for name in ("signal", "waveform") if name in dataset), None)
     if name is None:
         ax.text(0.5, 0.5, "no records are kept", ha="center", va="center")
@@ -94,8 +94,8 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     # Records of other heights side by side: each relative to its own peak.
     peaks = values.max(axis=1, keepdims=True)
     values = values / np.where(peaks > 0, peaks, 1)
-    # A logarithmic axis has no values below 0, and lower ones would be drawn as a level, as would be that of the dark
-    # before the first light: behind a converter it is the code next to 0.
+    # A logarithmic axis has no values below 0, and lower ones would be drawn as a level. So would the dark before the
+    # first light: after a converter it is the code next to 0.
     values[(values < 1 / _DYNAMIC_RANGE[name]) | (values <= values[:, :1])] = np.nan
     ax.set_yscale("log")
     ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
@@ -108,7 +108,7 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
 
 
 def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> None:
-    """Draw how often each value of a parameter occurs."""
+    """Draw how often each parameter value occurs."""
     shown = dict(itertools.islice(inputs.items(), _MOST_PARAMETERS))
     if not shown:
         return
@@ -127,7 +127,7 @@ def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> Non
 def _draw_responses(
     figure: Any, dataset: xr.Dataset, runs: npt.NDArray[np.intp], inputs: dict[str, npt.NDArray[Any]]
 ) -> None:
-    """Draw the mean response over pairs of parameters."""
+    """Draw the mean response over parameter pairs."""
     response, label = _response(dataset, runs)
     axes = {name: column for name, column in inputs.items() if column.dtype.kind in "if"}
     pairs = list(itertools.islice(itertools.combinations(axes, 2), _MOST_PAIRS))
@@ -155,7 +155,7 @@ def _draw_responses(
 
 
 def _response(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> tuple[FloatArray, str]:
-    """Return a quantity of each run, and its name."""
+    """Return a quantity for each run, and its name."""
     if "echo_flags" in dataset:
         flags = dataset["echo_flags"].sel(echo="bottom").isel(run=runs).values.reshape(len(runs), -1)
         return np.asarray(np.mean((flags & _NO_ECHO) == 0, axis=1)), "share of records with a bottom echo"
@@ -179,7 +179,7 @@ def _is_logarithmic(column: npt.NDArray[Any]) -> bool:
 
 
 def _edges(column: npt.NDArray[Any]) -> FloatArray:
-    """Return the edges of cells: about each of few values, or even ones over the range of many."""
+    """Return cell edges: about each of few values, or even ones over the range of many."""
     values = np.unique(column).astype(np.float64)
     if values.size <= _CELLS:
         middle = 0.5 * (values[1:] + values[:-1])

@@ -1,4 +1,4 @@
-"""Figure of two results and their differences."""
+"""Figure for two results and their differences."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def plot_comparison(
 ) -> Figure:
     """Draw two results with bands of two standard errors, and below them their difference in standard errors.
 
-    Of more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results
-    have the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
+    For more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results
+    have the same pixels and time bins; `outcome` comes from `analysis.comparison.compare`.
     """
     figure = drawing.new_figure(path, 9.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
@@ -30,7 +30,7 @@ def plot_comparison(
     powers, errors = ([_by_pixel(one, name) for one in (first, second)] for name in ("waveform", "waveform_stderr"))
     counted = np.isfinite(outcome.z)
     if not are_few:
-        # Pixels share light: the error of their sum is not that of independent ones, and has no band.
+        # Pixels share light: their sum's error differs from the error for independent pixels, and has no band.
         known = np.isfinite(powers[0]) & np.isfinite(powers[1])
         powers = [np.where(known, power, 0).sum(axis=0, keepdims=True) for power in powers]
         errors = [np.zeros_like(power) for power in powers]
@@ -64,7 +64,7 @@ def plot_comparison(
 
 
 def _labels(first: xr.Dataset, second: xr.Dataset) -> list[str]:
-    """Return labels of two results: the first of their attributes in which they differ."""
+    """Return labels for two results: the first of their attributes that differs."""
     for name in ("integrator", "scene", "instrument", "variant", "passes", "seed"):
         values = [str(result.attrs.get(name, "")) for result in (first, second)]
         if values[0] != values[1] and all(values):

@@ -1,4 +1,4 @@
-"""Figures of the derivatives of waveforms by parameters of a scene."""
+"""Figures for waveform derivatives by scene parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-#: Height of a panel [inch], and largest number of panels.
+#: Panel height [inch], and largest number of panels.
 _PANEL, _MOST = 1.5, 12
 
 #: Share of the largest power below which relative changes are not drawn.
@@ -21,16 +21,16 @@ _SMALLEST = 1e-3
 
 
 def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw how much the waveform of all pixels changes where a parameter grows, with its standard error.
+    """Draw how much the waveform over all pixels changes where a parameter grows, with its standard error.
 
-    A panel for each parameter, below the waveform: the change in percent for 1 % more of the parameter, where the
-    power is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the
-    band of several pixels is an upper bound, the sum of their errors.
+    A panel for each parameter, below the waveform: the change in percent for 1 % more of the parameter, where the power
+    is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the band
+    over several pixels is an upper bound, the sum of their errors.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result of `rendering.render.render` with derivatives, of one shot.
+        A result of `rendering.render.render` with derivatives, for one shot.
     path : path, optional
         File to write.
 

@@ -42,13 +42,13 @@ _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p"
 
 
 def check_format(path: FilePath) -> None:
-    """Raise a `UserError` unless the suffix of `path` is that of a figure."""
+    """Raise a `UserError` unless the suffix of `path` is a figure's."""
     if Path(path).suffix.lower() not in _FORMATS:
-        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}.")
+        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}")
 
 
 def new_figure(path: FilePath | None, width: float, height: float) -> Figure:
-    """Check the format of the file to write, and return an empty figure of a size in inches."""
+    """Check the format of the file to write, and return an empty figure with a size in inches."""
     if path is not None:
         check_format(path)
     return Figure(figsize=(width, height), layout="constrained")
@@ -132,7 +132,7 @@ def add_grid(ax: Axes, axis: Literal["both", "x", "y"] = "both", hide: tuple[str
 
 
 def plain_logarithms(axis: Any) -> None:
-    """Label a logarithmic axis, or that of a colour bar, with the plain numbers 1, 2, 5, 10, ..."""
+    """Label a logarithmic axis, or a colour bar's, with the plain numbers 1, 2, 5, 10, ..."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -164,7 +164,7 @@ def draw_band(
 
 
 def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool = True, **style: Any) -> AxesImage:
-    """Draw values of shape (row, column) over the angles of the pixels, as seen from the lidar: far is up, +y left."""
+    """Draw values with the shape (row, column) over the pixel angles, as seen from the lidar: far is up, +y left."""
     if label:
         ax.set(xlabel=ANGLE_Y_LABEL, ylabel=ANGLE_X_LABEL)
     left, right, near, far = image_extent(dataset)
@@ -194,7 +194,7 @@ def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
 
 
 def pixel_pitch(dataset: xr.Dataset) -> tuple[float, float]:
-    """Return the distance of rows and of columns [mrad]; the pixels of a single row or column count as square."""
+    """Return the spacing of rows and of columns [mrad]; the pixels in a single row or column count as square."""
     spans = (dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values)
     along, across = (float(np.ptp(values)) / max(values.size - 1, 1) for values in spans)
     return along or across or 1.0, across or along or 1.0

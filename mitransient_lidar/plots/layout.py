@@ -1,4 +1,4 @@
-"""Figure of the layout of a result: pixels, beam and targets on the mean sea level and under water."""
+"""Layout figure for a result: pixels, beam and targets on the mean sea level and under water."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mitransient_lidar.results.geometry import optional_number, pose_of
 #: Most cells along a side of an imager that are drawn with edges.
 _EDGED_CELLS = 16
 
-#: Largest ratio of length and width of a footprint that is drawn to scale.
+#: Largest ratio between length and width of a footprint that is drawn to scale.
 _LARGEST_ASPECT = 4.0
 
 #: Most planes through targets, and planes side by side.
@@ -36,7 +36,7 @@ _MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3
 #: Heights of targets that differ by less are drawn on one plane [m], and axes that differ by less as one [m].
 _SAME_PLANE, _SAME_POINT = 0.05, 1e-3
 
-#: Longest list of names of targets in a title.
+#: Longest list of target names in a title.
 _LONGEST_NAME = 32
 
 _BEAM_COLOUR = "#e07b00"
@@ -52,8 +52,8 @@ _HALO = [withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
 class _Plane:
     """Horizontal plane on which pixels and beam are drawn.
 
-    `targets` are the targets at about its height; `outline` is the kind of line that is drawn of each target of the
-    result: ``seen``, ``line`` or ``shadow``.
+    `targets` are the targets at about its height; `outline` is the kind of line drawn for each target in the result:
+    ``seen``, ``line`` or ``shadow``.
     """
 
     z: float
@@ -66,21 +66,20 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
     """Draw pixels, beam and targets of a result on horizontal planes, seen from above, away from the lidar upwards.
 
     The left of the line of sight is on the left, as in a picture taken from the lidar. Where the lidar does not look
-    along +x, the label of the vertical axis gives the direction of +x.
+    along +x, the vertical axis label gives the direction of +x.
 
-    The planes are the mean sea level, the mean heights of the targets (of three at most; others are drawn on the
-    nearest of them), and the height of the bottom on the receiver's axis. Lines of sight and the beam are refracted by
-    a level sea. On the sea level, targets are drawn where the receiver sees them; on their planes, at their true
-    positions; on the bottom, their shadows in the laser's light are drawn. Each plane's title gives the point of the
-    receiver's axis. The cells of an imager show the received energy.
+    The planes are the mean sea level, the targets' mean heights (for at most three; others are drawn on the nearest of
+    them), and the bottom height on the receiver's axis. A level sea refracts lines of sight and the beam. Targets are
+    drawn on the sea level where the receiver sees them, on their planes at their true positions, and on the bottom as
+    shadows in the laser light. Each plane's title gives the point on the receiver's axis. An imager's cells show the
+    received energy.
 
     Results without refractive index, targets or bottom in their attributes have fewer planes.
 
     Raises
     ------
     UserError
-        If the attributes of the result hold no pose of the lidar or no field of view, or the receiver looks above the
-        horizon.
+        If the result's attributes contain no lidar pose or no field of view, or the receiver looks above the horizon.
     """
     attributes = dataset.attrs
     ground = _Ground.of_result(attributes)
@@ -130,7 +129,7 @@ def axis_points(dataset: xr.Dataset) -> list[str]:
     Raises
     ------
     UserError
-        If the attributes of the result hold no pose of the lidar.
+        If the result's attributes contain no lidar pose.
     """
     ground = _Ground.of_result(dataset.attrs)
     planes = _planes(dataset.attrs, json.loads(dataset.attrs.get("target_outlines", "[]")))
@@ -159,7 +158,7 @@ def _planes(attributes: dict[str, Any], targets: list[dict[str, Any]]) -> list[_
 
 
 def _gaps(groups: list[list[dict[str, Any]]]) -> FloatArray:
-    """Return the distances between the heights of neighbouring groups of targets [m]."""
+    """Return the distances between the heights of neighbouring target groups [m]."""
     return -np.diff([np.mean([_middle(target) for target in group]) for group in groups])
 
 
@@ -198,13 +197,13 @@ def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, h
 
 @dataclass(frozen=True)
 class _Ground:
-    """Map of angles and positions to distances [m] to the left of and along the lidar's azimuth on a level plane."""
+    """Map from angles and positions to distances [m] to the left of and along the lidar's azimuth on a level plane."""
 
     receiver: Pose
     transmitter: Pose
     azimuth: float  #: Direction of the receiver's axis, from +x towards +y [rad].
     sea: LevelSea
-    z: float = 0.0  #: Height of the plane [m].
+    z: float = 0.0  #: Plane height [m].
 
     @classmethod
     def of_result(cls, attributes: dict[str, Any]) -> _Ground:
@@ -228,7 +227,7 @@ class _Ground:
         return self.place(self.sea.at_height(pose.origin, pose.rays(1e-3 * angles), self.z))
 
     def axis_names(self) -> tuple[str, str]:
-        """Return the names of the axes across and along the lidar's azimuth, with the direction of +x."""
+        """Return the axis names across and along the lidar's azimuth, with the direction of +x."""
         if abs(self.azimuth) < 1e-6:
             return "y (m)", "x (m), away from the lidar"
         side = "right" if self.azimuth > 0 else "left"
@@ -252,15 +251,15 @@ class _Ground:
 
 
 def _pose(attributes: dict[str, Any], name: str) -> Pose:
-    """Return a pose; for a result without poses that of its altitude and off-nadir angle."""
+    """Return a pose; for a result without poses from its altitude and off-nadir angle."""
     pose = pose_of(attributes, name)
     if pose is not None:
         if pose.submerged:
-            raise UserError("the lidar is under water: it has no layout on the sea to draw.")
+            raise UserError("the lidar is under water: it has no layout on the sea to draw")
         return pose
     altitude, off_nadir_deg = (optional_number(attributes, key) for key in ("altitude", "off_nadir_deg"))
     if altitude is None or off_nadir_deg is None:
-        raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw.")
+        raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw")
     return Pose.from_angles(altitude, off_nadir_deg)
 
 
@@ -287,7 +286,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[A
 
 
 def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
-    """Draw the received energy in the cells of an imager; return the points of its outline."""
+    """Draw the received energy in an imager's cells; return the points of its outline."""
     outline = _draw_field(ax, dataset.attrs, ground)
     if len(outline) == 0 or not np.isfinite(outline).all():
         return outline
@@ -311,7 +310,7 @@ def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
 
 
 def _draw_field(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatArray:
-    """Draw the outline of the field of view if it is known; return its points."""
+    """Draw the field-of-view outline if it is known; return its points."""
     width, shape = optional_number(attributes, "field_of_view_mrad"), attributes.get("field_of_view_shape")
     if width is None or shape not in ("circle", "square", "rectangle"):
         return np.zeros((0, 2))
@@ -339,7 +338,7 @@ def _draw_beam(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatAr
 
 
 def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
-    """Draw the outlines of the targets, with the depths of their highest points, or of their shadows."""
+    """Draw the targets' outlines, with the depths of their highest points, or their shadows."""
     marks: dict[str, Any] = {"color": _TARGET_COLOUR, "path_effects": _HALO, "zorder": 5}
     for target in plane.targets:
         line = _points(target.get(plane.outline, []))
@@ -381,7 +380,7 @@ def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray, outlines: FloatArra
     """
     seen, lit, outlines = (points[np.isfinite(points).all(axis=1)] for points in (seen, lit, outlines))
     if len(seen) == 0:
-        raise UserError("the result has no pixels that look at the sea: it has no layout to draw.")
+        raise UserError("the result has no pixels that look at the sea: it has no layout to draw")
     low, high = seen.min(axis=0), seen.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     lit = np.clip(lit, low - size, high + size)

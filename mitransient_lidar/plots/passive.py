@@ -1,4 +1,4 @@
-"""Figures and animations of images by daylight."""
+"""Figures and animations for daylight images."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from mitransient_lidar.plots import drawing
 #: Share of the pixels that may be brighter than white, or darker than black: glints would leave the rest black.
 _CLIPPED = 0.01
 
-#: Smallest width of an animation [pixels].
+#: Smallest animation width [pixels].
 _ANIMATION_WIDTH = 384
 
 
 def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, frame: int = 0) -> Figure:
-    """Draw an image in grey, with the far edge on top; pixels that form no grid as bars of their radiance.
+    """Draw an image in grey, with the far edge on top; pixels without a grid as bars of their radiance.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, fram
     path : path, optional
         File to write.
     frame
-        Index of the frame, if there are several.
+        Frame index, if there are several.
     """
     figure = drawing.new_figure(path, 6.4, 5.6)
     picture = dataset
@@ -64,7 +64,7 @@ def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
     from PIL import Image
 
     if Path(path).suffix.lower() != ".gif":
-        raise UserError(f"cannot write {path}: the file name must end in .gif.")
+        raise UserError(f"cannot write {path}: the file name must end in .gif")
     if dataset["radiance"].dims != ("frame", "row", "column"):
         raise UserError("an animation needs frames of an imager: render several frames of a layout with many pixels")
     radiance = drawing.as_seen(dataset)["radiance"].values

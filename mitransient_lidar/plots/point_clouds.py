@@ -1,4 +1,4 @@
-"""Pictures of flights: pulses, points by class, a profile with its waveforms, and errors of heights."""
+"""Flight pictures: pulses, points by class, a profile with its waveforms, and height errors."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ CLASS_COLOURS = {
     PointClass.NO_ECHO: "#999999",
 }
 
-#: Classes of what is solid.
+#: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
 
-#: Half of the width of the strip of a profile [m], and most waveforms in it.
+#: Half the width of a profile's strip [m], and most waveforms in it.
 _STRIP, _MOST_WAVEFORMS = 1.5, 2000
 
-#: Heights in a profile above sea and land and below the deepest point [m], and most columns of cells of its picture.
+#: Heights in a profile above sea and land and below the deepest point [m], and most cell columns in its picture.
 _ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
 
 #: Range of a nanosecond between pulse and echo in the air [m].
@@ -41,21 +41,20 @@ _DECADES = 3.0
 
 
 def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
-    """Draw a flight into the files flight.png and profile.png of a folder.
+    """Draw a flight into the files flight.png and profile.png in a folder.
 
-    The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
-    bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
-    on one. The side view is along x or y, over which points extend farther, the strip along x or y and through most
-    points.
+    The first one has the pulse locations, all points in a side view by class, and maps of the bottom heights and their
+    errors. The second one has the waveforms and points in a strip, through a target if points lie on one. The side view
+    is along x or y, over which points extend farther, the strip along x or y and through most points.
 
     Parameters
     ----------
     flown
         The pulses.
     points
-        Their points, as of `flights.products.points_of`.
+        Their points, as from `flights.products.points_of`.
     folder
-        Folder of the files.
+        Folder for the files.
 
     Returns
     -------
@@ -91,7 +90,7 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
 
 def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
-    """Draw the track of the scanner, and where the axes of its pulses meet the sea level."""
+    """Draw the scanner's track, and where its pulses' axes meet the sea level."""
     poses = flown.poses
     ax.plot(*poses.ground_point()[:, :2].T, ".", color="#1f77b4", markersize=1.5, label="pulses at the sea level")
     ax.plot(*poses.origin[:, :2].T, color="black", linewidth=1.5, label="scanner")

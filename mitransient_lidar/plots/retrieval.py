@@ -1,4 +1,4 @@
-"""Figure of estimates from a series of shots against the truth."""
+"""Figure for estimates from a shot series against the truth."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ _COLOUR = "#1f5fd6"
 
 
 def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the estimates of a series of shots against the truth, with their standard errors if known.
+    """Draw the estimates for a shot series against the truth, with their standard errors if known.
 
-    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series of `rendering.shots.series.render_shots`.
+    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series from
+    `rendering.shots.series.render_shots`.
 
     Raises
     ------

@@ -18,8 +18,8 @@ from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.results.files import Given, dataset_of
 
-_NOTEBOOK_MB = 20.0  # of a page in a notebook, which is stored with it
-_FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # of temporary pages
+_NOTEBOOK_MB = 20.0  # per page in a notebook, which is stored with it
+_FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # for temporary pages
 
 
 class View:
@@ -28,7 +28,7 @@ class View:
     Attributes
     ----------
     page : str
-        Text of the HTML page, which needs no network.
+        HTML text, which needs no network.
     height : int
         Height below a cell [CSS pixels].
     """
@@ -39,7 +39,7 @@ class View:
         self._name = name
 
     def _repr_html_(self) -> str:
-        # A sandbox without the origin of the notebook: scripts of the page reach nothing of it.
+        # A sandbox without the notebook's origin: the page's scripts reach nothing in it.
         return (
             f'<iframe sandbox="allow-scripts" srcdoc="{html.escape(self.page)}" title="{html.escape(self._name)}" '
             f'style="width: 100%; height: {self.height}px; border: 0"></iframe>'
@@ -63,14 +63,14 @@ class View:
             path = Path(tempfile.mkdtemp(prefix=_FOLDER)) / "view.html"
         path = Path(path)
         if path.suffix.lower() != ".html":
-            raise UserError(f"cannot write {path}: the file name must end in .html.")
+            raise UserError(f"cannot write {path}: the file name must end in .html")
         with replacing(path) as temporary:
             temporary.write_text(self.page, encoding="utf-8")
         return path
 
 
 def _remove_former_pages() -> None:
-    """Remove the folders of temporary pages of this user that are an hour old."""
+    """Remove this user's temporary page folders that are an hour old."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
         with contextlib.suppress(OSError):
             found = folder.lstat()
@@ -86,11 +86,11 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
     result : xarray.Dataset
         A result, a record of a receiver or camera, or a gate stack: see `plots.gate_viewer.page.page_text`.
     waveforms : xarray.Dataset, optional
-        A render of the pixels of a gate stack.
+        A render with a gate stack's pixels.
     height : int
         Height in a notebook [CSS pixels].
     limit_mb : float
-        Largest size of the page [MB of 1e6 bytes]; larger ones show means over blocks of pixels.
+        Largest page size [MB of 1e6 bytes]; larger pages show means over pixel blocks.
 
     Raises
     ------

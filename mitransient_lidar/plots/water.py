@@ -25,7 +25,7 @@ _WATER = "#1f5fd6"
 _DEPTHS = matplotlib.colormaps["viridis_r"]
 _COLOURS = {"c": "#111111", "b": "#1f5fd6", "a": "#d81e1e", "bb": "#17963f"}
 
-#: Most phase functions drawn of a profile, and the smallest visible step of ln(bb/b) between them.
+#: Most phase functions drawn for a profile, and the smallest visible step of ln(bb/b) between them.
 _MOST_FUNCTIONS, _RATIO_STEP = 8, 0.02
 
 #: Most decades on the axis of the coefficients, which may fall to 0.
@@ -43,7 +43,7 @@ def plot_water(
 ) -> Figure:
     """Draw the phase function of a water, or a profile with its layers.
 
-    Arguments and errors are those of `studies.water_report.describe_water`.
+    Arguments and errors as for `studies.water_report.describe_water`.
     """
     if kind == "profile":
         profile = water_report.profile_of(value)
@@ -55,7 +55,7 @@ def plot_water(
 def plot_phase_function(
     phase_function: PhaseFunction, label: str, title: str, path: drawing.FilePath | None = None
 ) -> Figure:
-    """Draw a phase function with those of pure sea water and of Petzold's average particle.
+    """Draw a phase function beside pure sea water's and Petzold's average particle's.
 
     The left panel extends from 0.01 to 180 degrees, the right one over the backward hemisphere. The function maps
     angles [rad] to p [1/sr]; if it is `water_phase_function` itself, pure sea water is drawn once. `label` is its name
@@ -124,7 +124,7 @@ def plot_profile(profile: Profile, layers: WaterColumn, title: str, path: drawin
 
 
 def _draw_coefficients(ax: Axes, profile: Profile, column: WaterColumn) -> None:
-    """Draw the coefficients of a profile as lines and those of its layers as steps, against depth."""
+    """Draw a profile's coefficients as lines and its layers' as steps, against depth."""
     bottom = float(profile.depth[-1])
     # Straight lines between the nodes are curves on a logarithmic axis.
     depth = np.union1d(profile.depth, np.linspace(0, bottom, 800))

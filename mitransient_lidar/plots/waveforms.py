@@ -1,4 +1,4 @@
-"""Figures of a result: waveforms of a few pixels, or the image and the summed waveform of an imager."""
+"""Figures for a result: waveforms of a few pixels, or an imager's image and summed waveform."""
 
 from __future__ import annotations
 
@@ -25,26 +25,25 @@ _ORIGIN_COLOURS = {"surface": "#8fa3ad", "water": "#3f8fc9", "bottom": "#a8743a"
 
 
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
-    """Draw the waveforms or recorded signals of a result; of an imager the total of each pixel and the summed waveform.
+    """Draw a result's waveforms or recorded signals; for an imager each pixel's total and the summed waveform.
 
-    Bands are +-1 standard error; of a series of shots, the curve is the mean of the shots, and the band holds 90 % of
-    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight of a single pixel, and on the
-    axis of the receiver for several.
-    Pixels are drawn in the shapes of their outlines, or as dots without them. The depth axis is left out if the result
-    lacks its attributes.
+    Bands are +-1 standard error; for a shot series, the curve is the mean over the shots, and the band contains 90 % of
+    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight for a single pixel, and on the
+    receiver's axis for several. Pixels are drawn in the shapes of their outlines, or as dots without them. The depth
+    axis is left out if the result lacks its attributes.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result of `mitransient_lidar.results.dataset`, or a record of `analysis.receiver.detect_waveforms`; one shot
-        or several.
+        A result in the form of `mitransient_lidar.results.dataset`, or a record from
+        `analysis.receiver.detect_waveforms`; one shot or several.
     path : path, optional
         File to write.
     scale : {'both', 'linear', 'log'}
-        Scale of the power axis; 'both' draws two panels.
+        Power axis scale; 'both' draws two panels.
     """
     if scale not in get_args(Scale):
-        raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}.")
+        raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}")
     panels = ["linear", "log"] if scale == "both" else [scale]
     figure = drawing.new_figure(path, 9.6, 4.3 if len(panels) == 1 else 6.0)
     is_image = "pixel" not in dataset.dims
@@ -70,21 +69,21 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
 
 
 def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the waveform of all pixels by the origin of its light: stacked areas, and curves on a logarithmic axis.
+    """Draw the waveform over all pixels by light origin: stacked areas, and curves on a logarithmic axis.
 
-    Of a series of shots, it is their mean.
+    For a shot series, it is their mean.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result of `rendering.render.render`, or a series of shots, with components.
+        A result of `rendering.render.render`, or a shot series, with components.
     path : path, optional
         File to write.
 
     Raises
     ------
     UserError
-        If the light of the result was not separated.
+        If the result's light was not separated.
     """
     name = "waveform_by_origin"
     if name not in dataset:
@@ -115,7 +114,7 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
 
 
 class _Curves(NamedTuple):
-    """Curves, their bands below and above, and their errors, in a unit, over (pixel, time) without that of a band."""
+    """Curves, their bands below and above, and their errors, in a unit, over (pixel, time) without the band's."""
 
     power: FloatArray
     band: FloatArray
@@ -125,7 +124,7 @@ class _Curves(NamedTuple):
 
 
 def _curves(dataset: xr.Dataset) -> _Curves:
-    """Return the curves of a result, or the means of the shots of a series with the band that holds 90 % of them."""
+    """Return a result's curves, or the means over a series' shots with the band that contains 90 % of them."""
     recorded = "signal" in dataset
     name = "signal" if recorded else "waveform"
     values = dataset[name]
@@ -212,13 +211,13 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
         legend.set_in_layout(False)  # it fits into the space below the square axes
     ax.set_anchor("N")
     points = np.stack([dataset["angle_y"].values, dataset["angle_x"].values], axis=-1)
-    outlines = json.loads(attributes.get("pixel_outlines", "[]"))  # lines angle_x, angle_y, ... of each [mrad]
+    outlines = json.loads(attributes.get("pixel_outlines", "[]"))  # lines angle_x, angle_y, ... for each [mrad]
     if len(outlines) == len(names) and all(outlines):
         shapes = [[np.reshape([*line, *line[:2]], (-1, 2))[:, ::-1] for line in lines] for lines in outlines]
         for loops, colour in zip(shapes, colours, strict=True):
             ax.add_patch(drawing.outline_patch(loops, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
         points = np.concatenate([loop for loops in shapes for loop in loops])
-    elif len(names) > 1:  # of another program, or too many for the attributes of a result
+    elif len(names) > 1:  # by another program, or too many for a result's attributes
         ax.scatter(points[:, 0], points[:, 1], c=colours, s=24)
     else:
         return
@@ -236,7 +235,7 @@ def _name_edges(ax: Axes, width: float | None) -> None:
 
 
 def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
-    """Draw the energy that each pixel has received, or the sum of its samples, in the mean of the shots."""
+    """Draw the energy that each pixel has received, or the sum of its samples, in the mean over the shots."""
     recorded = "impulse_response" not in dataset
     total = dataset["signal" if recorded else "impulse_response"].sum("time")
     energy = total.mean({"shot"} & set(total.dims)).values
@@ -250,7 +249,7 @@ def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
 
 
 def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
-    """Return scene, receiver, what is shown of the shots, and for waveforms their accuracy."""
+    """Return scene, receiver, the kind of shot mean, and for waveforms their accuracy."""
     attributes = dataset.attrs
     error = None if "signal" in dataset else optional_number(attributes, "error_median")
     parts = [drawing.scene_name(attributes) or "received power"]

@@ -35,23 +35,23 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Memory of a bin [bytes] for the means and errors over the passes, of energy and power, and their computation.
+#: Memory per bin [bytes] for means and errors over the passes, of energy and power, and their computation.
 _BYTES_PER_KEPT_BIN = 96
-#: Memory of a bin when a pass is converted to gates, of a gate that is kept then, and of one that is summed directly.
+#: Memory per bin when a pass is converted to gates, per gate kept then, and per gate summed directly.
 _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER_SMOOTHED_GATE = 8, 64, 18, 24
-#: Memory of a bin of a batch of passes: its sum, and the mean in the result.
+#: Memory per bin in a batch of passes: its sum, and the mean in the result.
 _BYTES_PER_BATCH = 16
 
 #: Pixels from which the error of a gate is estimated.
 _ERROR_PIXELS = 4096
 
-#: Smallest share of the paths in a pass of smoothed images: with fewer, most time is not that of paths.
+#: Smallest path share in a pass with smoothed images: with fewer, paths take little of the time.
 _LEAST_SHARE_OF_SMOOTH = 2**-3
 
-#: Noise in the estimated bias over that of the smoothed image, squared, for noise that pixels do not share.
+#: Noise in the estimated bias over the smoothed image's noise, squared, for noise that pixels do not share.
 _NOISE_OF_BIAS = 1 / 6
 
-#: A pixel is lit in a gate with this share of the energy of the gate's brightest pixels (99th percentile).
+#: A pixel is lit in a gate with this share of the energy in the gate's brightest pixels (99th percentile).
 _LIT = 0.05
 
 
@@ -87,7 +87,7 @@ class Light:
 
     @property
     def arrays(self) -> tuple[FloatArray, ...]:
-        """Mean energy [J] and power [W] of the whole, each with its standard error, as of `LightStatistics`."""
+        """Mean energy [J] and power [W] of the whole, each with its standard error, as in `LightStatistics`."""
         mean, error, power, power_error = self.whole.arrays
         if self._separate:
             # The whole is the sum of its parts to the bit.
@@ -96,7 +96,7 @@ class Light:
 
 
 class PassAccumulator:
-    """Means and standard errors over the passes of a render: of all light, or of gates alone.
+    """Means and standard errors over a render's passes: of all light, or of gates alone.
 
     Parameters
     ----------
@@ -105,16 +105,16 @@ class PassAccumulator:
     train
         Gates at their times, or None.
     origins
-        Names of the origins of light that is separated.
+        Names of the separated light origins.
     parameters, differences
-        Parameters by which light is differentiated, and those of them that are from central differences.
+        Parameters by which light is differentiated, and the subset with central differences.
     batches
-        Number of batches of passes whose power is kept.
+        Number of pass batches whose power is kept.
     kept
-        Whether ``histograms`` are kept, ``gates`` are cut from the histogram of each pass, or ``direct``: accumulated
-        in the pass.
+        Whether ``histograms`` are kept, ``gates`` are cut from each pass histogram, or ``direct``: accumulated in the
+        pass.
     smooth
-        Standard deviation by which the image of each gate is smoothed [pixels], or None.
+        Standard deviation by which each gate's image is smoothed [pixels], or None.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class PassAccumulator:
         self._origins, self._parameters = list(origins), list(parameters)
         self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._differences = differences
-        self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
+        self._batches: list[FloatArray] = [np.zeros(())] * batches  # power sums of every batch
         self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
         #: Memory of film, means and errors [bytes], 0 if it is unknown.
         self.size = 0.0
@@ -151,7 +151,7 @@ class PassAccumulator:
 
             self.gate_weights = GateWeights(train, train.response_weights(pulse, response), scene.reference_length)
         else:
-            # Weights of the bins in gates, shape (bin, gate).
+            # Bin weights in gates, shape (bin, gate).
             weights = train.bin_weights(pulse, response, scene.axis)
             self._weights = weights if kept == "histograms" else weights.astype(np.float32)
         if differences is not None:
@@ -168,7 +168,7 @@ class PassAccumulator:
         return float(np.nansum(self._received.mean)) * self._received.count
 
     def add(self, histogram: TransientHistogram, gated: TransientHistogram | None = None) -> None:
-        """Add the histogram of a pass, and that of its gates if they were accumulated beside it."""
+        """Add a pass histogram, and its gates if they were accumulated beside it."""
         pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
         if self._kept == "direct" and self._smooth:
             self.gates.add(self._smoothed(histogram.energy().reshape(pixels, -1)))
@@ -202,7 +202,7 @@ class PassAccumulator:
             self.gates.add(energy @ self._weights)
 
     def _smoothed(self, energy: FloatArray) -> FloatArray:
-        """Return energies of shape (pixels, gates) after the smoothing of each gate's image, which keeps their sum."""
+        """Return energies, shape (pixels, gates), after smoothing each gate's image, which keeps their sum."""
         from scipy.ndimage import gaussian_filter
 
         grid = self.scene.receiver.pixels.grid
@@ -235,8 +235,8 @@ class PassAccumulator:
     def errors(self) -> FloatArray:
         """Return the relative standard errors whose quantile is compared with the target, of bins or gates.
 
-        That of a gate is the median over its lit pixels, for gates with their middle between the surface echo and the
-        end of the bottom echo of a pixel.
+        A gate's error is the median over its lit pixels, for gates with their middle between a pixel's surface echo and
+        the end of its bottom echo.
         """
         if self.train is None:
             return self.window.relative_errors(self._light.whole.power.mean, self._light.whole.power.stderr)
@@ -305,7 +305,7 @@ class PassAccumulator:
         return label(stack.assign_coords(bias))
 
     def _joined(self, of_paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return arrays of the parameters with scores and of the others in the order of the parameters."""
+        """Return the arrays for parameters with scores and for the others in parameter order."""
         last = [parameter.perturbation is None for parameter in self._parameters]
         order = np.argsort(np.argsort(last, kind="stable"))
         pairs = itertools.zip_longest(of_paths, others)
@@ -328,11 +328,11 @@ def choose_accumulator(
     batches: int = 0,
     smooth: float | None = None,
 ) -> PassAccumulator:
-    """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
+    """Return the accumulator for the most quantities whose film, means and errors fit in `max_memory` [GB].
 
-    Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
-    `origins`, and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of
-    passes is kept, too. Images of gates are smoothed by a standard deviation [pixels], and then only they are kept.
+    Gate depths are relative to the surface echo's mean time [ns], None without one. Light is separated by `origins`,
+    and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of passes is
+    kept, too. With a standard deviation [pixels], gate images are smoothed and nothing else is kept.
 
     Raises
     ------
@@ -391,12 +391,12 @@ def choose_accumulator(
 
 
 def share_of_pass(smooth: float) -> float:
-    """Return the share of the paths in a pass of images smoothed by a number of pixels: about as many are averaged."""
+    """Return the path share in a pass with smoothed images: about one divided by the number of averaged pixels."""
     return float(np.clip(2.0 ** -np.round(np.log2(4 * np.pi * smooth**2)), _LEAST_SHARE_OF_SMOOTH, 1))
 
 
 def placed_gates(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
-    """Return the gates of the scene at their times."""
+    """Return the scene's gates at their times."""
     if scene.gates is None:
         return None
     train = scene.gate_train(scene.gates)

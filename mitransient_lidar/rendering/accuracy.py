@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from mitransient_lidar.transport.probe import Probe
     from mitransient_lidar.transport.scene import LidarScene
 
-#: Pixels darker than this fraction of the median are excluded from the errors of radiance.
+#: Pixels darker than this fraction of the median are excluded from the radiance errors.
 _DARK_PIXEL = 1e-2
 
 #: Values of an array that are added at a time.
 _PART = 2**17
 
-#: Most blocks of bins, and about as many pixels, that the correlation of errors is measured over.
+#: Most bin blocks, and about as many pixels, over which error correlation is measured.
 _BLOCKS, _CORRELATED_PIXELS = 512, 1024
 
 #: Least part of two blocks' errors that meets in pixels with light in both, for a correlation between them.
@@ -40,11 +40,11 @@ class PassStatistics:
         self._squares: FloatArray = np.zeros(())
 
     def add(self, values: FloatArray) -> None:
-        """Add the result of one pass."""
+        """Add one pass."""
         self.add_parts(np.shape(values), lambda part: values[part])
 
     def add_parts(self, shape: tuple[int, ...], part_of: Callable[[Any], FloatArray]) -> None:
-        """Add the result of one pass of a shape, of which a function returns parts of the first axis.
+        """Add one pass in a shape, given a function that returns parts of the first axis.
 
         Parts fit the processor's cache, and no further arrays of the whole shape exist.
         """
@@ -65,7 +65,7 @@ class PassStatistics:
         return self.stderr_of(slice(None))
 
     def stderr_of(self, part: slice) -> FloatArray:
-        """Return the standard error of the mean of part of the first axis; NaN before the second pass."""
+        """Return the standard error of the mean for part of the first axis; NaN before the second pass."""
         if self.count < 2:
             return np.full_like(self._squares[part], np.nan)
         found = self._squares[part] / (self.count - 1)
@@ -73,7 +73,7 @@ class PassStatistics:
 
 
 class LightStatistics:
-    """Means and standard errors of the energy [J per bin] and the power [W] of light; bins are the last axis."""
+    """Means and standard errors of light energy [J per bin] and power [W]; bins are the last axis."""
 
     def __init__(self) -> None:
         self.energy, self.power = PassStatistics(), PassStatistics()
@@ -101,9 +101,9 @@ def received_power(scene: LidarScene) -> Callable[[FloatArray], FloatArray]:
 class RatioStatistics:
     """Ratio of two sums over passes, and its standard error.
 
-    Each pass adds, for each pixel, radiance times solid angle and the solid angle of its samples; the ratio of the sums
-    is the mean radiance. The standard error is that of a ratio of means to first order (Cochran 1977, Sampling
-    Techniques, section 2.11).
+    Each pass adds, for each pixel, radiance times solid angle and its samples' solid angle; the ratio of the sums is
+    the mean radiance. The standard error is first order for a ratio of means (Cochran 1977, Sampling Techniques,
+    section 2.11).
     """
 
     def __init__(self, count: int) -> None:
@@ -111,13 +111,13 @@ class RatioStatistics:
         self._sums = np.zeros((5, count))
 
     def add(self, found: FloatArray, sampled: FloatArray) -> None:
-        """Add the result of one pass, shape (pixels,)."""
+        """Add one pass, shape (pixels,)."""
         self.count += 1
         self._sums += [found, sampled, found * found, found * sampled, sampled * sampled]
 
     @property
     def ratio(self) -> FloatArray:
-        """Mean of the ratio; NaN where nothing was sampled."""
+        """Mean ratio; NaN where nothing was sampled."""
         found, sampled = self._sums[:2]
         return np.asarray(np.divide(found, sampled, out=np.full_like(found, np.nan), where=sampled > 0))
 
@@ -149,7 +149,7 @@ class RatioStatistics:
 
 
 class ErrorCorrelation:
-    """Correlation of the errors of bins: those of a pass are correlated, since they share paths.
+    """Error correlation between bins: errors in a pass are correlated, since they share paths.
 
     Pixels are taken together, and bins in at most `_BLOCKS` blocks.
     """
@@ -161,7 +161,7 @@ class ErrorCorrelation:
         self._squares: FloatArray = np.zeros(())
 
     def add(self, values: FloatArray) -> None:
-        """Add the result of one pass, shape (pixels, time)."""
+        """Add one pass, shape (pixels, time)."""
         values = values[:: max(1, len(values) // _CORRELATED_PIXELS)]
         if self._count == 0:
             self._mean = np.zeros_like(values)
@@ -178,8 +178,8 @@ class ErrorCorrelation:
     def over(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return the middles of the blocks [ns], and their correlations; None before the second pass.
 
-        Entry (A, B) is the mean correlation of a bin in A with a bin in B. Entry (A, A) is the mean over pairs of
-        different bins; for a block of one bin it is 1. Other entries of blocks without light are 0.
+        Entry (A, B) is the mean correlation between a bin in A and a bin in B. Entry (A, A) is the mean over pairs of
+        different bins; for a block with one bin it is 1. Other entries for blocks without light are 0.
         """
         if self._count < 2:
             return None
@@ -198,17 +198,17 @@ class ErrorCorrelation:
 
 @dataclass(frozen=True)
 class ErrorWindow:
-    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and those of land.
+    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and land bins.
 
     Parameters
     ----------
     start_ns, end_ns
-        Limits for each pixel [ns], shape (pixels,), or of each shot (shots x pixels,); of land where a pixel sees no
-        water.
+        Limits for each pixel [ns], shape (pixels,), or for each shot (shots x pixels,); land limits where a pixel sees
+        no water.
     time_ns
-        Centres of the bins [ns], shape (time,).
+        Bin centres [ns], shape (time,).
     land_ns
-        Limits of the echo of land beside the water [ns], shape (pixels, 2) likewise; NaN without.
+        Limits of the land echo beside the water [ns], shape (pixels, 2) likewise; NaN without.
     """
 
     start_ns: FloatArray
@@ -220,8 +220,9 @@ class ErrorWindow:
     def of_probe(cls, probe: Probe) -> ErrorWindow:
         """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width.
 
-        Where the record has no bottom, the window ends with the light of the water: when absorption alone has reduced
-        it to `COLUMN_LEVEL` after the surface echo, in the near infrared after nanoseconds, or else with the record.
+        Where the record has no bottom, the window ends with the light from the water, or else with the record. This
+        light ends when absorption alone has reduced it to `COLUMN_LEVEL` after the surface echo, in the near infrared
+        after nanoseconds.
         """
         scene, echoes, time_ns = probe.scene, probe.echoes, probe.scene.axis.centres_ns
         half_pulse = 0.5 * scene.transmitter.pulse.fwhm_ns
@@ -236,7 +237,7 @@ class ErrorWindow:
         return cls(start, end, time_ns, np.full((start.size, 2), np.nan)).with_land(scene, echoes.dry_ns, alone)
 
     def with_land(self, scene: LidarScene, dry_ns: FloatArray, alone: BoolArray) -> ErrorWindow:
-        """Return the window of pixels, or of shots, that see land, some of them alone.
+        """Return the window for pixels, or shots, that see land, some of them land alone.
 
         Its echo comes between two times [ns], shape (n, 2), NaN without one.
         """
@@ -252,8 +253,8 @@ class ErrorWindow:
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
         """Return the relative standard errors of a waveform, infinite where it is 0.
 
-        Waveform and standard error have the shape (pixels, time), or of several shots (shots, pixels, time). Pixels
-        with less than a thousandth of the energy of the brightest one are excluded.
+        Waveform and standard error have the shape (pixels, time), or for several shots (shots, pixels, time). Pixels
+        with less than a thousandth of the brightest pixel's energy are excluded.
         """
         waveform, stderr = (values.reshape(-1, values.shape[-1]) for values in (waveform, stderr))
         limits = np.column_stack([self.start_ns, self.end_ns, self.land_ns])

@@ -34,7 +34,7 @@ _HELD = {
 #: Attributes that only results of a command have, the last one after the others.
 _KINDS = {"shots": "series_parameters", "passive": "frame_passes", "frames": "gate_order", "render": "pass_share"}
 
-#: Options of frames that are attributes of the same name.
+#: Frame options that are attributes with the same name.
 _OF_FRAMES = ("frames", "pulse_rate_hz", "gate_order", "readout_s", "speed", "heading_deg")
 
 #: Options that end a render; with another end the recorded ones do not count.
@@ -70,15 +70,15 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     Parameters
     ----------
     result
-        Dataset of `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
+        Dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
     options
-        Options of that function which replace those of the result, unless they are None; its parameters are added to
-        those of the scene.
+        Options of that function which replace the result's, unless they are None; its parameters are added to the
+        scene's.
 
     Raises
     ------
     UserError
-        If the result does not hold its scene or an option, or holds only some shots of a series.
+        If the result does not contain its scene or an option, or contains only some shots of a series.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)
@@ -117,7 +117,7 @@ def _held(attributes: Mapping[str, Any], name: str) -> Any:
 
 
 def _frame_options(attributes: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of daylight images alone."""
+    """Return the options for daylight images alone."""
     passes, step = _held(attributes, "frame_passes"), _held(attributes, "frame_step_s")
     frames = integer("frames", given.get("frames", len(passes)), 1, MOST_FRAMES)
     return {
@@ -129,12 +129,12 @@ def _frame_options(attributes: Mapping[str, Any], given: Mapping[str, Any]) -> d
 
 
 def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of series of shots alone, of a complete series or of the shots before Ctrl-C."""
+    """Return the options for series of shots alone, for a complete series or for the shots before Ctrl-C."""
     series = result if isinstance(result, xr.Dataset) else results.open(result)
     if "shot" not in series.dims or not np.array_equal(series["shot"], np.arange(attributes.get("shots", 0))):
         raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
     check_params(given.get("params"))
-    # The bins of some shots are those of all of them.
+    # The bins of some shots equal the bins of all shots.
     same: dict[str, Any] = {} if "params" in given or "positions" in given else {"axis": results.time_axis(series)}
     if same and "shot_passes" in series.coords and not any(name in given for name in _ENDS):
         same |= {"passes": int(_held(attributes, "most_passes")), "shot_passes": series["shot_passes"].values}
@@ -152,7 +152,7 @@ def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[s
 
 
 def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
-    """Return the attributes of a result, without texts of JSON or XML, and all parameters of its plugins, as texts.
+    """Return a result's attributes, without JSON or XML texts, and all its plugin parameters, as texts.
 
     A parameter is named by its object and itself, as ``surface.interior.attenuation``. Raises UserError if the file
     cannot be read.
@@ -189,7 +189,7 @@ def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def compare_versions(attributes: Mapping[str, Any]) -> None:
-    """Warn of other versions than those of the result."""
+    """Warn about versions that differ from the result's."""
     for name, version in variants.versions().items():
         if name != "variant" and attributes.get(name, version) != version:
             logger.warning(

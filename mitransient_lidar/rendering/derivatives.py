@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest number of parameters of a render.
+#: Largest number of parameters in a render.
 MOST_PARAMETERS = 64
 
-#: Estimate of derivatives by parameters of which paths have no sums.
+#: Derivative estimate for parameters without path sums.
 DIFFERENCES = "central differences"
 
-#: Divergence of the laser.
+#: Laser divergence.
 DIVERGENCE = "divergence_mrad"
 
-#: Slope variance of the ripples, and the relative step of its numerical derivative.
+#: Ripple slope variance, and the relative step of its numerical derivative.
 RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.005
 
 _NAME = re.compile(r"(?P<stem>\w+?)(\[(?P<layer>\d+)\])?\Z")
@@ -43,14 +43,14 @@ _REFLECTANCE = "_reflectance"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a scene by which light is differentiated.
+    """A scene parameter by which light is differentiated.
 
     Attributes
     ----------
     name, value, units
-        Name, with the number of the layer in brackets where there are several; value and its unit.
+        Name, with the layer number in brackets where there are several; value and its unit.
     perturbation
-        What paths sum for the derivative; None where it is from central differences.
+        Path sums for the derivative; None for central differences.
     """
 
     name: str
@@ -67,10 +67,10 @@ class Parameter:
 def path_parameters(
     renderer: PassRenderer, names: Sequence[str] | str, others: Mapping[str, str] | None = None
 ) -> list[Parameter]:
-    """Return the parameters of names: a coefficient of layered water stands for that of each layer.
+    """Return the parameters with some names: a coefficient of layered water gives one parameter per layer.
 
-    `others` are the parameters of the scene, with their values as text, of which those whose derivatives paths do not
-    sum are left to central differences; none by default.
+    `others` are the scene parameters, with their values as text; those without path sums are left to central
+    differences; none by default.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def perturbations(parameters: Sequence[Parameter]) -> list[Perturbation]:
 
 
 def known_names(scene: LidarScene) -> list[str]:
-    """Return the names of the parameters of a scene for which paths sum derivatives."""
+    """Return the names of a scene's parameters for which paths sum derivatives."""
     names: list[str] = []
     if scene.water is not None:
         layers = scene.water.layers
@@ -117,7 +117,7 @@ def known_names(scene: LidarScene) -> list[str]:
 
 
 def _parameters(renderer: PassRenderer, name: str, others: Mapping[str, str]) -> list[Parameter]:
-    """Return the parameters of a name."""
+    """Return the parameters with a name."""
     scene, focusing = renderer.scene, renderer.focusing
     match = _NAME.match(name) if isinstance(name, str) else None
     known = known_names(scene)
@@ -165,7 +165,7 @@ def _rippled(scene: LidarScene) -> list[SeaShape]:
 
 
 def _ripples(scene: LidarScene) -> Parameter:
-    """Return the parameter of the slope variance of the ripples, along and across the wind in proportion."""
+    """Return the parameter for the ripple slope variance, along and across the wind in proportion."""
     seas = _rippled(scene)
     if len(seas) > 1:
         raise UserError(f"derivatives: {RIPPLES} must be of one sea; the scene has {len(seas)}")
@@ -175,7 +175,7 @@ def _ripples(scene: LidarScene) -> Parameter:
 
 
 def _reflectance(name: str, solid: mi.Shape) -> Parameter:
-    """Return the parameter of the reflectance of a solid."""
+    """Return the parameter for a solid's reflectance."""
     value = _uniform_reflectance(solid)
     if value is None:
         raise UserError(f"derivatives: {name} must be of a solid that is diffuse, with one reflectance everywhere")

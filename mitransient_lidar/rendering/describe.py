@@ -1,4 +1,4 @@
-"""Attributes of a result that describe lidar, sea and the layout of pixels, beam and targets; lines of sight."""
+"""Result attributes that describe lidar, sea and the layout of pixels, beam and targets; lines of sight."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 #: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
 
-#: Longest text of an attribute; the limit of NetCDF files is 64 KiB.
+#: Longest attribute text; NetCDF files limit it to 64 KiB.
 _LONGEST_TEXT = 60_000
 
 #: Largest distance of simplified outlines from their points, relative to the size.
@@ -98,7 +98,7 @@ def describe_lidar(probe: Probe) -> dict[str, Any]:
 
 
 def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
-    """Return times [ns] and power [1/ns] of a pulse that is not Gaussian, as lists of at most 1000 samples."""
+    """Return times [ns] and power [1/ns] of a pulse that is not Gaussian, as lists with at most 1000 samples."""
     if pulse.shape == "gaussian":
         return {}
     times = pulse.times_ns
@@ -109,19 +109,19 @@ def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
 
 
 def describe_layout(probe: Probe) -> dict[str, Any]:
-    """Return the attributes of a result that `plot_layout` draws.
+    """Return the result attributes that `plot_layout` draws.
 
     ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
     the point x, y, z [m] where the receiver's axis, refracted by a level sea, meets the bottom (`WaterScene.bottoms`);
     missing without one. Water of several index layers has ``index_layers``, their refractive indices, and
     ``index_boundaries``, the depths between them [m].
 
-    JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of
-    imagers) and ``target_outlines``, for each target that the view may see (`Rays.meets`): ``id``, ``z`` (lowest and
-    highest point [m]), ``line`` (its vertical projection), ``seen`` (its outline on the sea level along the receiver's
-    refracted lines of sight) and, with a ``bottom_point``, ``shadow`` (that of its shadow in the laser's light at the
-    height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
-    targets. Texts above the limit are omitted.
+    JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not for
+    imagers) and ``target_outlines``, for each target that the view may see (`Rays.meets`). A target has an ``id``,
+    ``z`` (lowest and highest point [m]), ``line`` (its vertical projection), and ``seen`` (its outline on the sea level
+    along the receiver's refracted lines of sight). With a ``bottom_point`` it also has a ``shadow`` (the outline of its
+    shadow in the laser light at this point's height). A line is closed, with the coordinates angle_x, angle_y [mrad] of
+    its points, or x, y [m] for targets. Texts above the limit are omitted.
     """
     scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
@@ -205,7 +205,7 @@ def _outline(points: FloatArray) -> list[float]:
 
 
 def _flat(line: FloatArray, size: float | None = None) -> list[float]:
-    """Return the rounded coordinates of a line, with errors of about 1/5000 of a size, by default of the largest."""
+    """Return a line's rounded coordinates, with errors of about 1/5000 of a size, by default of the largest."""
     size = float(np.abs(line).max()) if size is None else size
     digits = max(0, 3 - math.floor(math.log10(max(size, 1e-6))))
     return np.round(line, digits).ravel().tolist()

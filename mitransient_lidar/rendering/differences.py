@@ -1,4 +1,4 @@
-"""Derivatives of waveforms by parameters of a scene: central differences on common random numbers."""
+"""Waveform derivatives by scene parameters: central differences on common random numbers."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from mitransient_lidar.rendering.accuracy import LightStatistics, PassStatistics
 if TYPE_CHECKING:
     from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 
-#: Shift of an echo by a step of a depth, over the pulse's full width at half maximum; of the edges of layers, which
-#: change the record little, the step is longer by a factor.
+#: Echo shift by a depth step, over the pulse's full width at half maximum; layer edges, which change the record little,
+#: have a step longer by a factor.
 _SHIFT_PER_WIDTH, _LAYER_FACTOR = 0.05, 2.0
 
-#: Step of other lengths [m].
+#: Step for other lengths [m].
 _LENGTH_STEP = 0.05
 
-#: Steps of beams and views, and of all others, over the value; and steps where that is 0.
+#: Steps for beams and views, and for all others, over the value; and steps where that is 0.
 _VIEW_STEP, _RELATIVE_STEP, _STEP_FROM_ZERO = 0.1, 0.01, 0.01
 
-#: Longest step of angles, and step of the mean slope of the sea, by which surface echoes change fast [degree].
+#: Longest angle step, and step for the sea's mean slope, by which surface echoes change fast [degree].
 _ANGLE_STEP_DEG, _SEA_STEP_DEG = 0.5, 0.2
 
 
@@ -42,7 +42,7 @@ class _Side:
         self._weights: FloatArray | None = None
 
     def cut(self, train: GateTrain) -> None:
-        """Return the energy in gates from now on, too."""
+        """From this call on, return the energy in gates, too."""
         scene = self._renderer.scene
         self._weights = train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)
 
@@ -55,16 +55,16 @@ class _Side:
 
 
 class Differences:
-    """Derivatives of impulse response and waveform by parameters of a scene, from passes that are added one by one.
+    """Derivatives of impulse response and waveform by scene parameters, from passes that are added one by one.
 
-    Each pass renders the scene with a parameter above and below its value, from the same random numbers, with time
-    bins and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in renders
-    of waveforms, and go with beam and sea. The session and its scene remain as they are.
+    Each pass renders the scene with a parameter above and below its value. Both renders share the random numbers, and
+    the time bins and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in
+    renders of waveforms, and follow beam and sea. The session and its scene stay unchanged.
 
-    Standard errors are smaller than those from independent random numbers (median over lit bins, default steps), in
-    `table1` by factors of 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
-    (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), and in `fig15_2x2` by 8 (``layer_tops[1]``). Light that does
-    not reach a bottom or target that moves is the same.
+    Standard errors are smaller than with independent random numbers (median over lit bins, default steps). In `table1`
+    the factors are 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
+    (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), in `fig15_2x2` 8 (``layer_tops[1]``). Light that does not
+    reach a moving bottom or target is the same.
 
     Parameters
     ----------
@@ -73,29 +73,29 @@ class Differences:
     integrator
         Lidar integrator.
     names
-        Names of numbers among the parameters of the scene, as for `loading.parameters.value_of`.
+        Names of numbers among the scene parameters, as for `loading.parameters.value_of`.
     steps
-        Distance of the two values from that of the scene, greater than 0, by name; by default `default_step`.
+        Distance of the two values from the scene's value, greater than 0, by name; by default `default_step`.
     renderer
         Renderer of the unchanged scene, by default a new one.
 
     Attributes
     ----------
     names
-        Names of the parameters.
+        Parameter names.
     values, steps
         Values and steps of the parameters, in their units, shape (parameter,).
     light
-        Derivatives of the energy of bins [J per unit of the parameter] and of the received power [W per unit], shape
-        (parameter, pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
+        Derivatives of bin energy [J per unit of the parameter] and of received power [W per unit], shape (parameter,
+        pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
     gates
         Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate).
 
     Raises
     ------
     UserError
-        If the scene is not an XML scene, a parameter is unknown, not a number, or one of record, gates or seeds, or a
-        step is for another parameter, not positive, or leads to a value that the scene refuses.
+        If the scene is not an XML scene; a parameter is unknown, not a number, or belongs to record, gates or seeds; or
+        a step is for another parameter, not positive, or leads to a value that the scene refuses.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Differences:
         return _Side(renderer)
 
     def add_pass(self, seed: int, share: float = 1.0) -> None:
-        """Render and add one pass of every parameter, with a share of the paths of a full one."""
+        """Render and add one pass for every parameter, with a share of the paths of a full one."""
         slopes = []
         for pair, step in zip(self._pairs, self.steps, strict=True):
             sides = zip(*(side.render(seed, share) for side in pair), strict=True)
@@ -160,13 +160,13 @@ class Differences:
 
 
 def default_step(name: str, value: float, renderer: PassRenderer) -> float:
-    """Return the step of a parameter for central differences, from measured noise and bias.
+    """Return a parameter's step for central differences, from measured noise and bias.
 
-    The noise of the derivative falls with the square root of the step or faster, and the bias grows with its square.
-    Depths, the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which
-    changes derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views of 10 % of their
-    width, other angles of 0.5 degrees, and all others of 1 %. Steps of the mean slope of the sea are 0.2 degrees: at 3
-    m/s and 20 degrees off nadir they change the surface echo of Gaussian slopes by 15 %, and derivatives by 0.4 %.
+    The derivative's noise falls with the square root of the step or faster, and the bias grows with its square. Depths,
+    the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which changes
+    derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views 10 % of their width,
+    other angles 0.5 degrees, and all others 1 %. The sea's mean slope has steps of 0.2 degrees. At 3 m/s and 20 degrees
+    off nadir they change the surface echo from Gaussian slopes by 15 %, and derivatives by 0.4 %.
     """
     known, scene = parameter_of(name), renderer.scene
     unit = unit_of(known)
@@ -187,7 +187,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
 
 
 def _checked_value(parameters: Mapping[str, str], name: str) -> float:
-    """Return the value of a parameter of what is measured."""
+    """Return the value of a measured parameter."""
     value, known = value_of(parameters, name), parameter_of(name)
     if not is_quantity(known):
         raise UserError(

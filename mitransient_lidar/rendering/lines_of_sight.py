@@ -1,4 +1,4 @@
-"""Lines of sight of the pixels over a level sea."""
+"""Pixel lines of sight over a level sea."""
 
 from __future__ import annotations
 
@@ -16,24 +16,23 @@ from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Points of a lattice for lines of sight: the fewest, those per pixel, and the most.
+#: Lattice points for lines of sight: the fewest, those per pixel, and the most.
 _POINTS, _POINTS_PER_PIXEL, _MOST_POINTS = 2**14, 8, 2**20
 
-#: Depth at which the scale of depth is taken, relative to the height of the lower instrument, and its limit [m].
+#: Depth at which the depth scale is taken, relative to the lower instrument's height, and its limit [m].
 _RELATIVE_DEPTH, _DEEPEST = 0.05, 10.0
 
 
 def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
-    """Return the lines of sight of the pixels over a level sea at z = 0, weighted with the beam.
+    """Return the pixels' lines of sight over a level sea at z = 0, weighted with the beam.
 
-    The lidar may be turned about the receiver's axis, from far to left [deg]; angles are those of the lidar that is
-    not.
+    The lidar may be turned about the receiver's axis, from far to left [deg]; angles refer to the unturned lidar.
 
     Under water they are straight, and ``surface_time`` is where depths on their scale are 0, before the pulse is
     emitted if the lidar looks down.
 
-    Each pixel uses the better sampled one of two sets of points, those of the beam that are in the pixel, and points in
-    the pixel with the beam's density. A pixel without either has the line of sight of its centre and no share.
+    Each pixel uses the better sampled one of two point sets: beam points that are in the pixel, and points in the pixel
+    with the beam's density. A pixel without either has the line of sight at its centre and no share.
     """
     pixels = scene.receiver.pixels
     depths = _depths_of_scale(scene)
@@ -67,7 +66,7 @@ def _turned(scene: LidarScene, turn_deg: float) -> tuple[Pose, Pose]:
 
 
 def _depths_of_scale(scene: LidarScene) -> tuple[float, float]:
-    """Return two depths between which the scale of depth is taken [m]; under water ahead of both poses."""
+    """Return two depths between which the depth scale is taken [m]; under water ahead of both poses."""
     heights = [float(pose.origin[2]) for pose in (scene.receiver.pose, scene.transmitter.pose)]
     if not scene.submerged:
         return 0.0, min(_RELATIVE_DEPTH * min(heights), _DEEPEST)
@@ -78,7 +77,7 @@ def _depths_of_scale(scene: LidarScene) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Sight:
-    """Beam-weighted means of the pixels: time and its spread [ns], angles [rad], and share of the beam; (pixels,)."""
+    """Beam-weighted pixel means: time and its spread [ns], angles [rad], and beam share; (pixels,)."""
 
     time: FloatArray
     spread: FloatArray
@@ -88,10 +87,10 @@ class _Sight:
 
 
 def _mean_sight(scene: LidarScene, poses: tuple[Pose, Pose], depth: float) -> _Sight:
-    """Return the means over the light of the beam that pixels see at a depth [m], for poses of receiver and laser."""
+    """Return the means over the beam light that pixels see at a depth [m], for poses of receiver and laser."""
     pixels, transmitter = scene.receiver.pixels, scene.transmitter
 
-    # Points of the beam, of equal energy. One of several pixels at a point stands for all of them.
+    # Beam points with equal energy. One of several pixels at a point represents them all.
     angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
     time, angles = _two_way(scene, *poses[::-1], np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
     seen_x, seen_y = (aligned(mi.Float, axis) for axis in angles.T)
@@ -99,7 +98,7 @@ def _mean_sight(scene: LidarScene, poses: tuple[Pose, Pose], depth: float) -> _S
     share = np.where(np.isfinite(time), np.array(inside, dtype=np.float64) / _POINTS, 0.0)
     by_beam = _means(time, angles, np.array(pixel), share, pixels.count)
 
-    # Points of the pixels, weighted with the beam's density.
+    # Pixel points, weighted with the beam's density.
     count = int(np.clip(_POINTS_PER_PIXEL * pixels.count, _POINTS, _MOST_POINTS))
     angle_x, angle_y = pixels.sample(_lattice(count))
     pixel, inside = pixels.pixel_at(angle_x, angle_y, _choices(count))
@@ -119,7 +118,7 @@ def _mean_sight(scene: LidarScene, poses: tuple[Pose, Pose], depth: float) -> _S
 
 
 def _means(time: FloatArray, angles: FloatArray, pixel: NDArray[np.integer], weight: FloatArray, count: int) -> _Sight:
-    """Return weighted means over the points of each pixel."""
+    """Return weighted means over each pixel's points."""
     total, squares = (np.asarray(np.bincount(pixel, one, count), dtype=np.float64) for one in (weight, weight**2))
     safe = np.where(total > 0, total, 1.0)
     first = float(np.nanmin(time)) if np.isfinite(time).any() else 0.0
@@ -140,7 +139,7 @@ def _lattice(count: int) -> mi.Point2f:
 
 
 def _choices(count: int) -> mi.Float:
-    """Return evenly distributed numbers from 0 to 1, independent of the points of `_lattice`."""
+    """Return evenly distributed numbers from 0 to 1, independent of the `_lattice` points."""
     return aligned(mi.Float, (np.arange(count) * 0.4142135623730951) % 1)
 
 
@@ -159,7 +158,7 @@ def _two_way(
         offset = start.origin + direction * distance[:, np.newaxis] - end.origin
         way_back = np.linalg.norm(offset, axis=1)
         return 1e9 / C0 * group * (distance + way_back), _tangent(end, offset)
-    # The scale of depth is that of the top index layer.
+    # The depth scale belongs to the top index layer.
     sea = LevelSea((scene.refractive_index,), group_index=(group,))
     down = np.where(direction[:, 2] < 0, -direction[:, 2], np.nan)
     one_way = start.origin[2] / down + sea.lengths(depth, np.hypot(*direction[:, :2].T))[0]

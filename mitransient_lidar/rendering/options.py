@@ -1,4 +1,4 @@
-"""Options of a render: type, range and meaning of each, shared by functions and commands."""
+"""Render options: type, range and meaning of each, shared by functions and commands."""
 
 from __future__ import annotations
 
@@ -8,35 +8,41 @@ from typing import Annotated
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, declared, positive_option
 
-#: Largest number of passes that can be asked for.
+#: Largest number of passes allowed.
 MOST_PASSES = 10**9
 
 #: Memory for histograms, unless another one is requested [GB].
 DEFAULT_MAX_MEMORY_GB = 2.0
 
-#: Smallest share of the paths of a full pass.
+#: Smallest share of a full pass's paths.
 SMALLEST_SHARE = 2**-9
 
 TargetError = Annotated[
     float | None,
     Option(
-        "Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have reached "
-        "this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels",
+        "Stop at this relative standard error in 95 % of the bins of lit pixels, surface echo to bottom echo, or in "
+        "95 % of the gates or of an image's lit pixels. By default 0.03 within 300 s, with gates 0.1 within 60 s, "
+        "for images 0.05 within 120 s",
         *(0, 1),
         above=True,
     ),
 ]
 TargetQuantile = Annotated[
-    float | None, Option("Share that must reach the target error instead of 0.95; 0.5 is the median", 0.01, 1)
+    float | None, Option("Share that must reach the target error, by default 0.95; 0.5 is the median", 0.01, 1)
 ]
-MaxTime = Annotated[float | None, positive_option("Stop before this many seconds, after at least two passes")]
-Passes = Annotated[int | None, Option("Stop after this many independent passes", 2, MOST_PASSES)]
-SignedSeed = Annotated[int | None, Option("Seed of the random numbers, 0 by default", -(2**63), 2**63 - 1)]
-PassShare = Annotated[float | None, Option("Share of the paths of a full pass in each pass", SMALLEST_SHARE, 1)]
+MaxTime = Annotated[
+    float | None,
+    positive_option("Stop before this many seconds, after at least two passes; by default see target error"),
+]
+Passes = Annotated[
+    int | None, Option("Stop after this many independent passes, by default at the target error", 2, MOST_PASSES)
+]
+SignedSeed = Annotated[int | None, Option("Random seed, by default 0", -(2**63), 2**63 - 1)]
+PassShare = Annotated[float | None, Option("Share of a full pass's paths in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
-    float | None, positive_option("Memory for histograms [GB], 2 by default; with less, only gates are kept")
+    float | None, positive_option("Memory for histograms [GB], by default 2; with less, only gates are kept")
 ]
-Components = Annotated[bool | None, Option("Also separate the light of surface, water, bottom and targets")]
+Components = Annotated[bool | None, Option("Also separate the light by surface, water, bottom and targets")]
 Derivatives = Annotated[
     list[str] | str | None,
     Option(
@@ -48,16 +54,15 @@ Derivatives = Annotated[
 Batches = Annotated[
     int | None,
     Option(
-        "Also keep the waveforms of this many batches of passes, from which a fit to the result takes the correlation "
-        "of its errors",
+        "Also keep this many batch waveforms, from which a fit to the result takes its error correlation",
         *(2, 256),
     ),
 ]
 Smooth = Annotated[
     float | None,
     Option(
-        "Smooth the images of gates by a Gaussian of this standard deviation [pixels]: less noise, and a bias, which "
-        "results state; only gates are kept",
+        "Smooth gate images by a Gaussian with this standard deviation [pixels]: less noise, and a bias, which "
+        "results state. Only gates are kept",
         *(0.2, 20),
     ),
 ]

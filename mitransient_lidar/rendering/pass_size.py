@@ -19,8 +19,8 @@ logger = logging.getLogger(__name__)
 #: Number of smaller passes that should fit into the time, and of full passes that must.
 _SMALL_PASSES, _FULL_PASSES = 4, 2
 
-#: Rays that a slow machine traces in a second (1 to 2 million on two cores): no trial is needed for passes with fewer
-#: rays than it traces in twice the time.
+#: Rays that a slow machine traces per second (1 to 2 million on two cores): passes with fewer rays than it traces in
+#: twice the time need no trial.
 _RAYS_PER_SECOND = 1e6
 
 #: Paths of a kernel that one thread follows at a time, and those that a GPU follows at once.
@@ -30,18 +30,18 @@ _PATHS_PER_THREAD, _PATHS_ON_GPU = 2**14, 2**17
 def fit_to_time(
     renderer: PassRenderer, max_time: float, start_ns: float, *, seed: int, gates: GateWeights | None
 ) -> tuple[PassRenderer, float, ReceivedLight | None]:
-    """Return a renderer of passes that fit into a time limit, with fewer paths where full passes do not.
+    """Return a renderer whose passes fit into a time limit, with fewer paths where full passes do not.
 
     Kernels cannot be interrupted. Where the expected number of rays is large for the time, a trial with 1/512 of the
-    paths measures the time of the kernels; if two full passes would exceed the limit, the number of paths is halved
-    until four passes do not, or the work besides the kernels takes longer.
+    paths measures the kernel time. If two full passes would exceed the limit, the number of paths is halved until four
+    passes fit, or the work besides the kernels takes longer.
 
     Parameters
     ----------
     renderer
-        Renderer of full passes.
+        Renderer for full passes.
     max_time
-        Time limit of the render [s].
+        Time limit for the render [s].
     start_ns
         Time at which light enters the water [ns].
     seed, gates
@@ -50,9 +50,9 @@ def fit_to_time(
     Returns
     -------
     renderer
-        Renderer of the passes.
+        Renderer for the passes.
     share
-        Its share of the paths of full passes.
+        Its share of a full pass's paths.
     first
         Record of the first pass, if it is rendered already.
     """
@@ -63,7 +63,7 @@ def fit_to_time(
     trial = renderer.scaled(SMALLEST_SHARE)
     received, kernels, rest = timed_pass(trial, seed, gates)
     if _SMALL_PASSES * kernels < max_time:
-        # Without the enlargement of buffers and the compilation of kernels in the first trial.
+        # Without buffer growth and kernel compilation, which belong to the first trial.
         received, kernels, rest = timed_pass(trial, seed, gates)
     left = max_time - (time.perf_counter() - began)
 
@@ -80,7 +80,7 @@ def fit_to_time(
 
 
 def describe_cost(renderer: PassRenderer, size: float, start_ns: float) -> str:
-    """Return memory of film, means and errors [bytes], and the longest time of a pass on two slow cores, in a line."""
+    """Return a line with the memory for film, means and errors [bytes], and a pass's longest time on two slow cores."""
     pixels, rays = renderer.scene.receiver.pixels.count, renderer.path_count * _rays_per_path(renderer.scene, start_ns)
     return (
         f"{pixels} pixels: film, means and errors take {1e-9 * size:.2g} GB, and a pass of {renderer.path_count} paths "
@@ -89,7 +89,7 @@ def describe_cost(renderer: PassRenderer, size: float, start_ns: float) -> str:
 
 
 def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
-    """Return the largest expected number of rays of a path: scattering events until the end of the record, and ends."""
+    """Return a path's largest expected number of rays: scattering events until the end of the record, and ends."""
     if scene.water is None:
         return 2.0
     plume = scene.water.plume
@@ -113,7 +113,7 @@ def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> 
 
 
 def _at_once(paths: float) -> float:
-    """Return the number of threads, or on a GPU of paths, that share a kernel of a number of paths."""
+    """Return the number of threads, or on a GPU of paths, that share a kernel with a number of paths."""
     if "cuda" in mi.variant():
         return min(max(paths, 1.0), _PATHS_ON_GPU)
     return min(max(paths / _PATHS_PER_THREAD, 1.0), float(dr.thread_count()))

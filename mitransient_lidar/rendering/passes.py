@@ -17,7 +17,7 @@ from mitransient_lidar.rendering.options import RenderOptions
 
 logger = logging.getLogger(__name__)
 
-#: Share of the energy lost at the edge of the surface mesh above which a warning is given.
+#: Share of the energy lost at the surface mesh's edge above which a warning is given.
 TOLERATED_LOSS = 1e-3
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
@@ -31,13 +31,14 @@ DEFAULT_QUANTILE = 0.95
 class Progress:
     """Progress of a render or a study.
 
-    Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or ``run``), elapsed
-    and estimated remaining time [s], median and 95th percentile of the relative standard errors, the requested error,
-    the number of completed units that have `failed`, and the `rate` of units a second.
+    Contains the numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or
+    ``run``), and the elapsed and estimated remaining time [s]. Also the median and 95th percentile of the relative
+    standard errors, the requested error, the number of completed units that have `failed`, and the `rate` of units per
+    second.
 
-    With a requested error: the quantile of the relative standard errors that must reach it, its value, what the errors
-    are those of (``bins``, ``gates`` or ``pixels``), and estimates of the passes and the time [s] still needed, None
-    while they are unknown.
+    With a requested error it also contains the quantile of the relative standard errors that must reach it, and this
+    quantile's value. The errors belong to ``bins``, ``gates`` or ``pixels``. Estimates of the passes and the time [s]
+    still needed are None while they are unknown.
     """
 
     done: int
@@ -78,7 +79,7 @@ ProgressCallback = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Goal:
-    """End of a render: a number of passes, an accuracy, or a time [s], whichever comes first.
+    """Render end: a number of passes, an accuracy, or a time [s], whichever comes first.
 
     The accuracy is reached when `target_quantile` of the relative standard errors are at most `target_error`.
     """
@@ -97,7 +98,7 @@ class Goal:
         default: Goal,
         target_quantile: float | None = None,
     ) -> Goal:
-        """Check the options of a render; without any of them, return the default."""
+        """Check a render's options; without any of them, return the default."""
         options = RenderOptions(target_error, target_quantile, max_time, passes)
         ends = options.target_error, options.max_time, options.passes
         goal = default if ends == (None, None, None) else cls(*ends)
@@ -155,14 +156,14 @@ class PassLog:
     error: float
 
     def edge_loss_share(self, received: float) -> float:
-        """Return the share of the energy lost at the edge of the surface mesh; `received` by all passes [J]."""
+        """Return the share of the energy lost at the surface mesh's edge; `received` by all passes [J]."""
         return self.edge_loss / (self.edge_loss + received) if self.edge_loss > 0 else 0.0
 
     def attributes(self, seed: int) -> dict[str, Any]:
-        """Return the attributes of a result that describe its passes.
+        """Return the result attributes that describe its passes.
 
-        With a requested error: the error and its quantile, the error that was reached, and an estimate of the time that
-        was still needed [s], 0 if the request was met and NaN if unknown.
+        With a requested error: the error and its quantile, and the reached error. Also an estimate of the time still
+        needed [s], 0 if the request was met and NaN if unknown.
         """
         attributes = {"seed": int(seed), "passes": self.count, "interrupted": int(self.interrupted)}
         if self.goal.target_error is None:
@@ -193,17 +194,17 @@ def run_passes(
     Parameters
     ----------
     render_pass
-        Called with the number and the seed of each pass; returns the energy lost at the edge of the surface mesh [J].
+        Called with the number and the seed of each pass; returns the energy lost at the surface mesh's edge [J].
     goal
-        End of the render.
+        Render end.
     seed
-        Seed of the render, a 64-bit integer with a sign.
+        Render seed, a 64-bit integer with a sign.
     errors
         Returns the relative standard errors, an array of any size; called from the second pass on.
     errors_of
-        What the errors are those of: ``bins``, ``gates`` or ``pixels``.
+        Unit to which the errors belong: ``bins``, ``gates`` or ``pixels``.
     verify
-        Called with the number of passes when there are 8, and at the end; raises UserError if the result is of no use.
+        Called with the number of passes at 8 passes, and at the end; raises UserError if the result is useless.
     smallest
         Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised.
     progress
@@ -214,7 +215,7 @@ def run_passes(
     KeyboardInterrupt
         On a Ctrl-C during the first passes.
     UserError
-        That of `verify`, or if memory runs out.
+        From `verify`, or if memory runs out.
     """
     count, lost, interrupted = 0, 0.0, False
     median = p95 = error = None
@@ -272,7 +273,7 @@ def run_passes(
 
 
 def warn_of_edge_loss(share: float) -> None:
-    """Warn when a large share of the energy is lost at the edge of the surface mesh."""
+    """Warn when a large share of the energy is lost at the surface mesh's edge."""
     if share > TOLERATED_LOSS:
         logger.warning(
             "the surface is smaller than the spread of the light in the water: about %.2g %% of the received energy is "
@@ -288,7 +289,7 @@ def describe_quantile(quantile: float, errors_of: str) -> str:
 
 
 def _shortfall(log: PassLog, errors_of: str, needed: int | None) -> str:
-    """Return the error that was reached instead of the requested one, and what that one would have taken."""
+    """Return the error reached instead of the requested one, and the passes and time that the latter needs."""
     share, target = (
         describe_quantile(log.goal.target_quantile, errors_of),
         f"target_error = {log.goal.target_error:.3g}",
@@ -301,7 +302,7 @@ def _shortfall(log: PassLog, errors_of: str, needed: int | None) -> str:
 
 
 def _pace(ends: list[float]) -> float:
-    """Return the time of a pass [s] from the start and the ends of passes.
+    """Return the time per pass [s] from the start and the ends of passes.
 
     The first pass includes the compilation of the kernels and is left out where there are others.
     """
@@ -310,7 +311,7 @@ def _pace(ends: list[float]) -> float:
 
 
 def pass_seed(seed: int, number: int) -> int:
-    """Return the seed of a pass, different from that of any other pass of any other seed."""
+    """Return a pass seed, different from any other pass seed with any other seed."""
     sequence = np.random.SeedSequence([int(seed) & 0xFFFFFFFFFFFFFFFF, number])
     return int(sequence.generate_state(1, np.uint64)[0])
 

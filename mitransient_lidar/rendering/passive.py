@@ -1,4 +1,4 @@
-"""Rendering of images by daylight, still or animated."""
+"""Rendering of daylight images, still or animated."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
 #: Largest number of frames.
 MOST_FRAMES = 10_000
 
-#: Memory of a pixel in the passes of a frame, and of one of an image that is kept, and labelled at the end [bytes].
+#: Memory per pixel in a frame's passes, and per pixel of an image that is kept, and labelled at the end [bytes].
 _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
 
-_TIMES = ("surface_time", "time")  # names of the time of the sea of an XML scene [s]
+_TIMES = ("surface_time", "time")  # names of the sea's time in an XML scene [s]
 
 
 @checked
@@ -71,14 +71,17 @@ def render_passive(
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
-    passes: Annotated[int | Sequence[int] | None, Option("Stop after this many passes", 2, MOST_PASSES)] = None,
+    passes: Annotated[
+        int | Sequence[int] | None,
+        Option("Stop after this many passes, by default at the target error", 2, MOST_PASSES),
+    ] = None,
     seed: SignedSeed = None,
-    frames: Annotated[int, Option("Number of frames of an animation, 1 by default", 1, MOST_FRAMES)] = 1,
+    frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
-        float, Option("Time between frames, 0.1 by default", 0, unit="s", above=True, flag="--frame-step")
+        float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")
     ] = 0.1,
     filter_width_nm: Annotated[
-        float | None, positive_option("Width of the receiver's filter, for the power of the daylight", "nm")
+        float | None, positive_option("Width of the receiver's filter, for the daylight power", "nm")
     ] = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,
@@ -90,29 +93,29 @@ def render_passive(
     scene
         As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
     integrator
-        Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
+        Name or dict of a passive integrator; by default the scene's, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
         End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may
-        be a list with one number a frame.
+        be a list with one number per frame.
     params, variant
         As for `render.render`.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
     frame_step_s
-        Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to ``time``
-        of the ``ocean_surface`` of a dict.
+        Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to a dict's
+        ``ocean_surface`` parameter ``time``.
     progress
         Called with a `passes.Progress` of the frame after every pass.
 
     Returns
     -------
     xarray.Dataset
-        ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,), after ``frame`` with
-        its coordinate ``time_s`` [s] for several; with a filter ``background_power`` [W], which the receiver detects
-        without its laser. ``etendue`` [m^2 sr] is open area times solid angle of each pixel times
-        the transmittance of optics and (one way) air; power is radiance times etendue times width of the filter. The
-        attribute ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that
-        were begun, and the attribute ``interrupted`` is 1.
+        ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,). Several frames come
+        first, over ``frame`` with its coordinate ``time_s`` [s]. A filter adds ``background_power`` [W], which the
+        receiver detects without its laser. ``etendue`` [m^2 sr] is open area times pixel solid angle times the
+        transmittance of optics and (one way) air; power is radiance times etendue times filter width. The attribute
+        ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that were begun,
+        and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -200,7 +203,7 @@ def _labelled(
 def _render_frame(
     renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None
 ) -> tuple[RatioStatistics, PassLog, float]:
-    """Render the passes of one frame; return statistics, log and share of the light lost at the surface's edge."""
+    """Render one frame's passes; return statistics, log and share of the light lost at the surface's edge."""
     statistics, received = RatioStatistics(renderer.scene.receiver.pixels.count), 0.0
 
     def render_pass(number: int, seed: int) -> float:
@@ -270,7 +273,7 @@ def _etendue(renderer: DaylightRenderer) -> FloatArray:
 
 
 def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
-    """Return the attributes of receiver and daylight; warn of a field of view beyond the surface."""
+    """Return the attributes of receiver and daylight; warn about a field of view beyond the surface."""
     from mitransient_lidar.transport.daylight.sampling import share_outside_surface
 
     scene, receiver = renderer.scene, renderer.scene.receiver

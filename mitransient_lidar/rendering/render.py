@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Default ends of a render without and with gates.
+#: Default render ends without and with gates.
 DEFAULT_GOAL = Goal(target_error=0.03, max_time=300.0)
 DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 
@@ -51,7 +51,7 @@ def render(
     *,
     instrument: Instrument = None,
     sensor: Sensor = None,
-    integrator: Annotated[Any, Option("Integrator to use instead of the scene's")] = None,
+    integrator: Annotated[Any, Option("Integrator, by default the scene's")] = None,
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
@@ -72,22 +72,21 @@ def render(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, the
-        record of a scene, or a session; or a result (a dataset, or its EXR or NetCDF file), which is rendered again
-        with its own options unless others are given. See `render_again`.
+        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, a scene
+        record, or a session. A result (a dataset, or its EXR or NetCDF file) is rendered again with its own options
+        unless others are given. See `render_again`.
     params
-        Values for the parameters of an XML scene and of its plugins; they have priority over those of an instrument.
+        Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
     instrument
-        Name of the instrument whose laser and receiver replace those of an XML scene, as `loading.instruments` lists
-        them.
+        Name of the instrument whose laser and receiver replace an XML scene's, as `loading.instruments` lists them.
     sensor
-        Id of a receiver of the scene, by default the first one.
+        Id of a receiver in the scene, by default the first one.
     integrator
-        Name or dict of an integrator plugin, or an integrator; by default that of the scene.
+        Name or dict of an integrator plugin, or an integrator; by default the scene's.
     target_error
-        Relative standard error, greater than 0, at most 1, that ends the render (after at least 8 passes) when 95 % of
-        the bins of lit pixels from the surface echo to the end of the bottom echo have reached it; with gates, 95 % of
-        the gates, in the median over their lit pixels.
+        Relative standard error, greater than 0, at most 1, that ends the render after at least 8 passes. 95 % of the
+        bins of lit pixels must have reached it, from the surface echo to the end of the bottom echo. With gates, 95 %
+        of the gates must have reached it, in the median over their lit pixels.
     target_quantile
         Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time
@@ -102,34 +101,33 @@ def render(
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning.
     pass_share
-        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, or less where `max_time` needs it.
+        Share of a full pass's paths in each pass, 1/512 to 1; by default 1, or less where `max_time` needs it.
     components
         Whether to separate the light by its origin, by default not: ``surface``, ``water``, and the id of each solid,
         such as ``bottom``. The origin is the last solid that the light has met, else the water if that has scattered
         it, else the surface.
     derivatives
-        Names of parameters by which the light is differentiated, from the paths that it takes: ``attenuation``,
-        ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
-        of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; ``<id>_reflectance`` of diffuse
-        solids, such as ``bottom_reflectance``; ``divergence_mrad`` of Gaussian beams; and ``ripple_variance``, the
-        slope variance of the sea's ripples, without that of `ripple_focusing`. Derivatives by other
-        numbers of the scene, such as ``bottom_depth`` or ``off_nadir_deg``, are central differences on common random
-        numbers, which take two more renders each (`differences.Differences`).
+        Names of parameters by which the light is differentiated, from its own paths: ``attenuation``, ``scattering``
+        and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water for each layer
+        or, as ``scattering[1]``, for one; ``phase_g`` for ``hg`` functions; ``<id>_reflectance`` for diffuse solids,
+        such as ``bottom_reflectance``; ``divergence_mrad`` for Gaussian beams; and ``ripple_variance``, the slope
+        variance of the sea's ripples, without the ripples in `ripple_focusing`. Derivatives by other numbers in the
+        scene, such as ``bottom_depth`` or ``off_nadir_deg``, are central differences on common random numbers, which
+        need two more renders each (`differences.Differences`).
     batches
-        Number of batches of passes whose waveforms are kept, 2 to 256; none by default. They show how errors of
+        Number of pass batches whose waveforms are kept, 2 to 256; none by default. They show how the errors in
         different bins are correlated, as a fit to the result needs to state its own errors.
     smooth
-        Standard deviation of a Gaussian by which the image of each gate is smoothed in each pass, 0.2 to 20 pixels;
-        none by default. Standard errors are those of the smoothed images. Only gates are kept, and passes have fewer
-        paths by default. The coordinate ``gate_smoothing_bias`` estimates what smoothing
-        changes.
+        Standard deviation of a Gaussian that smooths each gate's image in each pass, 0.2 to 20 pixels; none by default.
+        Standard errors refer to the smoothed images. Only gates are kept, and passes have fewer paths by default. The
+        coordinate ``gate_smoothing_bias`` estimates the change by smoothing.
     variant
-        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. What was active
-        before is active afterwards.
+        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
+        active variant is active again afterwards.
     progress
         Called with a `passes.Progress` after every pass.
     **others
-        Options of `shots.series.render_shots` or `passive.render_passive`, for results of these.
+        Options of `shots.series.render_shots` or `passive.render_passive`, for their results.
 
     Returns
     -------
@@ -141,8 +139,8 @@ def render(
         dimensions, whose sums over ``origin`` are the whole. With `derivatives`, ``waveform_derivative`` and
         ``impulse_response_derivative``, with standard errors, over ``parameter`` and the same dimensions. With
         `batches`, ``waveform_batch`` [W], the mean over each batch of passes (as many as the coordinate
-        ``batch_passes`` says), over ``batch`` and the same dimensions. After Ctrl-C it includes the completed passes,
-        and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
+        ``batch_passes`` states), over ``batch`` and the same dimensions. After Ctrl-C it includes the completed passes,
+        and the attribute ``interrupted`` is 1. A result gives the dataset of the function that rendered it.
 
     Raises
     ------
@@ -153,7 +151,7 @@ def render(
     -----
     Standard errors come from the spread of the passes. Intervals by Student's t with one degree of freedom less than
     the attribute ``passes`` have their nominal coverage where the error is below a tenth of the value. Where it is 20
-    to 40 %, 95 % intervals of 8 passes hold the mean in 91 to 93 % of the bins, and where it is larger, in fewer.
+    to 40 %, 95 % intervals from 8 passes contain the mean in 91 to 93 % of the bins, and where it is larger, in fewer.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
@@ -172,23 +170,23 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     Parameters
     ----------
     result
-        Dataset of `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. Of one that was
-        computed from a result, as gates or signals of a receiver, that result is rendered. Of a series, all shots, or
-        those that were completed before Ctrl-C.
+        Dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset that was
+        computed from a result, such as gates or receiver signals, gives a render of that result. A series gives all
+        shots, or the shots that were completed before Ctrl-C.
     options
-        Options of the function that rendered the result, by default those of its attributes. `params` are added to the
-        parameters of its scene.
+        Options of the function that rendered the result, by default the values in its attributes. `params` are added to
+        its scene's parameters.
 
     Returns
     -------
     xarray.Dataset
-        As of the function that rendered the result.
+        As from the function that rendered the result.
 
     Raises
     ------
     UserError
-        If the result does not hold its scene, a file of the scene has changed, shots were selected or reordered, or an
-        option is invalid.
+        If the result does not contain its scene, a file of the scene has changed, shots were selected or reordered, or
+        an option is invalid.
     """
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.shots.frames import render_frames

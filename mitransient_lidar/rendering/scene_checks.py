@@ -21,33 +21,33 @@ from mitransient_lidar.transport.solids import box_of, met_numbers
 
 logger = logging.getLogger(__name__)
 
-#: Distance of the axes that is told, over the radii of beam and view, whichever is larger.
+#: Axis distance that is reported, over the radii of beam and view, whichever is larger.
 _APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
 
 #: Heights at which the distance of the axes is compared.
 _HEIGHTS = 64
 
-#: Sum of the areas of a mesh over their absolute values, below which it is closed.
+#: Sum of a mesh's areas over their absolute values, below which it is closed.
 _CLOSED = 1e-3
 
-#: Most shapes that are named of those out of view or outside the beam.
+#: Most shapes out of view or outside the beam that are named.
 _MOST_NAMED = 5
 
-#: Widths of the pulse and of the receiver's response that an echo lasts at most.
+#: Longest echo in widths of the pulse and of the receiver's response.
 _PULSES = 5.0
 
 
 def check_scene(probe: Probe) -> None:
-    """Refuse the scene of a probe that can return no light within its record, and warn of parts that cannot contribute.
+    """Refuse a probe's scene that can return no light within its record, and warn about parts that cannot contribute.
 
-    Warnings name shapes whose echo comes before or after the record, which lie out of view or outside the beam, or
-    partly in the air, and a laser and a receiver whose axes do not meet.
+    Warnings name shapes whose echo comes before or after the record, and shapes out of view, outside the beam, or
+    partly in the air. They also report a laser and a receiver whose axes do not meet.
 
     Raises
     ------
     UserError
         If no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the record,
-        nothing in view reflects or scatters light, the record holds no echo, or a target lies below the bottom.
+        nothing in view reflects or scatters light, the record contains no echo, or a target lies below the bottom.
     """
     scene, view, beam = probe.scene, probe.view, probe.beam
     if scene.submerged:
@@ -61,7 +61,7 @@ def check_scene(probe: Probe) -> None:
     _check_solids(probe)
     _warn_of_axes(scene, view, beam)
     solids = scene.solids
-    # Of several parts of the bottom, such as a shore, some may be elsewhere.
+    # Of several bottom parts, such as a shore, some may be elsewhere.
     single = scene.targets if len(scene.bottoms) > 1 else solids
     out = [said for solid in single if (said := _out_of_place(solid, view, beam))]
     for said in out[:_MOST_NAMED]:
@@ -209,7 +209,7 @@ def _check_solids(probe: Probe) -> None:
 
 
 def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:
-    """Warn of axes of laser and receiver that do not meet in the water or on the surface."""
+    """Warn about axes of laser and receiver that do not meet in the water or on the surface."""
     boxes = [box_of(solid) for solid in scene.solids]
     highest = max([0.0, *(min(high[2], 0.5 * view.pose.origin[2]) for _, high in boxes)])
     # Without a solid, to the depth from which light returns within the record.
@@ -233,7 +233,7 @@ def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:
 
 
 def _out_of_place(solid: mi.Shape, view: Rays, beam: Rays) -> str:
-    """Return what to say of a solid that lies out of view or outside the beam; nothing of others."""
+    """Return the message for a solid that lies out of view or outside the beam; none for others."""
     z = float(solid.bbox().center().z)
     for rays, problem, name in ((view, "out of view", "receiver"), (beam, "outside the beam", "laser")):
         if rays.meets(solid) or not np.isfinite(axis := rays.axis_at_height(rays.middle_height(solid))).all():
@@ -275,14 +275,14 @@ def _is_inside_out(solid: mi.Shape) -> bool:
         return False
     volume = float(np.einsum("ij,ij->", corners[:, 0], areas))
     if solid.has_vertex_normals() and not solid.has_face_normals():
-        # BSDFs are in the frame of these.
+        # BSDFs use the frame of these normals.
         normals = np.array(buffers["vertex_normals"]).reshape(-1, 3)[faces[:, 0]]
         volume *= float(np.einsum("ij,ij->", normals, areas))
     return bool((volume < 0) != solid.has_flipped_normals())
 
 
 def _warn_of_time(probe: Probe, echo: SolidEcho) -> None:
-    """Warn of the echo of a solid that comes before the record, or after one that is not of the surface echo alone."""
+    """Warn about a solid's echo that comes before the record, or after one that contains more than the surface echo."""
     axis, fwhm_ns = probe.scene.axis, probe.scene.transmitter.pulse.fwhm_ns
     name, mean = echo.shape.id(), echo.mean_ns
     if mean < axis.start_ns:

@@ -1,4 +1,4 @@
-"""Datasets of results, and their files."""
+"""Result datasets, and their files."""
 
 from mitransient_lidar.results.attributes import provenance
 from mitransient_lidar.results.dataset import (

@@ -19,7 +19,7 @@ from mitransient_lidar.core.validation import shown as printed
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
 
-#: Lowest and highest value of attributes that are numbers; NaN is unknown.
+#: Lowest and highest value of number attributes; NaN is unknown.
 _NUMBERS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("bin_width_ns", "aperture_area", "divergence_mrad", "divergence_across_mrad"), _POSITIVE),
     **dict.fromkeys(("field_of_view_mrad", "pulse_energy_mj", "wavelength_nm", "gate_step_ns"), _POSITIVE),
@@ -38,7 +38,7 @@ PER_PIXEL = ("gain", "optical_density", "background_power_w", "fitting_gain", "f
 #: Those that count something, which is known.
 _COUNTS = ("passes", "most_passes", "pulses", "shots")
 
-#: Number of values of attributes that are lists of finite numbers, None for any.
+#: Number of values in attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {
     "transmitter_pose": 12,
     "receiver_pose": 12,
@@ -50,12 +50,12 @@ _LISTS: dict[str, int | None] = {
     **dict.fromkeys(("wave_focusing_depths", "wave_focusing")),
 }
 
-#: Those that are empty where there are none: views of hexagons and of separate pixels have no sides.
+#: Attributes that are empty where there are none: views of hexagons and of separate pixels have no sides.
 _MAY_BE_EMPTY = ("field_of_view_sides_mrad", "error_inflation_bins", "error_inflation")
 
 _TEXTS = ("scene", "beam_profile", "field_of_view_shape", "layout", "variant", "integrator", "instrument", "sensor")
 
-#: Attributes that are texts of JSON: lists of outlines, each a list of lines x, y, x, y, ...; or with a name.
+#: JSON text attributes: lists of outlines, each a list of lines x, y, x, y, ...; or with a name.
 _OUTLINES, _LISTED = ("pixel_outlines",), {"beam_outlines": ("share", "lines"), "target_outlines": ("id", "z", "line")}
 
 #: Coordinates that hold finite numbers, or NaN where they are unknown.
@@ -80,7 +80,7 @@ _FIRST = (
 
 
 def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of a result, checked, with ``title``, ``source`` and ``history`` added.
+    """Return a result's attributes, checked, with ``title``, ``source`` and ``history`` added.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def titled(what: str, attributes: Mapping[Any, Any]) -> str:
 
 
 def step_of_history(done: str, attributes: Mapping[Any, Any] | None = None) -> str:
-    """Return the attribute ``history`` of a dataset with a line about what was done with it now."""
+    """Return a dataset's attribute ``history`` with a line about the latest operation."""
     line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {done} by mitransient-lidar {__version__}"
     return "\n".join(part for part in (str((attributes or {}).get("history", "")), line) if part)
 
@@ -146,12 +146,12 @@ def attribute(name: str, value: Any) -> int | float | str | list[int] | list[flo
 
 
 def text(value: str | Path) -> str:
-    """Replace what UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
+    """Replace text that UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
     return str(value).replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
 
 
 def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
-    """Raise `UserError` if a known attribute of a result is of another kind than a render writes, or out of range."""
+    """Raise `UserError` if a known result attribute has another kind than a render writes, or is out of range."""
     for name, (low, high) in _NUMBERS.items():
         high = min(high, (limits(name) or (low, high))[1])
         value = attributes.get(name, low)
@@ -185,19 +185,19 @@ def check_coordinates(place: object, dataset: xr.Dataset, name: str) -> None:
         values = dataset[one]
         if values.dtype.kind not in "fiu":
             kind = "texts" if values.dtype.kind in "USO" else f"values of type {values.dtype}"
-            raise UserError(f"{place} has {one} with {kind}: it must hold numbers.")
+            raise UserError(f"{place} has {one} with {kind}: it must hold numbers")
         if one in _COORDINATES and np.isinf(values.values).any():
-            raise UserError(f"{place} has {one} = {values.values[np.isinf(values.values)][0]}: it must be finite.")
+            raise UserError(f"{place} has {one} = {values.values[np.isinf(values.values)][0]}: it must be finite")
         if one == f"{name}_stderr" and values.dims != dataset[name].dims:
-            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), unlike {name}.")
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), unlike {name}")
         if one in ("angle_x", "angle_y") and not set(values.dims) <= dims:
-            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), not over its pixels.")
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), not over its pixels")
     if ("angle_x" in dataset.coords) != ("angle_y" in dataset.coords):
-        raise UserError(f"{place} has one of the coordinates angle_x and angle_y: it must have both.")
+        raise UserError(f"{place} has one of the coordinates angle_x and angle_y: it must have both")
 
 
 def _refusal(place: object, name: str, value: object, allowed: str) -> UserError:
-    return UserError(f"{place} has the attribute {name} = {printed(value)}: it must be {allowed}.")
+    return UserError(f"{place} has the attribute {name} = {printed(value)}: it must be {allowed}")
 
 
 def _is_number(value: object) -> bool:
@@ -211,7 +211,7 @@ def _are_numbers(value: Any) -> bool:
 
 
 def _are_outlines(text: object, keys: tuple[str, ...] | None) -> bool:
-    """Return whether a text is JSON of lists of lines, or of objects with these keys, whose lists hold numbers."""
+    """Return whether a text is JSON with number lists in lines, or in objects with these keys."""
     try:
         listed = json.loads(text) if isinstance(text, str) else None
     except (ValueError, RecursionError):

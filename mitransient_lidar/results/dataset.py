@@ -2,13 +2,13 @@
 
 A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per bin] and ``waveform`` [W] and their
 standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
-time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
-the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes,
-among them the scene and all parameters of its plugins (`loading.scene_source`), from which it can be rendered again. A
-series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
-by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
-by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and
-these. The power of batches of passes is in ``waveform_batch``, over ``batch`` and the same dimensions.
+time) for an imager. The coordinates are ``time`` [ns] at the bin centres, ``pixel`` (names), and the pixel centres in
+tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The render parameters are attributes, among them the scene and
+all its plugin parameters (`loading.scene_source`), from which it can be rendered again. A shot series has the dimension
+``shot`` first, and each shot's truth as coordinates. Light separated by its origin is in variables whose names end in
+``_by_origin``, over ``origin`` and the other dimensions. Derivatives by scene parameters are in ``waveform_derivative``
+and ``impulse_response_derivative``, over ``parameter`` and these. The power in pass batches is in ``waveform_batch``,
+over ``batch`` and the same dimensions.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mitransient_lidar.results.variables import described, label
 
 _LOG = logging.getLogger(__name__)
 
-#: Variables of a result.
+#: Variables in a result.
 LIGHT = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")
 _TIME_TOLERANCE = 1e-3  # of a bin, between the time coordinate and the attributes
 _NAMED_PIXELS = 5  # largest number of pixels listed in a warning
@@ -48,7 +48,7 @@ def build(
     grid: tuple[int, int] | None = None,
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Label the arrays of a render as a result.
+    """Label a render's arrays as a result.
 
     Non-finite values are kept; a warning lists their pixels.
 
@@ -61,9 +61,9 @@ def build(
     time : TimeAxis
         The time bins.
     pixel_names : sequence of str
-        Unique names of the pixels; unused with `grid`.
+        Unique pixel names; unused with `grid`.
     pixel_centres_mrad : array-like of shape (pixel, 2)
-        Tangent-plane angles (angle_x, angle_y) of the centres of the pixels [mrad].
+        Tangent-plane angles (angle_x, angle_y) of the pixel centres [mrad].
     grid : tuple of int, optional
         Rows and columns of an imager, with pixels in row-major order.
     attributes : mapping of str to int, float, str or a list of those
@@ -102,9 +102,9 @@ def build(
 
 
 def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
-    """Label the arrays of a series of shots, of shape (shot, pixel, time), as a result; see `build`."""
+    """Label a shot series' arrays, shape (shot, pixel, time), as a result; see `build`."""
     values = [np.asarray(array, dtype=np.float64) for array in arrays]
-    # The mean holds what is not finite in any shot.
+    # The mean includes values that are not finite in any shot.
     labelled = build(*(array.mean(axis=0) for array in values), **described)
     data = {
         name: (("shot", *labelled[name].dims), array.reshape(-1, *labelled[name].shape), labelled[name].attrs)
@@ -114,16 +114,16 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
 
 
 def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.ArrayLike) -> xr.Dataset:
-    """Return a result of `build` or `build_series` with its light by origin.
+    """Return a result from `build` or `build_series` with its light by origin.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         The result.
     origins : sequence of str
-        Unique names of the origins.
+        Unique origin names.
     arrays : array-like of shape (pixel, origin, time)
-        The four arrays of `build`, of each origin; of a series with the shots first.
+        The four arrays of `build` for each origin; in a series with the shots first.
     """
     values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
     added = _add(dataset, "by_origin", "{}, by origin", {"origin": np.array(origins, dtype=str)}, values)
@@ -138,17 +138,17 @@ def add_derivatives(
     methods: Sequence[str],
     *arrays: npt.ArrayLike,
 ) -> xr.Dataset:
-    """Return a result of `build` or `build_series` with its derivatives by parameters.
+    """Return a result from `build` or `build_series` with its derivatives by parameters.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         The result.
     names, values, units, methods : sequences
-        Of each parameter: unique name, value at which the light was rendered, unit, and ``score`` or ``central
+        For each parameter: unique name, value at which the light was rendered, unit, and ``score`` or ``central
         differences``.
     arrays : array-like of shape (parameter, pixel, time)
-        Derivatives of the four arrays of `build` by the parameter in its unit; of a series with the shots after the
+        Derivatives of the four arrays of `build` by the parameter in its unit; in a series with the shots after the
         parameters.
     """
     coords = {
@@ -161,16 +161,16 @@ def add_derivatives(
 
 
 def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
-    """Return a result of `build` with the mean power of each batch of passes, ``waveform_batch`` [W].
+    """Return a result from `build` with each pass batch's mean power, ``waveform_batch`` [W].
 
     Parameters
     ----------
     dataset : xarray.Dataset
         The result.
     passes : sequence of int
-        Number of passes of each batch.
+        Passes per batch.
     waveforms : array-like of shape (batch, pixel, time)
-        Mean power of these passes [W].
+        Mean power in these passes [W].
     """
     waveform = dataset["waveform"]
     values = np.asarray(waveforms, dtype=np.float64).reshape(len(passes), *waveform.shape)
@@ -186,9 +186,9 @@ def _add(
     arrays: Sequence[npt.ArrayLike],
     per_unit: str = "",
 ) -> xr.Dataset:
-    """Return a result with other values of its four variables, under names with an ending before ``_stderr``.
+    """Return a result with other values for its four variables, under names with an ending before ``_stderr``.
 
-    The dimension of the first coordinate is added before those of the variables; `meaning` has their long names.
+    The first coordinate's dimension is added before the variables' own; `meaning` has their long names.
     """
     dim, (dims, shape) = next(iter(coords)), (dataset["waveform"].dims, dataset["waveform"].shape)
     data = {}
@@ -227,7 +227,7 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
 
 
 def time_axis(dataset: xr.Dataset) -> TimeAxis:
-    """Return the time bins of a dataset.
+    """Return a dataset's time bins.
 
     They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with
     them, else from the coordinate, as after a selection of bins.
@@ -255,14 +255,14 @@ def time_axis(dataset: xr.Dataset) -> TimeAxis:
 def pixel_coordinates(
     pixel_names: Sequence[str], pixel_centres_mrad: npt.ArrayLike, grid: tuple[int, int] | None = None
 ) -> dict[str, Any]:
-    """Return the coordinates of pixels: their names, or rows and columns, and their centres angle_x and angle_y.
+    """Return pixel coordinates: their names, or rows and columns, and their centres angle_x and angle_y.
 
-    The arguments are those of `build`.
+    Arguments as for `build`.
 
     Raises
     ------
     ValueError
-        If names repeat, or the number of names or grid cells differs from that of the centres.
+        If names repeat, or the number of names or grid cells differs from the number of centres.
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)
@@ -293,17 +293,17 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
     check_attributes(place, dataset.attrs)
     dims = tuple(str(dim) for dim in dataset[name].dims)
     if "time" not in dims or "time" not in dataset.coords:
-        raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}.")
+        raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}")
     if empty := [dim for dim in dims if dataset.sizes[dim] == 0]:
-        raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1.")
+        raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1")
     times = dataset["time"].values
     if times.dtype.kind not in "fiu":
-        raise UserError(f"{place} has the coordinate time of type {times.dtype}: it must hold numbers, in ns.")
+        raise UserError(f"{place} has the coordinate time of type {times.dtype}: it must hold numbers, in ns")
     if not np.isfinite(times).all():
-        raise UserError(f"{place} has the coordinate time = {times[~np.isfinite(times)][0]}: it must be finite.")
+        raise UserError(f"{place} has the coordinate time = {times[~np.isfinite(times)][0]}: it must be finite")
     for index in np.flatnonzero(np.diff(times) <= 0)[:1]:
         raise UserError(
-            f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly."
+            f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly"
         )
     check_coordinates(place, dataset, name)
 

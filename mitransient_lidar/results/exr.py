@@ -1,18 +1,18 @@
-"""OpenEXR files of datasets: parts of 32-bit floating-point channels, compressed with ZIP, and their metadata.
+"""OpenEXR files for datasets: parts with 32-bit floating-point channels, compressed with ZIP, and their metadata.
 
 - Time bins are the layers of one part: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels
-  ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs, beyond
-  1024 channels of several parts, named by their first channel.
-- Gates, and frames by daylight, are one part each, named ``gate000`` (four digits from 1000 gates on) or ``frame0000``,
-  with the channels ``Y`` and ``Y.stderr``. Gates of a camera have the moments of their frames (``Y``, their mean,
-  ``Y.deviation``, ...), and the digital numbers of each frame (``frame0000.Y``, ``frame0000.saturated``). Every part
-  has the header attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is
-  a folder of files with one gate each, numbered like the parts.
+  ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs. More
+  than 1024 channels fill several parts, named by their first channel.
+- Gates, and daylight frames, are one part each, named ``gate000`` (four digits from 1000 gates on) or ``frame0000``,
+  with the channels ``Y`` and ``Y.stderr``. Camera gates have the moments of their frames (``Y``, their mean,
+  ``Y.deviation``, ...), and each frame's digital numbers (``frame0000.Y``, ``frame0000.saturated``). Every part has the
+  header attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is a folder
+  with one file per gate, numbered like the parts.
 
-Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice: OpenEXR
-supports only integers and floats of 32 bits and no empty list, so a JSON string (header attribute ``mitransientLidar``)
+Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice. OpenEXR
+supports only 32-bit integers and floats and no empty list, so a JSON string (header attribute ``mitransientLidar``)
 stores them exactly; ``exrheader`` and other programs read copies of the numbers and texts that most readers need. The
-attribute ``mitransientLidarSha256`` of each part is the checksum of that string and of the channels: OpenEXR has none
+attribute ``mitransientLidarSha256`` in each part is the checksum of that string and of the channels: OpenEXR has none
 for its header, nor for blocks that ZIP cannot make smaller.
 """
 
@@ -46,9 +46,9 @@ _IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence 
 _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
 _NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
 _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
-#: Channels of a part: OpenImageIO reads no more, and OpenEXR takes a time that grows with their square.
+#: Channels in a part: OpenImageIO reads no more, and OpenEXR needs a time that grows with their square.
 _MOST_CHANNELS = 1024
-_BYTES_PER_CHANNEL = 2500  #: Memory of a channel besides its values.
+_BYTES_PER_CHANNEL = 2500  #: Memory per channel besides its values.
 _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
@@ -65,9 +65,9 @@ class _Images(NamedTuple):
     """Datasets whose images along a dimension are parts."""
 
     dim: str
-    digits: int  #: Fewest digits of the number of a part.
-    channels: dict[str, str]  #: Channel of each variable.
-    header: dict[str, str]  #: Header attribute of each coordinate over the dimension.
+    digits: int  #: Fewest digits in a part's number.
+    channels: dict[str, str]  #: Channel for each variable.
+    header: dict[str, str]  #: Header attribute for each coordinate over the dimension.
 
 
 _IMAGES = {
@@ -83,22 +83,22 @@ _IMAGES = {
     "radiance": _Images("frame", 4, {"radiance": "Y", "radiance_stderr": "Y.stderr"}, {"time_s": "timeS"}),
 }
 
-#: Channels of the moments of frames, and component of what each frame has.
+#: Channels for frame moments, and components for each frame's values.
 _MOMENTS = {"signal_mean": "Y", "signal_mean_stderr": "Y.stderr", "signal_deviation": "Y.deviation"}
 _MOMENTS |= {"snr": "Y.snr", "saturation": "Y.saturation", "dark_level": "Y.dark"}
 _OF_FRAMES = {"signal": "Y", "saturated": "saturated"}
 
 
 class Part(NamedTuple):
-    """One image of a file."""
+    """One image in a file."""
 
-    name: str  #: Unique name of the part; empty in a file of one part.
-    attributes: dict[str, Any]  #: The header; for writing, of types that OpenEXR stores.
-    channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values of shape (row, column).
+    name: str  #: Unique part name; empty in a file with one part.
+    attributes: dict[str, Any]  #: The header; for writing, in types that OpenEXR stores.
+    channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values with the shape (row, column).
 
 
 def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
-    """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts of a file, or of the files of a sequence.
+    """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts for a file, or for a sequence of files.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     kind = _kind(content, dataset.data_vars)
     variables = _LAYERS if kind is None else kind.channels
     if extra := [str(name) for name in dataset.data_vars if name not in variables]:
-        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
+        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file")
     dataset = dataset.assign_attrs({str(name): attribute(str(name), value) for name, value in dataset.attrs.items()})
     exact = {
         "content": content,
@@ -159,7 +159,7 @@ def _split_frames(dataset: xr.Dataset, path: str | os.PathLike[str]) -> xr.Datas
     if "frame" in dataset["signal_mean"].dims or 2 * dataset.sizes["frame"] > _MOST_CHANNELS - len(_MOMENTS):
         raise UserError(
             f"cannot write {path}: an EXR file holds up to {(_MOST_CHANNELS - len(_MOMENTS)) // 2} frames of one sea; "
-            "use a .nc or .tif file."
+            "use a .nc or .tif file"
         )
     like = dataset["signal_mean"]
     values: dict[str, xr.DataArray] = {name: dataset[name] for name in map(str, dataset) if name not in _OF_FRAMES}
@@ -173,7 +173,7 @@ def _split_frames(dataset: xr.Dataset, path: str | os.PathLike[str]) -> xr.Datas
 
 
 def _joined_frames(dataset: xr.Dataset, types: Mapping[str, str]) -> xr.Dataset:
-    """Return frames of `_split_frames` as they were; `types` are those of their values."""
+    """Return frames from `_split_frames` in their original form; `types` are their value types."""
     found = {}
     for name in _OF_FRAMES:
         parts = [dataset[f"{name}{number:04d}"] for number in range(dataset.sizes["frame"])]
@@ -185,7 +185,7 @@ def _joined_frames(dataset: xr.Dataset, types: Mapping[str, str]) -> xr.Dataset:
 
 
 def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any]) -> list[Part]:
-    """Return time bins as layers of one part, or of several for many channels."""
+    """Return time bins as layers in one part, or in several for many channels."""
     channels: dict[str, npt.NDArray[np.float32]] = {}
     for name, (stack, component) in _LAYERS.items():
         # Bins first: every channel is one contiguous image.
@@ -252,12 +252,12 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
         If `stem` is no file name, or a file cannot be written.
     """
     if not stem or Path(stem).name != stem:
-        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders.")
+        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders")
     parts = parts_of(stack.drop_dims("parameter", errors="ignore"), folder, "gates", sequence=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot write {folder}: {error.strerror}") from error
     paths = [folder / f"{stem}_{part.name}.exr" for part in parts]
     with together():
         for path, part in zip(paths, parts, strict=True):
@@ -303,7 +303,7 @@ def read(path: Path) -> xr.Dataset:
     number = _NUMBERED.fullmatch(path.name)
     if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
         first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
-        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}.")
+        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}")
     exact = exact_metadata(path, parts[0].attributes)
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
@@ -313,7 +313,7 @@ def read(path: Path) -> xr.Dataset:
     except UserError:
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is damaged: its metadata and its images disagree.") from error
+        raise UserError(f"{path} is damaged: its metadata and its images disagree") from error
 
 
 def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]:
@@ -335,15 +335,15 @@ def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]
 def _of_images(
     path: Path, parts: list[Part], exact: Mapping[str, Any], kind: _Images
 ) -> dict[str, npt.NDArray[np.float32]]:
-    """Return the values of variables in one part each image, (..., row, column) with the dimension of the parts."""
+    """Return the values of variables with one part per image, (..., row, column) with the dimension of the parts."""
     along = kind.dim in exact["dims"]
     count = len(exact["coordinates"][next(iter(kind.header))]["values"]) if along else 1
     if exact["is_sequence"] and count > 1:
         parts = parts + _later_files(path, count)
     if len(parts) != count:
-        raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} {kind.dim}s can be read.")
+        raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} {kind.dim}s can be read")
     if len({part.attributes[_IDENTITY] for part in parts}) != 1:
-        raise UserError(f"{path} is damaged: its {count} {kind.dim}s belong to different stacks.")
+        raise UserError(f"{path} is damaged: its {count} {kind.dim}s belong to different stacks")
     axis = exact["dims"].index(kind.dim) if along else 0
     found = {}
     for name, channel in kind.channels.items():
@@ -370,12 +370,12 @@ def _later_files(first: Path, count: int) -> list[Part]:
     """Return the images of a sequence after the first file; raise `UserError` if a file is missing or damaged."""
     number = _NUMBERED.fullmatch(first.name)
     if number is None or int(number[2]) != 0:
-        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr.")
+        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr")
     parts: list[Part] = []
     for index in range(1, count):
         path = first.with_name(f"{number[1]}_gate{index:0{len(number[2])}d}{first.suffix}")
         if not path.is_file():
-            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing.")
+            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing")
         parts += read_parts(path)
     return parts
 
@@ -384,24 +384,24 @@ def _first_of_folder(folder: Path) -> Path:
     try:
         numbers = {path: _NUMBERED.fullmatch(path.name) for path in sorted(folder.iterdir())}
     except OSError as error:
-        raise UserError(f"cannot read {folder}: {error.strerror}.") from error
+        raise UserError(f"cannot read {folder}: {error.strerror}") from error
     firsts = [path for path, number in numbers.items() if number and int(number[2]) == 0]
     if len(firsts) == 1:
         return firsts[0]
     if firsts:
         names = ", ".join(path.name for path in firsts[:3])
-        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names}).")
-    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr.")
+        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names})")
+    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr")
 
 
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
-    """Read all images of a file.
+    """Read all images in a file.
 
     Raises
     ------
     UserError
         If the file is damaged, truncated, or larger than half of the memory, or a part has another checksum than its
-        own. Files of other programs have none.
+        own. Files by other programs have none.
     """
     check_exr(path, _damaged(path), largest_result())
     with damaged_file(_damaged(path)), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
@@ -417,17 +417,17 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
     if not parts:
         raise UserError(_damaged(path))
     for part in parts:
-        # OpenEXR returns an attribute of an unknown type as an object of its own.
+        # OpenEXR returns an attribute with an unknown type as an object of its own.
         if not isinstance(part.attributes.get(_EXACT, ""), str):
             raise UserError(_damaged(path))
         checksum = _checksum(part)
         if part.attributes.get(_CHECKSUM, checksum) != checksum:
-            raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written.")
+            raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written")
     return parts
 
 
 def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the exact metadata of a part.
+    """Return a part's exact metadata.
 
     Raises
     ------
@@ -450,7 +450,7 @@ def _header(readable: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _checksum(part: Part) -> str:
-    """Return the SHA-256 of the exact metadata and of the channels of a part."""
+    """Return the SHA-256 over a part's exact metadata and channels."""
     digest = hashlib.sha256(part.attributes.get(_EXACT, "").encode())
     for name, pixels in sorted(part.channels.items()):
         digest.update(f"{name} {pixels.dtype} {pixels.shape}".encode())

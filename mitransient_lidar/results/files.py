@@ -1,4 +1,4 @@
-"""Files of all datasets of this package: one `open`, one `save`, and one way to take a dataset or its path.
+"""Files for all datasets in this package: one `open`, one `save`, and one way to take a dataset or its path.
 
 EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
 """
@@ -21,7 +21,7 @@ from mitransient_lidar.results.attributes import check_attributes, check_coordin
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
-#: What a kind of dataset is called, and the variables that one has.
+#: Names of the dataset kinds, and variables that identify each.
 _KINDS = {
     "result": ("waveforms of a render", LIGHT),
     "waveforms": ("waveforms over time", ("waveform",)),
@@ -62,7 +62,7 @@ def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
         dataset, foreign = netcdf.read(path)
     found = kinds_of(dataset)
     if foreign and not found:
-        raise UserError(f"{path} is a NetCDF file, but not of mitransient-lidar.")
+        raise UserError(f"{path} is a NetCDF file, but not of mitransient-lidar")
     for kind, name in (("waveforms", "waveform"), ("signals", "signal")):
         if kind in found and "campaign" not in found:
             check_axes(path, dataset, name)
@@ -83,8 +83,8 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         Any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images by
         daylight for an EXR file.
     path : path
-        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; of gates and frames ``.tif`` and ``.png`` are
-        images of 16 bits, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
+        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and frames ``.tif`` and ``.png`` are
+        16-bit images, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
         sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
 
     Raises
@@ -102,7 +102,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         image_files.write(dataset, path)
         return
     if suffix not in (".exr", ".nc"):
-        raise UserError(f"cannot write {path}: the file name must end in .exr, .nc, .tif or .png.")
+        raise UserError(f"cannot write {path}: the file name must end in .exr, .nc, .tif or .png")
     with replacing(path) as temporary:
         if suffix == ".nc":
             try:
@@ -119,9 +119,9 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
     """Return a dataset as parts of an EXR file; raise `UserError` if it is none that such a file stores."""
     found = kinds_of(dataset)
     if "shot" in dataset.dims:
-        raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
+        raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file")
     if "result" in found:
-        # The attributes have the curve of the errors of sums in its place.
+        # The attributes have the curve of sum errors in its place.
         return exr.parts_of(dataset.drop_dims(sum_errors.DIMS, errors="ignore"), path, "waveforms")
     if "gates" in found:
         return exr.parts_of(check_stack(dataset).drop_dims("parameter", errors="ignore"), path, "gates")
@@ -131,7 +131,7 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
         images = dataset.drop_vars(["etendue", "background_power"], errors="ignore")
         return exr.parts_of(images, path, "radiance")
     stored = _listed(("result", "gates", "frames", "radiance"))
-    raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file.")
+    raise UserError(f"cannot write {path}: an EXR file holds {stored}; use a .nc file")
 
 
 def is_exr(path: str | os.PathLike[str]) -> bool:
@@ -139,7 +139,7 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
     with open_file(path) as file:
         signature = file.read(len(netcdf.SIGNATURE))
     if not signature.startswith(EXR_SIGNATURE) and signature != netcdf.SIGNATURE:
-        raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file.")
+        raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file")
     return signature.startswith(EXR_SIGNATURE)
 
 
@@ -150,16 +150,16 @@ def kinds_of(dataset: xr.Dataset) -> set[str]:
 
 
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
-    """Return a dataset that is given itself, or by the path of its file.
+    """Return a dataset that is given itself, or by its file's path.
 
     Parameters
     ----------
     name
-        Name of the parameter, for messages.
+        Parameter name, for messages.
     given
         The dataset, or a path for `open`.
     kinds
-        Kinds of `kinds_of`, of which it must be one.
+        Kinds from `kinds_of`, of which it must be one.
 
     Raises
     ------
@@ -181,6 +181,6 @@ def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
 
 
 def _listed(kinds: Iterable[str]) -> str:
-    """Return the names of kinds of datasets, the last one after "or"."""
+    """Return the names of dataset kinds, the last one after "or"."""
     *first, last = (_KINDS[kind][0] for kind in kinds)
     return f"{', '.join(first)} or {last}" if first else last

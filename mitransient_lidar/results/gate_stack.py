@@ -1,11 +1,11 @@
 """Gate stacks: the energy of each pixel in each gate, as a labelled dataset.
 
 A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stderr`` [J], the energy that a pixel
-collects while a gate is open, summed over the pulses of the gate. Dimensions are (row, column, gate) for imagers and
-(pixel, gate) otherwise. Coordinates are those of the pixels, ``gate`` (0, 1, ...), ``gate_start`` and ``gate_width``
-[ns] between half heights, and ``gate_depth`` [m], the depth of the gate's middle on the receiver's axis, NaN where the
-time of the surface echo is unknown. In the other pixels the middle has other depths; see `LinesOfSight`. The attributes
-are those of the result and of the gate train.
+collects while a gate is open, summed over the gate's pulses. Dimensions are (row, column, gate) for imagers and (pixel,
+gate) otherwise. Coordinates are the pixels' own, ``gate`` (0, 1, ...), ``gate_start`` and ``gate_width`` [ns] between
+half heights, and ``gate_depth`` [m], the depth of the gate's middle on the receiver's axis, NaN where the surface echo
+time is unknown. In the other pixels the middle has other depths; see `LinesOfSight`. The attributes come from the
+result and the gate train.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mitransient_lidar.results.attributes import check_attributes, check_coordin
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number, required_number
 from mitransient_lidar.results.variables import label
 
-#: Dimensions of results with time bins alone.
+#: Dimensions that only results with time bins have.
 _OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
@@ -39,16 +39,16 @@ _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the reco
 def train_from_options(
     attributes: Mapping[str, Any],
     *,
-    start_ns: Annotated[float | None, Option("Start of the first gate, at half height [ns], any number")] = None,
+    start_ns: Annotated[float | None, Option("Start time of the first gate at half height [ns]")] = None,
     start_depth_m: Annotated[
         float | None,
-        Option("Depth below the mean sea level on the axis [m], any number, instead of a time", flag="--start-depth"),
+        Option("Depth below the mean sea level at which the first gate opens on the axis [m]", flag="--start-depth"),
     ] = None,
     start_range_m: Annotated[
         float | None,
         Option("Distance from the lidar along the axis [m], instead of a time", 0, flag="--start-range"),
     ] = None,
-    width_ns: Annotated[float | None, positive_option("Width of a gate between half heights", "ns")] = None,
+    width_ns: Annotated[float | None, positive_option("Gate width between half heights", "ns")] = None,
     step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
     count: Annotated[int, Option("Number of gates", 1, 100_000)] = 1,
     rise_ns: Annotated[
@@ -69,8 +69,8 @@ def train_from_options(
     attributes : mapping
         Attributes of a result, with the lidar geometry if the start is a depth.
     start_ns, start_depth_m, start_range_m : float, optional
-        Half height of the first gate's rising edge, as a time [ns], or that of echoes from a depth below the mean sea
-        level or a range from the lidar on the receiver's axis [m]; exactly one of them.
+        Half height of the first gate's rising edge, as a time [ns], or the time of echoes from a depth below the mean
+        sea level or a range from the lidar on the receiver's axis [m]; exactly one of them.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def build_gates(
         array = np.asarray(values, np.float64)
         whole = (*first, *shape, train.count)
         if array.shape not in (whole, (*first, math.prod(shape), train.count)):
-            raise UserError(f"{name} has shape {array.shape}; it must be {whole}.")
+            raise UserError(f"{name} has shape {array.shape}; it must be {whole}")
         variables[name] = ((*frames, *dims, "gate"), array.reshape(whole))
     axis = {
         "gate": np.arange(train.count),
@@ -172,14 +172,14 @@ def build_gates(
 
 
 def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.ArrayLike) -> xr.Dataset:
-    """Return a gate stack of `build_gates` with the derivatives of its energies by parameters.
+    """Return a gate stack from `build_gates` with the derivatives of its energies by parameters.
 
     Parameters
     ----------
     stack : xarray.Dataset
         The gate stack.
     slopes, stderr : array-like of shape (parameter, pixel, gate)
-        Derivative of the energy in each gate, in J per unit of the parameter, and its standard error.
+        Derivative of each gate's energy, in J per unit of the parameter, and its standard error.
     """
     energy = stack["gate_energy"]
     arrays = {
@@ -235,7 +235,7 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
     """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
-    Of several frames they are the mean, `average_frames`.
+    Several frames give their mean, `average_frames`.
 
     Raises
     ------
@@ -243,19 +243,19 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
         If it has no gates, or dimensions other than (row, column, gate) or (pixel, gate); `place` names it.
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
-        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}")
     dataset = average_frames(dataset)
     energy = dataset["gate_energy"]
     pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
     if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):
         raise UserError(
             f"the dataset is no gate stack: gate_energy has the shape {dict(energy.sizes)}, but must have the "
-            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and must not be empty."
+            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and must not be empty"
         )
     needed = {"gate_start": {"gate"}, "gate_width": {"gate"}, "angle_x": {*pixels}, "angle_y": {*pixels}}
     for name, dims in needed.items():
         if name not in dataset.coords or set(dataset[name].dims) != dims:
-            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
+            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)})")
     check_attributes(place, dataset.attrs)
     check_coordinates(place, dataset, "gate_energy")
     stack = dataset.drop_dims(_OF_BINS, errors="ignore")
@@ -265,15 +265,15 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
 
 
 def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
-    """Return gates to draw and to analyse as a gate stack, with a name and unit of ``gate_energy`` in its attributes.
+    """Return gates to draw and to analyse as a gate stack, with a name and unit for ``gate_energy`` in its attributes.
 
-    Frames of a camera become their mean above the dark level [DN], with the standard error of this mean; a stack with
-    a sea for each frame becomes the mean over the frames.
+    Camera frames become their mean above the dark level [DN], with this mean's standard error; a stack with a sea for
+    each frame becomes the mean over the frames.
 
     Raises
     ------
     UserError
-        As of `check_stack`.
+        As for `check_stack`.
     """
     if not has_frames(dataset):
         stack = check_stack(dataset, place)
@@ -295,7 +295,7 @@ def has_frames(dataset: xr.Dataset) -> bool:
 
 
 def _without_frames(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the coordinates and attributes of a dataset over frames, of which those over the gates are means."""
+    """Return the coordinates and attributes of a dataset over frames, with means for those over the gates."""
     coords = {name: one for name, one in dataset.coords.items() if name != "frame"}
     means = {name: one.mean("frame") if "frame" in one.dims else one for name, one in coords.items()}
     return xr.Dataset(coords=means, attrs=dataset.attrs)

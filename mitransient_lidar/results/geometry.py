@@ -27,7 +27,7 @@ from mitransient_lidar.results.variables import described
 Attributes = Mapping[str, Any]
 
 
-#: Decimals kept of the coordinates of `LinesOfSight`.
+#: Decimals kept in the coordinates of `LinesOfSight`.
 _SIGHT = {
     **{"sight_x": 6, "sight_y": 6, "off_nadir": 7, "surface_time": 6, "surface_spread": 6},
     **{"depth_per_ns": 10, "beam_share": 9},
@@ -36,7 +36,7 @@ _SIGHT = {
 
 @dataclass(frozen=True)
 class LinesOfSight:
-    """Lines of sight of pixels over a level sea: arrays of one shape, such as (pixels,).
+    """Pixel lines of sight over a level sea: arrays with one shape, such as (pixels,).
 
     Attributes
     ----------
@@ -45,10 +45,10 @@ class LinesOfSight:
     off_nadir
         Angle from the vertical in air [rad].
     surface_time, surface_spread
-        Arrival of the echo of the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's
-        direct light.
+        Echo arrival from the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's direct
+        light.
     depth_per_ns
-        Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one place.
+        Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one location.
     beam_share
         Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
     """
@@ -63,9 +63,9 @@ class LinesOfSight:
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset, dims: tuple[str, ...] | None = None) -> LinesOfSight:
-        """Read the lines of sight of a result or gate stack.
+        """Read the lines of sight in a result or gate stack.
 
-        Without their coordinates, they are those of the pixels' centres, with the mean arrival of the attribute
+        Without their coordinates, they go to the pixel centres, with the mean arrival in the attribute
         ``surface_time_ns`` if it is known.
 
         Parameters
@@ -73,7 +73,7 @@ class LinesOfSight:
         dataset
             A dataset over ``pixel``, or ``row`` and ``column``.
         dims
-            Dimensions of the arrays, flattened to one; by default those of the pixels.
+            Dimensions of the arrays, flattened to one; by default the pixels' own.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class LinesOfSight:
         return cls(x, y, off_nadir, time, np.zeros(count), axis.metres_per_ns * water, unknown)
 
     def coordinates(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, Any]:
-        """Return the coordinates of a dataset over dimensions of a shape, rounded so that files stay small."""
+        """Return the coordinates for a dataset over dimensions with a shape, rounded so that files stay small."""
         values = vars(self) | {"off_nadir": np.degrees(self.off_nadir)}
         values |= {name: 1e3 * values[name] for name in ("sight_x", "sight_y")}
         return {
@@ -124,7 +124,7 @@ class LinesOfSight:
         return LinesOfSight(**{name: values[index] for name, values in vars(self).items()})
 
     def combined(self) -> LinesOfSight:
-        """Return the line of sight of the sum of the pixels, weighted with the beam, shape (1,)."""
+        """Return the line of sight for the pixel sum, weighted with the beam, shape (1,)."""
         known = np.isfinite(self.beam_share).all() and self.beam_share.sum() > 0
         weight = (
             self.beam_share / self.beam_share.sum() if known else np.full(self.off_nadir.shape, 1 / self.off_nadir.size)
@@ -135,7 +135,7 @@ class LinesOfSight:
         return LinesOfSight(**mean | {"beam_share": np.array([self.beam_share.sum()])})
 
     def reshaped(self, shape: tuple[int, ...]) -> LinesOfSight:
-        """Return the lines of sight in arrays of another shape."""
+        """Return the lines of sight in arrays with another shape."""
         return LinesOfSight(**{name: values.reshape(shape) for name, values in vars(self).items()})
 
     def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
@@ -164,7 +164,7 @@ class LinesOfSight:
 
 
 def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
-    """Read the geometry of a lidar from the attributes of a result.
+    """Read a lidar's geometry from a result's attributes.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
         ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally, ``surface_time_ns``,
         the mean arrival over the pixels.
     surface
-        Time of the surface echo: ``measured`` is ``surface_time_ns``, ``level`` that of the mean sea level on the axis,
+        Surface echo time: ``measured`` is ``surface_time_ns``, ``level`` the time of the mean sea level on the axis,
         ``any`` the first of these that is known.
 
     Raises
@@ -192,7 +192,7 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
 
 
 def lidar_system(attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
-    """Return the system of the lidar equation, with the energy of the whole beam and the open area of the aperture.
+    """Return the lidar equation's system, with the whole beam's energy and the open aperture area.
 
     The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default it is
     the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
@@ -213,13 +213,13 @@ def spot_diameter(attributes: Attributes) -> float:
 
 
 def pose_of(attributes: Attributes, name: str = "receiver_pose") -> Pose | None:
-    """Return the pose of the receiver, or ``transmitter_pose``, of a result that has it among its attributes."""
+    """Return the receiver's pose, or ``transmitter_pose``, for a result that has it among its attributes."""
     given = attributes.get(name, ())
     return Pose(*np.reshape(np.asarray(given, dtype=np.float64), (4, 3))) if len(given) == 12 else None
 
 
 def _columns(values: FloatArray, dimensions: int) -> FloatArray:
-    """Return values of pixels for arrays of a number of dimensions, the pixels first."""
+    """Return pixel values for arrays with a number of dimensions, the pixels first."""
     return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
@@ -232,8 +232,9 @@ def open_aperture(attributes: Attributes) -> float:
 def share_in_view(dataset: xr.Dataset) -> FloatArray:
     """Return the share of the beam's energy in all pixels of a result over ``pixel``, shape () or (shots,).
 
-    It is the sum of the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in the sum of
-    their waveforms. Without the coordinate, it is that of a Gaussian beam in the middle of a full field of view.
+    It is the sum over the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in the sum
+    of their waveforms. Without the coordinate, it is the share of a Gaussian beam in the middle of a full field of
+    view.
     """
     if "beam_share" in dataset.coords and "pixel" in dataset["beam_share"].dims:
         share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
@@ -251,7 +252,7 @@ def _gaussian_share(attributes: Attributes) -> float:
 
 
 def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:
-    """Return a given efficiency of optics and atmosphere, or that of the lidar; see `lidar_system`."""
+    """Return a given efficiency of optics and atmosphere, or the lidar's; see `lidar_system`."""
     if given is not None:
         return in_range("efficiency", given, 0, 1)
     if "two_way_efficiency" not in attributes:
@@ -260,7 +261,7 @@ def two_way_efficiency(attributes: Attributes, given: float | None = None) -> fl
 
 
 def pulse_of(attributes: Attributes) -> Pulse:
-    """Return the transmitted pulse of a result: its samples, or a Gaussian of its width."""
+    """Return a result's transmitted pulse: its samples, or a Gaussian with its width."""
     if {"pulse_times_ns", "pulse_power"} <= set(attributes):
         return Pulse.sampled(attributes["pulse_times_ns"], attributes["pulse_power"])
     return Pulse.gaussian(required_number(attributes, "pulse_fwhm_ns"))

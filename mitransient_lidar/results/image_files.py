@@ -1,11 +1,10 @@
-"""Images of 16 bits for other programs: the gates of a stack, and the frames of a camera, as TIFF and PNG.
+"""16-bit images for other programs: the gates in a stack, and camera frames, as TIFF and PNG.
 
-A frame keeps its digital numbers. Energies are numbers from 0 to 65535, the largest finite one of the stack; the
-description states the energy of one number [J]. Pixels without a grid form an image one row high. A TIFF file has one
-page for each frame and gate, all gates of the first frame first; PNG files are numbered, ``<name>_gate000.png``, of
-several frames ``<name>_frame0000_gate000.png``. Each has a description in JSON: ``frame`` and ``gate``, its
-``gate_start_ns`` and ``gate_width_ns``, ``gate_depth_m`` if it is known, and the ``unit`` of a number with its
-``scale``.
+A frame keeps its digital numbers. Energies are numbers from 0 to 65535, the largest finite one in the stack; the
+description states the energy per number [J]. Pixels without a grid form an image one row high. A TIFF file has one page
+for each frame and gate, all gates in the first frame first; PNG files are numbered, ``<name>_gate000.png``, for several
+frames ``<name>_frame0000_gate000.png``. Each has a description in JSON: ``frame`` and ``gate``, its ``gate_start_ns``
+and ``gate_width_ns``, ``gate_depth_m`` if it is known, and the ``unit`` of a number with its ``scale``.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
 SUFFIXES = (".tif", ".tiff", ".png")
 _MOST = 65535
-_DESCRIPTION = 270  # tag of TIFF
-_LARGEST_TIFF = 4e9  # bytes, with offsets of 32 bits
+_DESCRIPTION = 270  # TIFF tag
+_LARGEST_TIFF = 4e9  # bytes, with 32-bit offsets
 
 
 def write(dataset: xr.Dataset, path: Path) -> list[Path]:
@@ -65,7 +64,7 @@ def write(dataset: xr.Dataset, path: Path) -> list[Path]:
 
 
 def _numbers(dataset: xr.Dataset, path: Path) -> tuple[npt.NDArray[np.uint16], float]:
-    """Return numbers of 16 bits over (frame, gate, row, column), and the value of one [J or digital number]."""
+    """Return 16-bit numbers over (frame, gate, row, column), and the value of one [J or digital number]."""
     is_frames = has_frames(dataset)
     if not is_frames and "gate_energy" not in dataset:
         raise UserError(f"cannot write {path}: a {path.suffix} file holds gates or frames of a camera")

@@ -1,4 +1,4 @@
-"""NetCDF files of labelled datasets.
+"""NetCDF files for labelled datasets.
 
 A file has at most 40 attributes of its own, numbers and texts. The attribute ``mitransient_lidar`` is a text of JSON
 with all others, lists among them, which `read` restores.
@@ -24,14 +24,14 @@ from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.results.attributes import attribute, shown
 
-#: What a file of this package starts with, and what its SHA-256 follows at its end.
+#: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
 
-#: Attribute with the JSON of those that are not attributes of the file.
+#: Attribute with the JSON of those that are not file attributes.
 OTHERS = "mitransient_lidar"
 
 _SMALL = 4096  # bytes of a variable that is not worth compressing
-_ROUNDING = 1e-2  # of a step of a converter, by which a signal may differ from a code
+_ROUNDING = 1e-2  # of a converter step, by which a signal may differ from a code
 
 
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
@@ -106,7 +106,7 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
             found.update(block)
             size -= len(block)
     if known != _CHECKSUM + found.hexdigest().encode():
-        raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written.")
+        raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written")
     return True
 
 

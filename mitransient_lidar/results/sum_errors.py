@@ -1,4 +1,4 @@
-"""Standard errors of sums over bins of a render, whose passes give correlated errors to different bins."""
+"""Standard errors of sums over a render's bins, whose passes correlate the errors between different bins."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.results.variables import label
 
-#: Variable with the correlation of the errors of bins, and its dimensions.
+#: Variable with the correlation between bin errors, and its dimensions.
 VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")
 
 #: Most sums of a length, and smallest sum over the largest one, for the curve.
@@ -28,17 +28,17 @@ _CURVE = ("error_inflation_bins", "error_inflation")
 
 @dataclass(frozen=True)
 class BlockCorrelation:
-    """Correlation of the errors of bins, of which those in two blocks of bins have the same.
+    """Correlation between bin errors, the same for all bins in two blocks.
 
     Attributes
     ----------
     correlation
-        Mean correlation of a bin of one block with a bin of another, shape (blocks, blocks); on the diagonal, of
-        different bins of a block.
+        Mean correlation between a bin in one block and a bin in another, shape (blocks, blocks); on the diagonal,
+        between different bins in a block.
     block
         Block of each bin, ascending, shape (time,).
     inflation
-        Ratio of the errors that are given to those of bins, shape () or (time,).
+        Ratio of given errors to bin errors, shape () or (time,).
     """
 
     correlation: FloatArray
@@ -46,14 +46,14 @@ class BlockCorrelation:
     inflation: FloatArray = field(default_factory=lambda: np.ones(()))
 
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
-        """Return the covariances of k sums over the same bins, shape (..., k, k).
+        """Return the covariances between k sums over the same bins, shape (..., k, k).
 
         Parameters
         ----------
         scaled
             Errors of neighbouring bins times their weights, shape (..., k, bins).
         first
-            Number of the first of them in the record.
+            Number of their first bin in the record.
         """
         part = slice(first, first + scaled.shape[-1])
         own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
@@ -64,7 +64,7 @@ class BlockCorrelation:
         return np.asarray(between + (scaled * self._alone[own]) @ np.swapaxes(scaled, -1, -2))
 
     def variances(self, scaled: FloatArray, places: IntArray) -> FloatArray:
-        """Return the variances of sums, shape (n,), over the bins `places` of their own, shape (n, bins)."""
+        """Return the variances of sums, shape (n,), each over its own bins `places`, shape (n, bins)."""
         own = self.block[places]
         scaled = scaled / np.broadcast_to(self.inflation, self.block.shape)[places]
         local = own - own.min(axis=1, keepdims=True)
@@ -81,21 +81,21 @@ class BlockCorrelation:
 
     @property
     def _alone(self) -> FloatArray:
-        """Part of the variance of a bin of each block that is its own: a bin is fully correlated with itself."""
+        """Part of the variance that a bin in each block has on its own: a bin is fully correlated with itself."""
         return np.asarray(1 - np.diagonal(self.correlation))
 
 
 @dataclass(frozen=True)
 class SumErrors:
-    """Correlation of the errors of bins, from the passes of a render.
+    """Correlation between bin errors, from a render's passes.
 
     Attributes
     ----------
     shared
         The correlation; None where only the curve is known, as from an EXR file.
     curve
-        Numbers of bins, and the median ratios of the errors of their sums to those of independent bins, shape (2, n);
-        empty where nothing is known.
+        Numbers of bins, and the median ratios between their sums' errors and independent bins', shape (2, n); empty
+        where nothing is known.
     """
 
     shared: BlockCorrelation | None
@@ -103,12 +103,12 @@ class SumErrors:
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
-        """Return what a result states, None without a statement.
+        """Return a result's statement, None without one.
 
         Raises
         ------
         UserError
-            If the result states a correlation of another kind.
+            If the result states another kind of correlation.
         """
         curve = _curve(dataset.attrs)
         if VARIABLE not in dataset:
@@ -123,14 +123,14 @@ class SumErrors:
         return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:
-        """Return the standard error of a sum of weighted bins.
+        """Return the standard error of a sum over weighted bins.
 
         Parameters
         ----------
         deviation
             Standard errors of neighbouring bins, shape (..., bins).
         weights
-            Their weights, shape (bins,) or that of `deviation`.
+            Their weights, shape (bins,) or the shape of `deviation`.
         first
             Number of the first of them in the record.
         """
@@ -143,10 +143,10 @@ class SumErrors:
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
     def of_means(self, deviation: FloatArray, run: int, passes: int) -> FloatArray:
-        """Return the ratio of the errors of means over `run` bins about each bin to those of independent bins.
+        """Return the error ratio of means over `run` bins about each bin to independent bins.
 
-        The ratio is for the mean over pixels of the squares of the errors, shape (pixels, time); it is of the shape
-        (time,). A few passes may show correlations far below the true ones: the ratio is then at least the median one.
+        The ratio is for the mean over pixels of the squared errors, shape (pixels, time); it has the shape (time,). A
+        few passes may show correlations far below the true ones: the ratio is then at least the median one.
         """
         count = deviation.shape[-1]
         least = max(self._of_curve(run), 1.0) if passes < _FEW_PASSES else _LEAST_RATIO
@@ -164,10 +164,10 @@ class SumErrors:
         return np.maximum(ratio, least)
 
     def median_curve(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
-        """Return numbers of bins, 1, 2, 4, ..., and the median ratios of the errors of their sums to independent bins.
+        """Return numbers of bins, 1, 2, 4, ..., and the median error ratios of their sums to independent bins.
 
-        Mean and standard error are those of bins, shape (pixels, time). Sums below a millionth of the brightest one,
-        and more than `_SUMS` of each number, are left out.
+        Mean and standard error are bin values, shape (pixels, time). Sums below a millionth of the brightest one, and
+        more than `_SUMS` of each number, are left out.
         """
         typical, light = np.sqrt(np.mean(stderr**2, axis=0)), np.mean(mean, axis=0)
         bins, inflation = [1], [1.0]
@@ -196,9 +196,9 @@ class SumErrors:
 
 
 def with_correlation(dataset: xr.Dataset, middles_ns: FloatArray, correlation: FloatArray) -> xr.Dataset:
-    """Return a result of a render with the correlation of the errors of its bins, and the curve of its attributes.
+    """Return a render's result with the correlation between its bin errors, and the curve in its attributes.
 
-    The arguments are the middles of the blocks [ns], shape (blocks,), and the correlations of `SumErrors`.
+    The arguments are the block middles [ns], shape (blocks,), and the correlations in `SumErrors`.
     """
     middles = {name: (name, middles_ns) for name in DIMS}
     dataset = label(dataset.assign({VARIABLE: (DIMS, correlation.astype(np.float32))}).assign_coords(middles))
@@ -211,16 +211,16 @@ def with_correlation(dataset: xr.Dataset, middles_ns: FloatArray, correlation: F
 
 
 def _check(dataset: xr.Dataset) -> None:
-    """Raise `UserError` if a result has no correlation of every block of bins with every one, or none of its bins."""
+    """Raise `UserError` if a result lacks the correlation between some blocks of bins, or between its bins."""
     sizes = [dataset[VARIABLE].sizes.get(name, 0) for name in DIMS]
     if sizes[0] != sizes[1] or not sizes[0]:
         raise UserError(
-            f"the result has {VARIABLE} over {dict(dataset[VARIABLE].sizes)}: it must be square over {DIMS}."
+            f"the result has {VARIABLE} over {dict(dataset[VARIABLE].sizes)}: it must be square over {DIMS}"
         )
     for name, dims in ((VARIABLE, None), (DIMS[0], DIMS[:1]), ("time", ("time",))):
         values = dataset[name]
         if values.dtype.kind not in "fiu" or (dims and values.dims != dims) or not np.isfinite(values.values).all():
-            raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them.")
+            raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them")
 
 
 def _curve(attributes: Mapping[str, Any]) -> FloatArray:

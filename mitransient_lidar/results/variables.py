@@ -1,8 +1,7 @@
-"""Registry of the variables of all datasets: unit and long name (CF-1.11) of each, in one place.
+"""Registry of the variables in all datasets: unit and long name (CF-1.11) of each, in one place.
 
-The registry is the file ``variables.csv``. `label` describes the variables of a dataset by their names. Standard errors
-and limits follow from what they are of. A name of several meanings has an entry for each kind of dataset,
-``kind.name``.
+The registry is the file ``variables.csv``. `label` describes a dataset's variables by their names. Standard errors and
+limits follow from their variable. A name with several meanings has an entry for each dataset kind, ``kind.name``.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _DOWN = ("gate_depth", "depth")
 
 
 class PointClass(IntEnum):
-    """Class of a point, by the codes of LAS 1.4 and of its profile for bathymetry; 1 is an object above the water."""
+    """Point class, by the codes in LAS 1.4 and in its profile for bathymetry; 1 is an object above the water."""
 
     UNCLASSIFIED = 1
     GROUND = 2
@@ -39,23 +38,23 @@ class PointClass(IntEnum):
 
     @property
     def text(self) -> str:
-        """Name of the class in tables and legends."""
+        """Class name in tables and legends."""
         names = {"SURFACE": "water surface", "UNCLASSIFIED": "above the water", "GROUND": "land"}
         return names.get(self.name, self.name.lower().replace("_", " "))
 
 
 def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, Any]:
-    """Return the attributes ``units`` and ``long_name`` of a variable, empty if it is not in the registry.
+    """Return a variable's attributes ``units`` and ``long_name``, empty if it is not in the registry.
 
     Parameters
     ----------
     name
-        Name of the variable; with ``_stderr``, ``_low`` or ``_high`` after that of another one, its standard error or
-        a limit of its interval.
+        Variable name; with ``_stderr``, ``_low`` or ``_high`` after another one's name, its standard error or a limit
+        of its interval.
     kind
-        Kind of dataset, whose entry ``kind.name`` goes first.
+        Dataset kind, whose entry ``kind.name`` goes first.
     unit
-        Another unit than that of the registry, as of signals in counts.
+        Unit instead of the registry's, such as counts for signals.
     """
     for key in (f"{kind}.{name}", name):
         if key in VARIABLES:
@@ -86,7 +85,7 @@ def label(dataset: xr.Dataset, kind: str = "", **units: str) -> xr.Dataset:
 
 
 def flagged(meanings: type[IntEnum] | type[IntFlag]) -> dict[str, Any]:
-    """Return the attributes of a variable whose values, or bits of a set of flags, are members of an enum."""
+    """Return the attributes for a variable whose values, or bits in a set of flags, are members of an enum."""
     key = "flag_masks" if issubclass(meanings, IntFlag) else "flag_values"
     return {
         key: [int(one) for one in meanings],

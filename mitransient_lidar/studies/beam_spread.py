@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Smallest distance of a plane from the bottom [m], larger than rounding errors of the intersections.
+#: Smallest distance from a plane to the bottom [m], larger than intersection rounding errors.
 _ABOVE_BOTTOM = 1e-3
 
-#: Number of radii and delays of the distributions, smallest over largest, and largest share of the light beyond them.
+#: Number of radii and delays in the distributions, smallest over largest, and largest share of the light beyond them.
 _STEPS, _SMALLEST, _BEYOND = 160, 1e-3, 2e-3
 
 _MEASURED = (
@@ -60,13 +60,13 @@ def beam_spread(
     *,
     depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
     instrument: Instrument = None,
-    passes: Annotated[int, Option("Number of independent passes of each render", 2, 10_000)] = 8,
+    passes: Annotated[int, Option("Number of independent passes per render", 2, 10_000)] = 8,
     max_time: FewerPasses = None,
-    photons: Annotated[int, Option("Photons of a pass", 1024, 2**24)] = 2**16,
+    photons: Annotated[int, Option("Photons per pass", 1024, 2**24)] = 2**16,
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Trace light from the laser to horizontal planes under water, and measure its places and delays.
+    """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
 
     Parameters
     ----------
@@ -83,9 +83,8 @@ def beam_spread(
         Over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
         laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
         ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and
-        ``radius`` [m] or ``delay`` [ns], the shares of the light ``within_radius``, ``within_shift`` and
-        ``within_delay``. Each has its standard error over the passes, ``..._stderr``. Without light, all but the first
-        two are NaN.
+        ``radius`` [m] or ``delay`` [ns], the light shares ``within_radius``, ``within_shift`` and ``within_delay``.
+        Each has its standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN.
 
     Raises
     ------
@@ -101,8 +100,8 @@ def beam_spread(
     Shift and delay are relative to the unscattered continuation of the path on which the light entered the water: they
     exclude the spread by beam, waves and ripples. At oblique incidence some delays are negative.
 
-    Light is in the field of view where the line of sight from the receiver to it through a level sea is in a pixel.
-    Paths end at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
+    Light is in the field of view where its line of sight from the receiver through a level sea is in a pixel. Paths end
+    at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     wanted = np.unique(depths)
     session = open_scene(scene, params, instrument)
@@ -168,7 +167,7 @@ def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
 
 
 def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
-    """Return the variables of one plane in one pass."""
+    """Return one plane's variables in one pass."""
     weight, energy = light.weight, lidar.transmitter.energy
     shares = {"transmitted": weight.sum() / energy, "unscattered": weight[light.scatterings == 0].sum() / energy}
     if len(weight) == 0:
@@ -214,7 +213,7 @@ def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDAr
 
 
 def _describe(lidar: LidarScene) -> dict[str, Any]:
-    """Return the attributes of the lidar and the water."""
+    """Return the attributes of lidar and water."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
     water: Any = lidar.water
@@ -254,7 +253,7 @@ def _dataset(
 
 
 def describe_spread(spread: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `beam_spread`, with standard errors."""
+    """Return table lines for a result of `beam_spread`, with standard errors."""
     lines = ["".join(f"{heading:>{_COLUMN}}" for heading in ("depth (m)", *(column[0] for column in _COLUMNS)))]
     for row in (spread.isel(depth=depth) for depth in range(spread.sizes["depth"])):
         cells = [f"{float(row['depth']):.4g}"]

@@ -1,4 +1,4 @@
-"""Least errors of parameters that a receiver's records allow, for one design of the lidar or several."""
+"""Cramer-Rao bounds of parameters from a receiver's records, for one lidar design or several."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
 
-#: Most designs of a comparison.
+#: Most designs in a comparison.
 MOST_DESIGNS = 1000
 
 _JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
@@ -56,8 +56,8 @@ def bounds(
     over: Annotated[
         Mapping[str, Sequence[Any]] | None,
         Option(
-            "Values of a parameter of the scene to compare, separated by semicolons where they hold commas. "
-            "Repeatable: all combinations count",
+            "Values of a scene parameter to compare, separated by semicolons where they hold commas. Repeatable: all "
+            "combinations count",
             form="NAME=V1,V2,...",
         ),
     ] = None,
@@ -85,20 +85,20 @@ def bounds(
     nuisances: Annotated[
         Mapping[str, float] | None,
         Option(
-            "Also unknown: time_offset [ns] or scale of the light [1], or known to a standard deviation. Repeatable",
+            "Nuisance parameter: time_offset [ns] or scale [1], optionally with its standard deviation. Repeatable",
             form="NAME[=STD]",
             flag="--nuisance",
         ),
     ] = None,
     renders: Annotated[int, Option("Independent renders of each design; 3 or more give errors", 2, 1000)] = 4,
-    passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 16,
+    passes: Annotated[int, Option("Number of independent passes per render", 2, 100_000)] = 16,
     max_time: Annotated[
         float | None, positive_option("Begin no further design after this many seconds, and leave it out")
     ] = None,
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Compute the Cramer-Rao bounds of parameters of a scene from one shot's record, and compare designs.
+    """Compute the Cramer-Rao bounds of scene parameters from one shot's record, and compare designs.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ def bounds(
     free
         Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
     over
-        Values of parameters of the scene, by name; designs are all combinations of them, the last one changing first,
-        at most 1000. None for the scene as it is.
+        Values of scene parameters, by name; designs are all their combinations, the last one changing first, at most
+        1000. None for the unchanged scene.
     receiver, gain, optical_density
         As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`; several receivers in a list
-        are compared on the same renders, and ``receiver`` is then the last parameter of a design.
+        are compared on the same renders, and ``receiver`` is then the last design parameter.
     nuisances
         As for `analysis.information.fisher.fisher_information`.
     renders
@@ -119,9 +119,9 @@ def bounds(
         spread gives standard errors.
     max_time
         Time after which no design is begun [s], above 0; the first one always is. The attribute ``designs_left_out``
-        has the number of the others that are left out, with a warning.
+        has the number of omitted designs, with a warning.
     seed
-        Seed of the random numbers, at least 0; all designs have the same ones.
+        Random seed, at least 0; all designs use the same random numbers.
     progress
         Called with a `passes.Progress` after every render.
 
@@ -129,17 +129,17 @@ def bounds(
     -------
     xarray.Dataset
         Over ``design`` (its parameters as text) and ``parameter``: ``bound``, ``bound_stderr``, ``bound_known``,
-        ``variance_share`` and ``monte_carlo_share`` of `fisher_information`, and ``ratio``, the bound over that of the
-        first design, with ``ratio_stderr`` by the spread of the renders. Over ``design``, ``parameter`` and
-        ``other_parameter``: ``correlation``. Over ``design``: ``lost_samples``, the share of samples of all pixels that
-        saturate, and ``remarks``, sentences on parameters that are not determined, one a line. Coordinates are those of
-        `fisher_information`, ``parameter_value`` over design and parameter, and ``design_NAME`` for each parameter of
+        ``variance_share`` and ``monte_carlo_share`` from `fisher_information`, and ``ratio``, the bound over the first
+        design's, with ``ratio_stderr`` by the spread of the renders. Over ``design``, ``parameter`` and
+        ``other_parameter``: ``correlation``. Over ``design``: ``lost_samples``, the share of samples in all pixels that
+        saturate, and ``remarks``, sentences on undetermined parameters, one per line. Coordinates come from
+        `fisher_information`, ``parameter_value`` over design and parameter, and ``design_NAME`` for each parameter in
         `over`, as text.
 
     Raises
     ------
     UserError
-        If the scene, a parameter or an option is invalid, or the records of a design hold no information.
+        If the scene, a parameter or an option is invalid, or a design's records contain no information.
     KeyboardInterrupt
         If a render was interrupted.
     """
@@ -155,7 +155,7 @@ def bounds(
     for design in cases:
         results = []
         for i in range(renders):
-            # Seeds of a render are signed.
+            # Render seeds are signed.
             options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
             options["instrument"] = instrument
             results.append(cases.keep(render(scene, params={**(params or {}), **design}, **options)))
@@ -182,7 +182,7 @@ def bounds(
 
 
 def _receivers(given: Any, gain: Any) -> dict[str, ReceiverChannels | None]:
-    """Return receivers by name, None with an empty name for that of the scene's instrument."""
+    """Return receivers by name, None with an empty name for the receiver of the scene's instrument."""
     listed = list(given) if isinstance(given, (list, tuple)) else [given]
     found = [None if one is None else chain_of("receiver", one) for one in listed]
     named = {"" if one is None else one.name: one for one in found}
@@ -195,7 +195,7 @@ def _receivers(given: Any, gain: Any) -> dict[str, ReceiverChannels | None]:
 
 
 def _designs(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """Return the parameters of each design."""
+    """Return each design's parameters."""
     for name, values in over.items():
         if isinstance(values, str) or len(values) == 0 or len({str(value) for value in values}) != len(values):
             raise UserError(f"over: {name} = {values!r} must be a list of different values")
@@ -230,7 +230,7 @@ def _compared(
 
 
 def _ratio_errors(one: xr.Dataset, first: xr.Dataset) -> list[float]:
-    """Return standard errors of ratios of bounds; renders of the same random numbers are left out together."""
+    """Return standard errors of bound ratios; renders with the same random numbers are left out together."""
     if "bound_left_out" not in one:
         return [math.nan] * one.sizes["parameter"]
     ratios = (one["bound_left_out"] / first["bound_left_out"].values).values
@@ -238,10 +238,10 @@ def _ratio_errors(one: xr.Dataset, first: xr.Dataset) -> list[float]:
 
 
 def write_table(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a result of `bounds` as a CSV file, one row a design and parameter.
+    """Write a result of `bounds` as a CSV file, one row per design and parameter.
 
-    Columns are the parameters of the designs, the free parameter with its value and unit, and bound, bound_stderr,
-    bound_known, ratio and ratio_stderr; a bound that does not exist is inf, an unknown error nan.
+    Columns are the design parameters, the free parameter with its value and unit, and bound, bound_stderr, bound_known,
+    ratio and ratio_stderr; a bound that does not exist is inf, an unknown error nan.
     """
     varied = [str(name) for name in found.coords if str(name).startswith("design_")]
     numbers = ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")
@@ -256,10 +256,10 @@ def write_table(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def describe_bounds(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `bounds`, and its remarks.
+    """Return table lines for a result of `bounds`, and its remarks.
 
-    One block a parameter, with the designs from the best to the worst: bound, its standard error, bound with the other
-    parameters known, and ratio to the first design.
+    One block per parameter, with the designs from the best to the worst: bound, its standard error, bound with the
+    other parameters known, and ratio to the first design.
     """
     lines = []
     width = max(12, *(len(str(name)) for name in found["design"].values))

@@ -17,14 +17,14 @@ _Case = TypeVar("_Case")
 
 
 class Cases(Generic[_Case]):
-    """Cases of a study, such as designs, depths or places, one after the other.
+    """Cases in a study, such as designs, depths or locations, one after the other.
 
     Parameters
     ----------
     cases
         The cases, and with their name in the plural in warnings, such as ``designs``.
     unit, steps
-        Unit of the progress, and number of units of each case.
+        Progress unit, and number of units per case.
     max_time
         Time after which no case begins [s], None for no limit. Those before the first kept result always do.
     progress
@@ -33,7 +33,7 @@ class Cases(Generic[_Case]):
     Attributes
     ----------
     begun, kept
-        Number of cases that have begun, and of results that are kept.
+        Number of cases that have begun, and of kept results.
     left
         Time that was left when the case began [s], None without a limit.
     """
@@ -76,7 +76,7 @@ class Cases(Generic[_Case]):
         """Return a result, of which the study needs all; raise KeyboardInterrupt if its render was interrupted."""
         if result.attrs.get("interrupted"):
             planned = len(self.cases) * self._steps
-            raise KeyboardInterrupt(f"interrupted after {self._done} of {planned} {self._unit}s, and none is kept.")
+            raise KeyboardInterrupt(f"interrupted after {self._done} of {planned} {self._unit}s, and none is kept")
         self.kept += 1
         return result
 

@@ -45,24 +45,24 @@ def rising(meaning: str, unit: str, **more: Any) -> Option:
     return Option(meaning, 0, None, unit, ascending=True, form="N,N,...", **more)
 
 
-#: Parameters of tables of an instrument.
+#: Parameters for an instrument's tables.
 InstrumentName = Annotated[str, Option("Name of the instrument", form="INSTRUMENT", is_argument=True)]
 Winds = Annotated[Numbers, rising("Wind speeds; 0 for a level sea with ripples", "m/s")]
 Waters = Annotated[Sequence[str], Option("Jerlov types from clear to turbid", form="NAME,NAME,...")]
-Depths = Annotated[Numbers, rising("Depths of the bottom", "m", above=True)]
-SeaScene = Annotated[str, Option("Scene whose sea, water and bottom count")]
+Depths = Annotated[Numbers, rising("Bottom depths", "m", above=True)]
+SeaScene = Annotated[str, Option("Scene that supplies sea, water and bottom")]
 OwnReceiver = Annotated[str | None, Option(f"{RECEIVERS}. By default the instrument's")]
-Places = Annotated[int, Option("Random places of a sea with waves, or renders of a level sea", 2, 10_000)]
-Records = Annotated[int, Option("Records with noise of each place", 1, 10_000)]
+Places = Annotated[int, Option("Random locations per wavy sea, or renders of a level sea", 2, 10_000)]
+Records = Annotated[int, Option("Records with noise at each location", 1, 10_000)]
 SeaTime = Annotated[
-    float | None, positive_option("Render no sea after this many seconds; those left out are NaN in the table")
+    float | None, positive_option("Render no sea after this many seconds; omitted seas are NaN in the table")
 ]
-SeaSeed = Annotated[int, Option("Seed of the random numbers", 0, 2**31)]
+SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 
-#: Wavelength of their tables [nm].
+#: Wavelength in their tables [nm].
 _WAVELENGTH = 532.0
 
-#: Relative standard error of renders of a level sea over that of waves, which differ more between places.
+#: Relative standard error of renders over a level sea, relative to waves, which differ more between locations.
 _LEVEL = 0.6
 
 #: Difference of the second angle [degree], and angle from which it is less.
@@ -77,13 +77,13 @@ _BRIGHT, _RIGHT = 10.0, 2.0
 #: Attributes of renders that do not depend on angle, wind, water and depth.
 _GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")
 
-#: Numbers of each bottom, estimator and pixel.
+#: Numbers for each bottom, estimator and pixel.
 _NUMBERS = (
     *("bias", "spread", "found", "noise_error", "error", "z", "wrong", "flagged", "bright", "bright_found", "hidden"),
     *("corrected_bias", "corrected_spread", "corrected_z", "snr"),
 )
 
-#: Numbers of bottoms that are not found.
+#: Numbers for bottoms that are not found.
 _ZERO = ("found", "flagged", "wrong")
 
 
@@ -93,7 +93,7 @@ def depth_bias(
     params: Mapping[str, Any] | None = None,
     *,
     angles_deg: Annotated[
-        Numbers | None, rising("Angles from nadir; the instrument's and 5 more by default", "degrees", flag="--angles")
+        Numbers | None, rising("Angles from nadir; by default the instrument's and 5 more", "degrees", flag="--angles")
     ] = None,
     winds: Winds = (0.0, 3.0, 6.0),
     ripples: Annotated[Numbers, rising("Winds whose ripples level seas have", "m/s", above=True)] = (3.0, 6.0),
@@ -105,17 +105,18 @@ def depth_bias(
     shots: Places = 12,
     records: Records = 5,
     target_error: Annotated[
-        float, Option("Relative standard error of a render over waves; of a level sea 0.6 of it", 0, 1, above=True)
+        float,
+        Option("Relative standard error of a render over waves; 0.6 of it over a level sea", 0, 1, above=True),
     ] = 0.05,
     corrections: Annotated[
         Given | None,
-        Option("Table of another seed to also correct the depths by; auto for the shipped one", form="FILE"),
+        Option("Correction table made with another seed, to test it; auto for the shipped one", form="FILE"),
     ] = None,
     max_time: SeaTime = None,
     seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Measure the errors of depths in an instrument's records, by angle, wind, water and depth.
+    """Measure the depth errors in an instrument's records, at each angle, wind, water and depth.
 
     Parameters
     ----------
@@ -123,22 +124,22 @@ def depth_bias(
         A scene with the parameters ``aim_x``, ``aim_y``, ``off_nadir_deg``, ``wind_speed``, ``spectrum``, ``jerlov``
         and ``bottom_depth``, and further parameters.
     angles_deg
-        Angles from nadir [degree], ascending; by default that of the instrument, and 5 degrees more,
-        or less near grazing.
+        Angles from nadir [degree], ascending; by default the instrument's, and 5 degrees more, or less near grazing.
     waters
-        Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
+        Jerlov types, from clear to turbid, at 532 nm, whatever the instrument has.
     depths
-        Depths of the bottom [m], above 0, ascending. Not rendered are bottoms that waves uncover, and those below one
+        Bottom depths [m], above 0, ascending. Bottoms that waves uncover are not rendered. Nor are bottoms below one
         that no channel finds though it found a shallower one: ``found``, ``flagged`` and ``wrong`` are 0, other numbers
         NaN.
     estimators
-        Estimators of `echo_table.extract`.
+        Estimators in `echo_table.extract`.
     target_error
-        Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
-        have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
+        Relative standard error of each location's render, above 0; 0.6 times this over a level sea. Bottoms in faint
+        pixels have larger errors than the median, and are not found where these could be mistaken for echoes: see
+        ``hidden``.
     max_time
-        Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
-        out are NaN, and the attribute ``seas_left_out`` has their number.
+        Time after which no sea is rendered [s], above 0; the first one always is. All numbers for omitted seas are NaN,
+        and the attribute ``seas_left_out`` has their number.
     progress
         Called with a `passes.Progress` after every sea.
 
@@ -146,14 +147,14 @@ def depth_bias(
     -------
     xarray.Dataset
         Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``, where ``wind_speed``
-        is 0 for each of the coordinate ``ripples`` [m/s], and equals it in seas with waves: ``bias``, ``spread``,
-        ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` of `summarize_depths`; with `corrections` also
+        is 0 for each entry of the coordinate ``ripples`` [m/s], and equals it in seas with waves: ``bias``, ``spread``,
+        ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` from `summarize_depths`; with `corrections` also
         ``corrected_bias``, ``corrected_spread`` and ``corrected_z``; and the shares of shots ``flagged`` with a depth,
         ``bright`` with a signal-to-noise ratio above 10 at the bottom, ``bright_found`` with a depth among these, and
-        ``hidden``, bright ones without a depth that have one where errors of the render do not count as noise. Without
+        ``hidden``, bright ones without a depth that have one where render errors do not count as noise. Without
         estimator: ``snr``; without estimator and pixel: ``slope_along`` and ``slope_across``, root mean squares of the
-        mean slopes in the beam, and the ``attenuation`` [1/m] that is measured, NaN in columns that are too short. The
-        truth is the depth of the bottom below the mean surface in the beam.
+        mean slopes in the beam, and the measured ``attenuation`` [1/m], NaN in columns that are too short. The truth is
+        the bottom depth below the mean surface in the beam.
 
     Raises
     ------
@@ -239,7 +240,7 @@ def depth_bias(
 
 
 def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
-    """Return the lines of a table of a result of `depth_bias`, in centimetres, of one estimator."""
+    """Return table lines for one estimator in a result of `depth_bias`, in centimetres."""
     corrected = "corrected_bias" in found
     head = f"{'angle':>6}{'wind':>6}{'ripples':>9} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
     head += f"{'>10':>7}{'hidden':>8}{'flagged':>9}{'bias':>8}{'spread':>8}"
@@ -340,7 +341,7 @@ def _labelled(
     attributes: Mapping[str, Any],
     begun: int,
 ) -> xr.Dataset:
-    """Return the table of all seas, of which the first `begun` were rendered or need not be."""
+    """Return the table for all seas, of which the first `begun` were rendered or need not be."""
     shape = tuple(values.size for values in axes.values())
 
     def table(name: str) -> Any:
@@ -356,7 +357,7 @@ def _labelled(
         if name in next(iter(cells.values())):
             dims = (*AXES, "pixel") if name == "snr" else (*AXES, "estimator", "pixel")
             data[name] = (dims, table(name))
-    # Root mean squares of slopes, in the names of the truth of shots.
+    # Root mean squares of slopes, under the names of the shots' truth.
     for name in ("slope_along", "slope_across", "attenuation"):
         data[name] = (AXES, table(name))
     coords: dict[str, Any] = dict(axes)

@@ -1,4 +1,4 @@
-"""Detection of a target and errors of its depth with one and with several pixels, from simulated shots."""
+"""Target detection and depth errors with one and with several pixels, from simulated shots."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _LOG = logging.getLogger(__name__)
 _FRAMES, _SHOWN_FRAMES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000), 8
 
 _MOST_ADJOINING = 6  # gates that are tried as one wide gate
-_BYTES_PER_GATE = 48  # memory of the light of a pixel in a gate of a render, with and without the target
+_BYTES_PER_GATE = 48  # memory for a pixel's light in a render's gate, with and without the target
 
 
 @checked
@@ -63,12 +63,12 @@ def detect(
     *,
     instrument: Instrument = None,
     receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS_OR_CAMERAS)] = "apd",
-    pfa: Annotated[float, Option("Probability of false alarm", 1e-12, 0.5)] = 1e-3,
+    pfa: Annotated[float, Option("False alarm probability", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
     ] = 0.9,
     depths: Annotated[
-        Numbers, Option("Further depths of the target", 0, unit="m", above=True, ascending=True, form="N,N,...")
+        Numbers, Option("Further target depths", 0, unit="m", above=True, ascending=True, form="N,N,...")
     ] = (),
     shots: Annotated[
         int, Option("Number of simulated shots with and without the target, none for a camera", 100, 100_000)
@@ -79,8 +79,8 @@ def detect(
     renders: Annotated[int, Option("Renders of one sea, whose spread gives the intervals", 3, 1000)] = 4,
     target_id: TargetId = "target",
     background_power_w: BackgroundPower = 0.0,
-    frames: Annotated[int, Option("Frames of each gate of a camera that are averaged", 1, 1_000_000)] = 1,
-    passes: Annotated[int, Option("Number of independent passes of each render", 16, 100_000)] = 16,
+    frames: Annotated[int, Option("Averaged camera frames per gate", 1, 1_000_000)] = 1,
+    passes: Annotated[int, Option("Number of independent passes per render", 16, 100_000)] = 16,
     max_time: Annotated[
         float | None,
         positive_option(
@@ -92,9 +92,9 @@ def detect(
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Simulate the detection of a target with one pixel, and with sums and the best weighting of pixels.
+    """Simulate target detection with one pixel, and with sums and the best weighting of pixels.
 
-    With a camera as the receiver: simulate it in the images of the scene's gates, of any number of pixels, also by the
+    With a camera as the receiver: simulate it in images of the scene's gates, with any number of pixels, also by the
     target's shadow.
 
     Parameters
@@ -104,41 +104,41 @@ def detect(
     receiver
         Detector and electronics of every pixel, or a camera, or the name of one in `physics.receiver.receiver_files`.
     depths
-        Further depths of the target to render [m], increasing: values of the parameter ``target_depth`` of the scene.
+        Further target depths to render [m], increasing: values of the scene parameter ``target_depth``.
     shots
         Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it. A camera
         needs none.
     frames
-        Frames of each gate of a camera that are averaged, with the same sea in all.
+        Averaged camera frames per gate, with the same sea in all.
     clutter
-        Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or
-        4 to 1000.
+        Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or 4
+        to 1000.
     max_time
-        Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
-        attribute ``depths_left_out`` has those that are left out as text, and a warning names them.
+        Time after which no further depth is begun [s], above 0; all renders of the unchanged target are made. The
+        attribute ``depths_left_out`` lists the omitted depths as text, and a warning names them.
     progress
         Called with a `passes.Progress` after every render.
 
     Returns
     -------
     xarray.Dataset
-        Over ``combination`` (`COMBINATIONS`), with ``_low`` and ``_high`` of 95 % confidence intervals:
-        ``detection``, the probability of detecting the target as it is at `pfa`, and ``pixel_detection`` over
-        ``pixel``, that of each pixel alone, in closed form; ``needed_target`` and ``needed_energy``, the fractions of
-        the target's signal and of the pulse energy with the required detection (infinite if there is none),
-        ``gain_target`` and ``gain_energy``, those of ``single`` over them; for random shots with the fraction
-        ``drawn_share`` (attribute) of the target's signal, the ``area`` under the ROC curve, and ``drawn_detection``
-        and ``drawn_false_alarm`` over ``false_alarm``; ``depth_bias`` and ``depth_spread`` [m] of random shots with
-        the full signal, and ``depth_gain``. With `depths`: ``needed_at_depth`` over ``depth``, and
-        ``detectable_depth`` [m] where it is 1. Without intervals: ``expected_detection`` and ``expected_area`` in
-        closed form, ``deflection`` of the full signal, ``depth_bound`` [m] (Cramer-Rao, without clutter), and over
-        ``pixel`` and ``time`` [ns] the means of ``background`` and ``difference`` [W] over the renders. Attributes
-        ``gain_pixels`` and ``gain_single``: factors of the transimpedance that keep the echo in range.
+        Over ``combination`` (`COMBINATIONS`), with ``_low`` and ``_high`` as 95 % confidence limits: ``detection``, the
+        probability of detecting the unchanged target at `pfa`, and in closed form over ``pixel`` ``pixel_detection``,
+        the same for each pixel alone; ``needed_target`` and ``needed_energy``, the fractions of the target's signal and
+        of the pulse energy with the required detection (infinite if there is none), ``gain_target`` and
+        ``gain_energy``, the fractions for ``single`` over them; for random shots with the fraction ``drawn_share``
+        (attribute) of the target's signal, the ``area`` under the ROC curve, and ``drawn_detection`` and
+        ``drawn_false_alarm`` over ``false_alarm``; ``depth_bias`` and ``depth_spread`` [m] in random shots with the
+        full signal, and ``depth_gain``. With `depths`: ``needed_at_depth`` over ``depth``, and ``detectable_depth`` [m]
+        where it is 1. Without intervals: ``expected_detection`` and ``expected_area`` in closed form, ``deflection`` by
+        the full signal, ``depth_bound`` [m] (Cramer-Rao, without clutter), and over ``pixel`` and ``time`` [ns] the
+        means of ``background`` and ``difference`` [W] over the renders. Attributes ``gain_pixels`` and ``gain_single``:
+        transimpedance factors that keep the echo in range.
 
 
-        With a camera: over (row, column, gate) or (pixel, gate) the maps of `images.ImageTrial.maps`; ``detection``
+        With a camera: over (row, column, gate) or (pixel, gate) the maps in `images.ImageTrial.maps`; ``detection``
         over ``frames`` (averaged numbers) and ``frames_needed``, and with `depths` ``detection_at_depth`` and
-        ``frames_needed_at_depth``, all with limits; ``gate_detection`` and ``gate_deflection`` of a single gate as
+        ``frames_needed_at_depth``, all with limits; ``gate_detection`` and ``gate_deflection`` for a single gate as
         wide as some that adjoin, over ``adjoining`` (their number) and ``gate`` (`images.single_gates`). Digital
         numbers x are filtered as sum(``filter_weight`` (x - ``background``)), which is 1 on average with the target,
         and with `frames` exceeds the attribute ``threshold`` by chance with the probability `pfa`.
@@ -155,17 +155,18 @@ def detect(
     -----
     ``single`` is one detector that receives the light of all pixels through the same aperture; ``sum`` adds the signals
     of the pixels' detectors, each with its own electronic noise; ``brightest`` is the detector of the pixel with the
-    strongest echo; ``best`` weights every sample of every pixel. All know shape and time of the echo, use the samples
-    within 1.5 pulse widths of it, and weight them for the best detection (`statistics.Cases.statistic`). A search among
-    n pixels has up to n times the false alarms. All detectors are equal; the transimpedance is lowered where the echo
-    would saturate it, for ``single`` independently. With clutter, the weights for each sea are estimated from the other
-    seas, and the statistic is taken as normally distributed. Intervals are Student's from a jackknife over at most 10
-    groups of renders or seas, and exact binomial ones for rates of random shots, given the rendered light and seas.
+    strongest echo; ``best`` weights every sample in every pixel. All use the known echo shape and time, take the
+    samples within 1.5 pulse widths of it, and weight them for the best detection (`statistics.Cases.statistic`). A
+    search among n pixels has up to n times the false alarms. All detectors are equal; the transimpedance is lowered
+    where the echo would saturate it, for ``single`` independently. With clutter, the weights for each sea are estimated
+    from the other seas, and the statistic is assumed to be normally distributed. Intervals are Student's from a
+    jackknife over at most 10 groups of renders or seas, and exact binomial ones for random shot rates, given the
+    rendered light and seas.
 
-    Images: all pixels and gates are weighted by difference over variance, behind the covariance of pixels that share
-    the noise of an intensifier, and of the images of seas. The level without the target, or its mean over the seas, is
-    known. Each render is filtered with the weights of the others, so that the errors of renders lower the probability
-    and never raise it. The sum has the mean, variance and skewness of rare events (`statistics.Statistic`).
+    Images: all pixels and gates are weighted by difference over variance, after the covariance of pixels that share an
+    intensifier's noise, and of the images of seas. The level without the target, or its mean over the seas, is known.
+    Each render is filtered with the weights from the others, so that render errors lower the probability and never
+    raise it. The sum has the mean, variance and skewness of rare events (`statistics.Statistic`).
     """
     device = receiver_of("receiver", receiver)
     camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
@@ -206,9 +207,9 @@ def detect(
             if clutter:
                 number = int(float(session.parameters["surface_seed"])) + 1 + i
                 sea = open_scene(scene, {**moved, "surface_seed": number}, instrument)
-                # The records of all seas have the bins of the first one.
+                # The records of all seas have the first one's bins.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
-            own = pass_seed(seed, i) >> 1  # seeds of a render are signed
+            own = pass_seed(seed, i) >> 1  # render seeds are signed
             options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator, "seed": own}
             one = target_signal(sea, axis=axis, **options) if camera is None else target_gates(sea, **options)
             found.append(cases.keep(one))
@@ -246,7 +247,7 @@ def detect(
 def _in_waveforms(
     experiments: Sequence[Experiment], depths: Sequence[float], lidar: LidarScene, attributes: dict[str, Any]
 ) -> trials.Variables:
-    """Return the variables of a result of waveforms, and add its attributes."""
+    """Return the variables of a waveform result, and add its attributes."""
     own, pfa, pd, shots, seed = experiments[0], *(attributes[name] for name in ("pfa", "pd", "shots", "seed"))
     try:
         data = trials.needs(own, pfa, pd)
@@ -270,7 +271,7 @@ def _in_waveforms(
 def _image_trial(
     renders: Sequence[xr.Dataset], seas: bool, camera: Camera, lidar: LidarScene, sky: float
 ) -> ImageTrial:
-    """Return the light of the renders in the gates of a camera."""
+    """Return the renders' light in a camera's gates."""
     assert lidar.gates is not None
     shape, size = lidar.gates.train.shape, renders[0]["gate_light"].size
     require_memory(
@@ -292,7 +293,7 @@ def _in_images(
     lidar: LidarScene,
     attributes: dict[str, Any],
 ) -> xr.Dataset:
-    """Return the result of gates of a camera."""
+    """Return the result for a camera's gates."""
     pfa, pd, numbers = attributes["pfa"], attributes["pd"], sorted({*_FRAMES, frames})
     experiments = [one.tuned(frames, pfa) for one in experiments]
     trial, dims = experiments[0], stack["gate_energy"].dims
@@ -354,7 +355,7 @@ def _experiment(
 
 
 def describe_detected(found: xr.Dataset) -> str:
-    """Return a sentence on whether the target of the scene is detected, from a result of `detect`."""
+    """Return a sentence on whether the scene's target is detected, from a result of `detect`."""
     attributes = found.attrs
     best = found.sel(combination="best")
     others = {"one pixel for all light": "single", "the sum of the pixels": "sum"}
@@ -382,14 +383,14 @@ def _noise(attributes: Mapping[str, Any]) -> str:
 
 
 def _rate(probability: float) -> str:
-    """Return a probability of detection with three digits."""
+    """Return a detection probability with three digits."""
     return ">0.999" if probability > 0.999 else f"{probability:.3g}"
 
 
 def describe_detection(found: xr.Dataset) -> list[str]:
     """Return the lines on a result of `detect`: whether the target is detected, and tables.
 
-    The tables are those of required levels, random shots, and depths if any.
+    The tables show required levels, random shots, and depths if any.
     """
     if "gate" in found.dims:
         return _describe_images(found)

@@ -1,4 +1,4 @@
-"""Places on a sea with given slopes of the surface over the footprint of the beam."""
+"""Sea locations with given surface slopes over the beam's footprint."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _PASSES = 12
 
 @dataclass(frozen=True)
 class RenderedShots:
-    """Shots of a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level.
+    """Shots in a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level.
 
     Attributes
     ----------
     azimuth, beam_spread
-        Azimuth of the beam [rad], and standard deviations of its footprint along and across it [m].
+        Beam azimuth [rad], and standard deviations of its footprint along and across it [m].
     pixel_lines, pixel_map, pixel_count
-        Grid lines of a map about a shot [m], shape (n,), the index of the pixel at each node, shape (n, n), rows along
-        y, and the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
+        Grid lines of a map about a shot [m], shape (n,), the pixel index at each node, shape (n, n), rows along y, and
+        the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
     """
 
     scene: str
@@ -61,16 +61,16 @@ def find_shots(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
-    at: Annotated[Sequence[tuple[float, float]], Option("A place, instead of a search", unit="m", form="X,Y")] = (),
+    at: Annotated[Sequence[tuple[float, float]], Option("A location, instead of a search", unit="m", form="X,Y")] = (),
     slope_sigmas: Annotated[float, positive_option("Slopes to find, in standard deviations")] = 2.0,
-    count: Annotated[int, Option("Places of each kind", 1, 100)] = 1,
+    count: Annotated[int, Option("Locations of each kind", 1, 100)] = 1,
     waveforms: Annotated[bool, Option("Also render the shots")] = True,
     max_time: Annotated[
         float | None, positive_option("Stop before this many seconds, with fewer passes or waveforms")
     ] = None,
     progress: ProgressCallback | None = None,
 ) -> RenderedShots:
-    """Find places of each kind of slope on the sea of a scene, within 256 m of its origin, and render them.
+    """Find locations for each kind of slope on a scene's sea, within 256 m of its origin, and render them.
 
     Where the lidar's aim is more than 250 m from the origin, they are about the aim.
 
@@ -82,7 +82,7 @@ def find_shots(
     Returns
     -------
     RenderedShots
-        Shots by kind, those with the nearest slopes first.
+        Shots by kind, the nearest slopes first.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def find_shots(
 
 
 def describe_found_shots(rendered: RenderedShots) -> list[str]:
-    """Return the lines of a table of places and slopes."""
+    """Return table lines for locations and slopes."""
     lines = [f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}"]
     for shot in rendered.shots:
         along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))

@@ -42,14 +42,14 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_COARSE_PASSES = 4  # of renders that approach the solution
+_COARSE_PASSES = 4  # in renders that approach the solution
 _FEWEST_PASSES, _MOST_PASSES = 16, 256  # that are chosen
-#: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
-#: their own noise to matter little, and few because each is kept.
+#: Pass batches that give the errors by the model's Monte Carlo, besides those for each parameter: enough for their own
+#: noise to matter little, and few because each is kept.
 _BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
-_WIDEST_BIN, _FINE_BIN = 0.4, 0.2  # of the scene's record, in widths of the pulse, that an interpolation needs
+_WIDEST_BIN, _FINE_BIN = 0.4, 0.2  # widest bins of an interpolation, and finer ones, in pulse widths
 _BIN_WIDTH = "bin_width_ns"
-_LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
+_LARGEST_RATIO = 0.1  # variance by the model's Monte Carlo over the waveform variance
 
 
 @checked
@@ -57,10 +57,10 @@ def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
         str | os.PathLike[str] | Model | None,
-        Option("Name or XML file of the scene; by default that of the result"),
+        Option("Name or XML file of the scene, by default the result's scene"),
     ] = None,
     free: Annotated[
-        Sequence[str], Option("Free parameters of the scene, and bandwidth_mhz of a receiver", form="NAME,NAME,...")
+        Sequence[str], Option("Free scene parameters, and bandwidth_mhz for a receiver", form="NAME,NAME,...")
     ] = (),
     *,
     params: Mapping[str, Any] | None = None,
@@ -73,59 +73,59 @@ def fit(
     ] = None,
     free_scale: Annotated[
         bool | None,
-        Option("Fit the scale of the waveforms, as by default of CSV files", flag="--free-scale/--fixed-scale"),
+        Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale"),
     ] = None,
     free_time: Annotated[
-        bool | None, Option("Fit the time offset, as by default of CSV files", flag="--free-time/--fixed-time")
+        bool | None, Option("Fit a time offset, by default for CSV files alone", flag="--free-time/--fixed-time")
     ] = None,
     noise: Annotated[
-        float | None, positive_option("Standard deviation of every sample, in the unit of the waveforms")
+        float | None, positive_option("Standard deviation of every sample, in the waveforms' unit")
     ] = None,
     receiver: Annotated[
         str | os.PathLike[str] | ReceiverChain | None,
         Option(
-            "Receiver of a signal, by default the one that it names. Of a CSV file, the one whose response and noise "
-            "the model gets: a preset, an instrument or a .toml file"
+            "Receiver whose response and noise the model gets: a preset, an instrument or a .toml file. By default "
+            "the receiver that the signal names"
         ),
     ] = None,
     scale_errors: Annotated[bool, Option("Multiply the covariance by the reduced chi-squared")] = False,
     passes: Annotated[
-        int | None, Option("Passes of each render, by default by the errors of the waveforms", 2, MOST_PASSES)
+        int | None, Option("Passes per render, by default as many as the waveform errors need", 2, MOST_PASSES)
     ] = None,
     max_time: Annotated[
         float | None, positive_option("Try no step after this many seconds, so that the fit may not converge")
     ] = None,
     seed: Annotated[
-        int | None, Option("Seed of all renders, by default not that of the result", -(2**63), 2**63 - 1)
+        int | None, Option("Seed of all renders, by default 1, or for a result its own plus 1", -(2**63), 2**63 - 1)
     ] = None,
     most_renders: Annotated[int, Option("Renders after which the fit ends without convergence", 2, 10_000)] = 60,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Fit parameters of a scene to waveforms by weighted nonlinear least squares.
+    """Fit scene parameters to waveforms by weighted nonlinear least squares.
 
     Parameters
     ----------
     source
         A result, a recorded signal, or a CSV file; see `analysis.information.measured.measured`.
     scene
-        Name or path of the scene, by default that of the result; or a function that returns a render with derivatives
-        for values of the free parameters (`analysis.information.fits.WaveformFit`).
+        Name or path of the scene, by default the result's; or a function that returns a render with derivatives for
+        values of the free parameters (`analysis.information.fits.WaveformFit`).
     free
-        Names of the free parameters, such as ``attenuation``, ``attenuation[1]`` of the second layer, or
-        ``bottom_reflectance``; and ``bandwidth_mhz``, the half-power frequency of a receiver with a single pole [MHz].
+        Names of the free parameters, such as ``attenuation``, ``attenuation[1]`` for the second layer, or
+        ``bottom_reflectance``; and ``bandwidth_mhz``, the half-power frequency of a single-pole receiver [MHz].
     params, instrument
         Other values of the scene's parameters, and instrument that replaces its lidar; see `rendering.render.render`.
     start
-        Starts of free parameters, by default their values in the scene; also of ``scale`` and ``time_offset_ns``.
+        Starts of free parameters, by default their values in the scene; also for ``scale`` and ``time_offset_ns``.
     bounds
-        Lowest and highest values of free parameters, by default their physical ranges; of an attenuation whose
-        scattering is fixed from that on, and of a scattering up to a fixed attenuation.
+        Lowest and highest values of free parameters, by default their physical ranges; an attenuation with a fixed
+        scattering begins there, and a scattering ends at a fixed attenuation.
     free_scale, free_time
-        Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
-        file, whose unit and time zero are unknown.
+        Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only for a CSV file,
+        whose unit and time zero are unknown.
     passes
-        Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
-        a tenth of that of the waveforms, 16 to 256.
+        Passes per render, 2 to 10^9; by default 16 to 256: as many as make the median variance by the model's Monte
+        Carlo a tenth of the waveforms' variance.
     seed
         Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
     max_time
@@ -143,8 +143,8 @@ def fit(
     Raises
     ------
     UserError
-        If the waveforms, the scene, a parameter or an option is invalid; or the seed is that of the result, whose noise
-        the model would repeat.
+        If the waveforms, the scene, a parameter or an option is invalid; or the seed is the result's, whose noise the
+        model would repeat.
     """
     limit, began = max_time or math.inf, time.perf_counter()
     names = _names(free)
@@ -195,7 +195,7 @@ def fit(
 
 
 def _passes(ratio: float) -> int:
-    """Return the passes of a render for the variance by Monte Carlo of coarse ones over that of the waveforms."""
+    """Return the passes of a render from the variance by Monte Carlo in coarse ones over the waveforms' variance."""
     needed = math.ceil(_COARSE_PASSES * ratio / _LARGEST_RATIO)
     if needed > _MOST_PASSES:
         logger.warning(
@@ -210,7 +210,7 @@ def _passes(ratio: float) -> int:
 
 @dataclass
 class _RenderedModel:
-    """Renders of a scene by values of its free parameters, all with the same random numbers.
+    """Scene renders for values of its free parameters, all with the same random numbers.
 
     Where light is interpolated `between_bins` that are too wide for it, the scene is rendered with narrower ones.
     """
@@ -279,14 +279,14 @@ class _RenderedModel:
             other = fixed + name.removeprefix(base)
             if not fixed or other in self.names:
                 continue
-            # Coefficients may also be those of a water by name, or of layers that the name does not tell apart.
+            # Coefficients may also come from a water by name, or from layers that the name does not distinguish.
             with contextlib.suppress(UserError):
                 value = value_of(self.texts, other)
                 found[name] = (value, LAYERED_WATER[base].high) if base == "attenuation" else (0.0, value)
         return found
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Return the parameters of the scene with other values, those of layers in their list."""
+        """Return the scene parameters with other values, layer values in their list."""
         texts = self.texts
         for name, value in values.items():
             texts = with_value(texts, name, value)
@@ -310,7 +310,7 @@ def _names(free: Sequence[str]) -> list[str]:
 
 
 def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) -> str | os.PathLike[str] | SceneSource:
-    """Return the scene, or that of a result."""
+    """Return the scene, or a result's scene."""
     if scene is not None:
         return scene
     if not attributes or FILE in attributes:
@@ -319,7 +319,7 @@ def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) 
 
 
 def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:
-    """Return the seed of the renders, another one than that of a result."""
+    """Return the seed of the renders, different from a result's seed."""
     own = attributes.get("seed")
     if seed is None:
         return 1 if own is None else int(own) + 1
@@ -329,7 +329,7 @@ def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:
 
 
 def describe_fit(fitted: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a fit: value, standard error and start of each parameter, and its quality."""
+    """Return table lines for a fit: each parameter's value, standard error and start, and the fit's quality."""
     lines = [f"{'parameter':<24}{'value':>13}{'error':>11}{'start':>13}  unit"]
     for name in fitted["parameter"].values:
         one = fitted.sel(parameter=name)
@@ -345,7 +345,7 @@ def describe_fit(fitted: xr.Dataset) -> list[str]:
 
 
 def parameter_frame(fitted: xr.Dataset) -> pd.DataFrame:
-    """Return the table of the parameters of a fit, as for a CSV file."""
+    """Return the table of a fit's parameters, as for a CSV file."""
     columns = ("parameter_units", "value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
     frame = fitted.reset_coords()[[*columns]].to_dataframe().reset_index()[["parameter", *columns]]
     return frame.rename(columns={"parameter_units": "unit"})

@@ -1,4 +1,4 @@
-"""Attenuation of the column signal as a function of the field of view (Gordon 1982)."""
+"""Column signal attenuation as a function of the field of view (Gordon 1982)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def fov_sweep(
     max_depth: Annotated[
         float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
     ] = 5.0,
-    passes: Annotated[int, Option("Number of independent passes of each render", 4, 10_000)] = 48,
+    passes: Annotated[int, Option("Number of independent passes per render", 4, 10_000)] = 48,
     max_time: Annotated[
         float | None,
         positive_option("Stop before this many seconds, without the widest fields of view, but with the narrowest one"),
@@ -59,13 +59,13 @@ def fov_sweep(
     seed: Seed = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Measure the attenuation of the column signal as a function of the field of view.
+    """Measure the column signal's attenuation as a function of the field of view.
 
     Parameters
     ----------
     scene, params, instrument
-        As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
-        ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
+        As for `rendering.render.render`. One circle about the axis replaces the pixels. The largest circle replaces an
+        XML scene's parameter ``field_of_view_mrad``, which determines the size of the surface.
     min_depth, max_depth
         Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
     max_time
@@ -79,36 +79,36 @@ def fov_sweep(
     xarray.Dataset
         Over ``field_of_view`` [mrad], increasing: ``effective_attenuation`` K and its standard error
         ``effective_attenuation_stderr`` [1/m], ``spot_radius`` R_s [m] of the circle that the receiver sees across the
-        axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] of the fit in
+        axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] by the fit in
         `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
         standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
-        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that `max_time` or Ctrl-C
-        has left out.
+        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that `max_time` or Ctrl-C has left
+        out.
 
     Raises
     ------
     UserError
-        If the scene is invalid, has no water, bubbles, or several layers between the depths, the echo of a solid can
-        overlap with them, a number is out of range, or as for `ColumnBins`.
+        If the scene is invalid, has no water, bubbles, or several layers between the depths, a solid's echo can overlap
+        with them, a number is out of range, or as for `ColumnBins`.
 
     Notes
     -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: for a narrow beam, K is c for c R_s far below 1, and
-    falls to the diffuse attenuation at c R_s above 5 to 6. The signal depends on the correlation of the profiles of
-    beam and field of view, so that both widths have the same effect. R = sqrt(R_s^2 + R_b^2) is the radius of a disc
-    with the mean-square radius of the correlation; R_b is twice the root-mean-square angle of the beam per axis times
-    the slant range. The diameter in the fit is 2 R. K approaches c only if c R_b is also far below 1.
+    falls to the diffuse attenuation at c R_s above 5 to 6. The signal depends on the correlation between the profiles
+    of beam and field of view, so that both widths have the same effect. R = sqrt(R_s^2 + R_b^2) is the radius of a disc
+    with the correlation's mean-square radius; R_b is twice the beam's root-mean-square angle per axis times the slant
+    range. The diameter in the fit is 2 R. K approaches c only if c R_b is also far below 1.
 
-    ``kd`` is the depth-averaged Kd of daylight (`water_types`), bb that of the phase function in use.
+    ``kd`` is the depth-averaged Kd for daylight (`water_types`), and bb belongs to the phase function in use.
 
-    For the default water and a narrow beam on a level sea, K falls as Gordon's until c R_s = 3, but to the absorption
-    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 12 % below
-    Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
+    For the default water and a narrow beam on a level sea, K falls like Gordon's until c R_s = 3. But it falls to the
+    absorption coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 12
+    % below Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
     which is independent of the phase function, is up to 0.06 1/m too high between the limits.
 
     Rings between neighbouring circles are rendered and added up, since rare paths near the middle would cause most of
-    the noise. Errors of neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
-    which include the correlation of the bins.
+    the noise. Errors in neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
+    which include the correlation between bins.
     """
     fields = np.unique(fov_mrad)
     session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
@@ -160,7 +160,7 @@ def fov_sweep(
 
 
 def describe_fov_sweep(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `fov_sweep`."""
+    """Return table lines for a result of `fov_sweep`."""
     columns = ("effective_attenuation", "effective_attenuation_stderr", "system_attenuation")
     lines = [f"{'field of view':>13}{'R_s':>9}{'c R_s':>8}{'K':>9}{'+-':>9}{'fit':>9}"]
     lines.append(f"{'(mrad)':>13}{'(m)':>9}{'':>8}{'(1/m)':>9}{'(1/m)':>9}{'(1/m)':>9}")
@@ -175,11 +175,11 @@ def describe_fov_sweep(found: xr.Dataset) -> list[str]:
 
 
 def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) -> Mapping[str, Any] | None:
-    """Return the parameters with the widest field of view, if it is a parameter of the scene."""
+    """Return the parameters with the widest field of view, if it is a scene parameter."""
     if not isinstance(scene, (str, os.PathLike)) or not isinstance(params or {}, Mapping):
         return params
     document, name = read_document(scene_path(scene)), "field_of_view_mrad"
-    # Pixels within a receiver have views of their own, in place of the receiver's.
+    # Pixels within a receiver have their own views, in place of the receiver's.
     own = [
         one
         for one in plugins_of(document)
@@ -189,7 +189,7 @@ def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) ->
 
 
 def _geometry(lidar: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
-    """Return the geometry, and the edge of the beam within a half angle [rad]; reject a view of the horizon."""
+    """Return the geometry, and the beam's edge within a half angle [rad]; reject a view of the horizon."""
     geometry = LidarGeometry.of_pose(lidar.receiver.pose, lidar.refractive_index, lidar.group_index)
     widest = 2e3 * math.tan(0.5 * math.pi - geometry.off_nadir)
     if 2e3 * half_view >= widest:
@@ -233,9 +233,9 @@ def _check_solids(lidar: LidarScene, geometry: LidarGeometry, edge: float, max_d
 def _render(
     session: LoadedScene, fields: FloatArray, of_field: Goal, seed: int, progress: ProgressCallback | None
 ) -> tuple[FloatArray, PassLog]:
-    """Return the energy [J] in circles of full angles [mrad], shape (fields, passes, bins), and the log.
+    """Return the energy [J] in circles with full angles [mrad], shape (fields, passes, bins), and the log.
 
-    `of_field` has the passes of a field of view, and the time of all.
+    `of_field` has the passes for a field of view, and the time for all.
     """
     from mitransient_lidar.transport.sensor.fov_shapes import Sector
     from mitransient_lidar.transport.sensor.pixels import ShapedPixels

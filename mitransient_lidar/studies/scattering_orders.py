@@ -28,7 +28,7 @@ def scattering_orders(
     *,
     instrument: Instrument = None,
     orders: Annotated[int, Option("Number of orders to separate", 1, MOST_ORDERS)] = 8,
-    passes: Annotated[int, Option("Number of independent passes of each render", 2, 100_000)] = 32,
+    passes: Annotated[int, Option("Number of independent passes per render", 2, 100_000)] = 32,
     max_time: FewerPasses = None,
     seed: Seed = 0,
     integrator: Any = None,
@@ -45,7 +45,7 @@ def scattering_orders(
     scene, params, instrument, integrator
         As for `rendering.render.render`.
     orders
-        Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
+        Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum over all higher ones.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -54,8 +54,8 @@ def scattering_orders(
     xarray.Dataset
         ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``, ``reversals``
         (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]; their sums over
-        ``reversals`` and ``order`` are those of `rendering.render.render`. ``energy`` [J] of all pixels and times and
-        its standard error, over ``reversals`` and ``order``. After Ctrl-C it includes the completed passes, and the
+        ``reversals`` and ``order`` equal `rendering.render.render`. ``energy`` [J] over all pixels and times and its
+        standard error, over ``reversals`` and ``order``. After Ctrl-C it includes the completed passes, and the
         attribute ``interrupted`` is 1.
 
     Raises
@@ -88,7 +88,7 @@ def scattering_orders(
         "impulse_response_stderr": (dims, energy.stderr.reshape(shape)),
         "waveform": (dims, power.mean.reshape(shape)),
         "waveform_stderr": (dims, power.stderr.reshape(shape)),
-        # Errors of sums are estimated from the passes, since bins of a pass share paths.
+        # Errors of sums are estimated from the passes, since bins in a pass share paths.
         "energy": (dims[1:3], totals.mean),
         "energy_stderr": (dims[1:3], totals.stderr),
     }
@@ -103,9 +103,9 @@ def scattering_orders(
 
 
 def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
-    """Return order, energy and its standard error [J], share of all light, and share of the order by several reversals.
+    """Return order, energy and its standard error [J], share of all light, and share with several reversals.
 
-    One row for each order of a result of `scattering_orders`, and a last one for all; shares are NaN without light. The
+    One row for each order in a result of `scattering_orders`, and a last one for all; shares are NaN without light. The
     error of a sum is the sum of the errors, its upper bound.
     """
     energy, stderr = result["energy"].values, result["energy_stderr"].values
@@ -121,7 +121,7 @@ def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
 
 
 def describe_orders(result: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `scattering_orders`: one for each order, and one for all."""
+    """Return table lines for a result of `scattering_orders`: one for each order, and one for all."""
     lines = [f"{'order':<8}{'energy (J)':>22}{'share (%)':>12}{'several reversals (%)':>24}"]
     for name, energy, error, share, several in shares(result):
         known = f"{energy:.3e} +- {error:.0e}"

@@ -1,4 +1,4 @@
-"""Statistics of echoes over shots at random places of a sea, against the slope of the surface."""
+"""Echo statistics over shots at random sea locations, against the surface slope."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.results.variables import label
 
-#: Half width of the gates about the echoes of a level sea [ns].
+#: Half width of the gates about the echoes from a level sea [ns].
 _HALF_GATE_NS = 10.0
 
 
 def shot_statistics(series: xr.Dataset) -> xr.Dataset:
-    """Measure the echoes of shots at places of one sea, for their dependence on its slopes.
+    """Measure the echoes of shots at locations on one sea, for their dependence on its slopes.
 
     Parameters
     ----------
     series
-        A result of `rendering.shots.series.render_shots` of a scene with the parameter ``bottom_depth``.
+        A result of `rendering.shots.series.render_shots` for a scene with the parameter ``bottom_depth``.
 
     Returns
     -------
     xarray.Dataset
         Over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
         positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
-        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] of the highest point of the waveform in a gate of
-        20 ns about the echo of a level sea; NaN where it lies at a limit of the gate.
+        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate
+        about the echo from a level sea; NaN where it lies at a gate limit.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
 
 
 def _echo_times(shot: xr.Dataset) -> dict[str, float]:
-    """Return the times of surface and bottom echo of a level sea [ns]."""
+    """Return the times of surface and bottom echo from a level sea [ns]."""
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
         raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
@@ -63,8 +63,8 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
     Returns
     -------
     height, time
-        Power [W] and time [ns], shape (waveforms,), of the pixels of one shot, or of several shots in a row; NaN where
-        the highest bin lies at a limit of the gate.
+        Power [W] and time [ns], shape (waveforms,), for the pixels of one shot, or of several shots in a row; NaN where
+        the highest bin lies at a gate limit.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
 
 
 def highest_of(time: FloatArray, power: FloatArray, inside: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """Return height and time of `highest_points` for power [W], shape (pixels, time), in bins of given indices."""
+    """Return height and time as `highest_points` for power [W], shape (pixels, time), in bins with given indices."""
     heights, times = np.full(len(power), np.nan), np.full(len(power), np.nan)
     for pixel, values in enumerate(power):
         top = inside[np.argmax(values[inside])]
@@ -93,7 +93,7 @@ def highest_of(time: FloatArray, power: FloatArray, inside: npt.NDArray[np.intp]
 
 
 def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refractive_index: float) -> FloatArray:
-    """Return the error of the depth [m] of a bottom by refraction at a slope, positive for too deep a bottom.
+    """Return the depth error [m] of a bottom by refraction at a slope, positive for too deep a bottom.
 
     Slopes are along the lidar's azimuth [1], and the ray in air has an angle from the vertical [rad].
 
@@ -107,15 +107,14 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
 
 
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return slopes [1] and their effects on the echoes of a receiver with 2x2 pixels, from `shot_statistics`.
+    """Return slopes [1] and their effects on the echoes in a receiver with 2x2 pixels, from `shot_statistics`.
 
     Returns
     -------
     dict
-        Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (delay of the
-        surface echo of the far pair after that of the near pair [ns]) and ``depth`` (error of the depth of the bottom
-        [m]) for the slope along the azimuth; ``sideways`` (delay of green, on the right, after red [ns]) for the rise
-        to the left.
+        Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (surface echo
+        delay of the far pair after the near pair [ns]) and ``depth`` (bottom depth error [m]) for the slope along the
+        azimuth; ``sideways`` (delay of green, on the right, after red [ns]) for the rise to the left.
 
     Raises
     ------
@@ -148,7 +147,7 @@ def describe_statistics(shots: xr.Dataset) -> list[str]:
 def slope_correlations(shots: xr.Dataset) -> dict[str, float]:
     """Return the correlation of each of the `slope_effects` with its slope; raises as `slope_effects`.
 
-    Shots without the effect, of value NaN, are left out; the correlation of fewer than two is NaN.
+    Shots without the effect, with the value NaN, are left out; the correlation of fewer than two is NaN.
     """
     found = {}
     for name, (slope, value) in slope_effects(shots).items():

@@ -1,4 +1,4 @@
-"""Signal of a target: difference of a scene with and without it, from the same random numbers."""
+"""Target signal: difference between a scene with and without it, from the same random numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mitransient_lidar.transport.solids import shape_groups
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 _HALF_GATE = 1.0
 
-#: Jackknife groups of passes.
+#: Jackknife pass groups.
 _GROUPS = 16
 
 
@@ -43,32 +43,32 @@ def target_signal(
     *,
     instrument: Instrument = None,
     target_id: TargetId = "target",
-    grid: Annotated[int, Option("Places of the target along each axis", 1, 15)] = 1,
-    max_offset: Annotated[float, positive_option("Largest offset of these places along each axis", "m")] = 2.0,
-    passes: Annotated[int, Option("Number of independent passes of each render", _GROUPS, 100_000)] = 64,
+    grid: Annotated[int, Option("Target positions along each axis", 1, 15)] = 1,
+    max_offset: Annotated[float, positive_option("Largest offset of these positions along each axis", "m")] = 2.0,
+    passes: Annotated[int, Option("Number of independent passes per render", _GROUPS, 100_000)] = 64,
     max_time: Annotated[
         float | None,
         positive_option(
-            "Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or more"
+            "Stop before this many seconds, shared among the positions, with fewer passes, at least 16 per position"
         ),
     ] = None,
-    seed: Annotated[int, Option("Seed of the random numbers", -(2**63), 2**63 - 1)] = 0,
+    seed: Annotated[int, Option("Random seed", -(2**63), 2**63 - 1)] = 0,
     integrator: Any = None,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render a scene with and without a target, and measure their difference; with a `grid`, at many places.
+    """Render a scene with and without a target, and measure their difference; with a `grid`, at many positions.
 
     Both renders use the same random numbers: paths that do not meet the target are equal, so that the difference has
-    much smaller errors than either record. It is the echo of the target, and behind it the shadow in the water and on
-    the bottom, which is negative.
+    much smaller errors than either record. The difference is the target echo, followed by the shadow in the water and
+    on the bottom, which is negative.
 
     Parameters
     ----------
     scene, params, instrument, integrator
         As for `rendering.render.render`.
     grid, max_offset
-        Places of the target along each axis, and their largest offset from that in the scene: the result is that of
+        Target positions along each axis, and their largest offset from the position in the scene: the result is
         `target_map` on a square.
     axis
         Time bins instead of automatic ones.
@@ -80,23 +80,23 @@ def target_signal(
     xarray.Dataset
         Over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and ``difference``
         [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo`` and
-        ``backscatter`` [J] of difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
-        difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` of all
-        pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and
-        ``combined_detectability``. All with standard errors (of the gates: jackknife over 16 groups of passes).
+        ``backscatter`` [J] in difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
+        difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` over all
+        pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``.
+        All with standard errors (for the gates: jackknife over 16 pass groups).
 
     Raises
     ------
     UserError
-        If the scene or a parameter is invalid, a number is out of range, there is no such shape, or it is above the
-        sea or below the bottom, or returns no light.
+        If the scene or a parameter is invalid, a number is out of range, there is no such shape, or it is above the sea
+        or below the bottom, or returns no light.
 
     Notes
     -----
-    Where backscatter limits detection, the variance of a pixel's noise is proportional to the energy B of the
-    backscatter. With echoes E and weights w, the signal-to-noise ratio is proportional to the ``detectability``
-    sum(w E) / sqrt(sum(w^2 B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of
-    detectabilities are ratios of signal-to-noise ratios for every detector.
+    Where backscatter limits detection, a pixel's noise variance is proportional to the backscatter energy B. With
+    echoes E and weights w, the signal-to-noise ratio is proportional to the ``detectability`` sum(w E) / sqrt(sum(w^2
+    B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of detectabilities are ratios
+    of signal-to-noise ratios for every detector.
     """
     if grid > 1:
         offsets = np.linspace(-max_offset, max_offset, grid).tolist()
@@ -136,12 +136,12 @@ def target_map(
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """Measure the signal of a target at offsets [m] from its place in an XML scene, with `options` of `target_signal`.
+    """Measure a target's signal at offsets [m] from its position in an XML scene, with `options` of `target_signal`.
 
-    The time [s] is shared equally among the places that are left; each has at least 16 passes. Returns the quantities
-    of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m], and the number of
-    ``place_passes`` over these alone. Raises `UserError` if the scene lacks the parameters ``target_x`` and
-    ``target_y``, and KeyboardInterrupt if a render was interrupted.
+    The time [s] is shared equally among the remaining positions; each has at least 16 passes. Returns the quantities of
+    `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m], and the number of ``place_passes``
+    over these alone. Raises `UserError` if the scene lacks the parameters ``target_x`` and ``target_y``, and
+    KeyboardInterrupt if a render was interrupted.
     """
     known = open_scene(scene, params, options.get("instrument")).parameters
     for name in ("target_x", "target_y"):
@@ -173,12 +173,12 @@ def target_gates(
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render the gates of a scene with and without a target, on the same random numbers, for any number of pixels.
+    """Render a scene's gates with and without a target, on the same random numbers, for any number of pixels.
 
     Returns
     -------
     xarray.Dataset
-        A gate stack of the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
+        A gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
         without), ``half`` (of the passes), and its dimensions.
 
     Raises
@@ -216,14 +216,14 @@ def target_gates(
 def _pair(
     session: LoadedScene, target_id: str, integrator: Any, axis: TimeAxis | None
 ) -> tuple[LidarIntegrator, PassRenderer, PassRenderer]:
-    """Return the integrator, and renderers of the scene with and without the target, of the same layout."""
+    """Return the integrator, and renderers with the same layout for the scene with and without the target."""
     bare, chosen = _without(session.scene, target_id), choose_integrator(session.scene, integrator)
     with_target = chosen.prepare(session.scene, session.sensor, connections=False, axis=axis)
     return chosen, with_target, chosen.prepare(bare, session.sensor, layout_of=with_target, connections=False)
 
 
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
-    """Return the shape of the target.
+    """Return the target's shape.
 
     Raises
     ------
@@ -262,7 +262,7 @@ def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
 
 
 def _quantities(own: FloatArray, backscatter: FloatArray, shadow: FloatArray) -> dict[str, FloatArray]:
-    """Return the quantities of pixels and of their combinations, from energies of echo, water and shadow [J]."""
+    """Return the quantities for pixels and their combinations, from energies of echo, water and shadow [J]."""
     echo = np.maximum(own, 0)
     quality = np.divide(echo, backscatter, out=np.zeros_like(echo), where=backscatter > 0)
     weight = quality / max(float(np.max(quality)), 1e-300)
@@ -324,9 +324,9 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
 
 
 def describe_target(result: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `target_signal`: gate, heading, pixels, and combinations of pixels.
+    """Return table lines for a result of `target_signal`: gate, heading, pixels, and pixel combinations.
 
-    The relative SNR is the detectability over that of the sum. Of a map: shares, contrasts and gain by place.
+    The relative SNR is the detectability over the sum's. For a map: shares, contrasts and gain by position.
     """
     if "target_x" in result.dims:
         return _describe_map(result)

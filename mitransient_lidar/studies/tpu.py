@@ -38,7 +38,7 @@ from mitransient_lidar.studies.depth_bias import (
 #: Wind whose ripples a level sea has [m/s].
 RIPPLES = 5.0
 
-#: Winds [m/s] and waters of the tables of uncertainty tools, and depths at which airborne lidars find the bottom.
+#: Winds [m/s] and waters in the tables for uncertainty tools, and depths at which airborne lidars find the bottom.
 WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
 
 
@@ -48,50 +48,50 @@ def tpu(
     params: Mapping[str, Any] | None = None,
     *,
     altitudes: Annotated[
-        Numbers | None, rising("Heights of the lidar above the sea; the instrument's by default", "m", above=True)
+        Numbers | None, rising("Lidar heights above the sea; by default the instrument's", "m", above=True)
     ] = None,
     angles_deg: Annotated[
-        Numbers | None, rising("Angles from nadir; the instrument's by default", "degrees", flag="--angles")
+        Numbers | None, rising("Angles from nadir; by default the instrument's", "degrees", flag="--angles")
     ] = None,
     winds: Winds = WINDS,
     waters: Waters = WATERS,
     depths: Depths = DEPTHS,
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
-    estimator: Annotated[str, Option("Estimator of depths, as of echoes")] = "gaussian",
+    estimator: Annotated[str, Option("Depth estimator, as for echoes")] = "gaussian",
     shots: Places = 12,
     records: Records = 4,
     corrections: Annotated[
         Given | None,
-        Option("Table of depth-bias to also correct the depths by, auto for the shipped one, or none", form="FILE"),
+        Option("Table from depth-bias that also corrects the depths, auto for the shipped one, or none", form="FILE"),
     ] = "auto",
-    pointing_mrad: Annotated[float, Option("Standard deviation of the beam's direction, each axis", 0)] = 0.1,
+    pointing_mrad: Annotated[float, Option("Standard deviation of the beam direction, each axis", 0)] = 0.1,
     position_m: Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)] = 0.05,
-    height_m: Annotated[float, Option("Standard deviation of the height of the sea surface", 0)] = 0.05,
+    height_m: Annotated[float, Option("Standard deviation of the sea surface height", 0)] = 0.05,
     max_time: SeaTime = None,
     seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Determine the uncertainties of an instrument's soundings by altitude, angle, wind, water and depth.
+    """Determine an instrument's sounding uncertainties at each altitude, angle, wind, water and depth.
 
     Parameters
     ----------
     params, scene
-        As of `depth_bias.depth_bias`.
+        As for `depth_bias.depth_bias`.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
     pointing_mrad, position_m, height_m
-        Errors of the survey's trajectory; see `analysis.depth_uncertainty.TrajectoryErrors`.
+        Trajectory errors of the survey; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
-        Time after which no sea is rendered [s], above 0. The uncertainties of seas that are left out are NaN; altitudes
-        of which none is rendered are left out. The attribute ``seas_left_out`` has the number of both.
+        Time after which no sea is rendered [s], above 0. Uncertainties for omitted seas are NaN; altitudes without any
+        rendered sea are left out. The attribute ``seas_left_out`` has the number of both.
     progress
-        Called with a `passes.Progress` after every cell of the table.
+        Called with a `passes.Progress` after every table cell.
 
     Returns
     -------
     xarray.Dataset
-        As of `sounding_uncertainty`, with the dimension ``altitude`` in front.
+        As from `sounding_uncertainty`, with the dimension ``altitude`` in front.
 
     Raises
     ------
@@ -139,10 +139,10 @@ def tpu(
 
 
 def describe_tpu(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `tpu`, one for each water and wind.
+    """Return table lines for a result of `tpu`, one for each water and wind.
 
-    TVU at 95 % of each depth [cm], corrected if there are corrections, with the order met, and a [cm] and b [%] of the
-    fit at one standard deviation, with the root mean square of its residuals [cm].
+    TVU at 95 % at each depth [cm], corrected if there are corrections, with the order met, and a [cm] and b [%] of the
+    fit at one standard deviation, with its root mean square residual [cm].
     """
     one = found.isel(correction=-1)
     names = [*(order.name for order in SURVEY_ORDERS), "none"]

@@ -22,10 +22,10 @@ PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
 
 REPORTED_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 
-#: Default of ``profile_tolerance`` of the medium ``layered_water``.
+#: Default ``profile_tolerance`` of the medium ``layered_water``.
 DEFAULT_TOLERANCE = 0.01
 
-#: Uncertainty of the properties of each kind.
+#: Uncertainty of each kind's properties.
 _CAUTION = {
     "jerlov": "bb is that of typical particles and uncertain by a third in the ocean, by half at the coast",
     "chlorophyll": "the scattering of individual waters differs by a factor of 2",
@@ -35,7 +35,7 @@ _CAUTION = {
     "pure": "natural waters contain particles, which scatter more",
 }
 
-#: Titles of figures, by kind.
+#: Figure titles, by kind.
 _TITLES = {
     "jerlov": "Jerlov's water type {}",
     "chlorophyll": "chlorophyll {} mg/m³",
@@ -62,9 +62,7 @@ def describe_water(
     ] = None,
     wavelength_nm: Annotated[
         float,
-        Option(
-            "Wavelength; of Jerlov's and Petzold's waters green, or 700 or more", 400, 1100, "nm", flag="--wavelength"
-        ),
+        Option("Wavelength; green for Jerlov and Petzold waters, or 700 or more", 400, 1100, "nm", flag="--wavelength"),
     ] = 532.0,
     temperature: Annotated[float, Option("Temperature, for the indices", 0, 30, "degrees Celsius")] = 20.0,
     salinity: Annotated[float, Option("Salinity, for the indices", 0, 40, "per mille")] = 35.0,
@@ -121,9 +119,9 @@ def describe_water(
 def phase_function_of(
     kind: str, value: str | None, found: water_types.InherentProperties
 ) -> tuple[PhaseFunction, str, str]:
-    """Return the phase function of a water that is rendered, or was measured, its label, and a title.
+    """Return a water's phase function as rendered, or as measured, its label, and a title.
 
-    `found` are the properties of the water by `water_of`.
+    `found` are the water's properties from `water_of`.
     """
     ratio = f"bb/b = {found.backscatter_ratio:.3g}"
     phase: PhaseFunction

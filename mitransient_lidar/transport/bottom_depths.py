@@ -1,4 +1,4 @@
-"""Depth of the bottom of a scene at places on its sea, which waves follow."""
+"""Bottom depths in a scene at locations on its sea, which waves follow."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from mitransient_lidar.physics.sea.shoaling import BottomDepths
 from mitransient_lidar.transport.opaque import aligned_ray
 from mitransient_lidar.transport.solids import box_of, scene_of_shapes
 
-#: Smallest side of a bottom, over that of the largest solid: waves do not follow targets and piers.
+#: Smallest bottom side over the largest solid's side: waves do not follow targets and piers.
 _BOTTOM_PER_LARGEST = 0.25
 
-#: Distance of places from the edge of the bottoms, and of the start of rays above them [m].
+#: Distance of locations from the bottoms' edges, and of ray starts above them [m].
 _MARGIN = 1e-3
 
 
@@ -51,10 +51,10 @@ class _Bottoms:
 
 
 def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
-    """Return the depths of the bottoms of a scene in its frame, None without one.
+    """Return a scene's bottom depths in its frame, None without a bottom.
 
-    Bottoms are the solids whose shorter horizontal side is at least a quarter of that of the largest one. Beyond them
-    the depth is that of their nearest edge.
+    Bottoms are the solids whose shorter horizontal side is at least a quarter of the largest solid's. Beyond them the
+    depth is the depth of their nearest edge.
     """
     shapes = [
         shape

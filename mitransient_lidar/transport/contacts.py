@@ -26,10 +26,10 @@ _PARALLEL, _LEAST_RAYS = 0.9999, 3
 #: Largest vertical component of a direction that counts as level.
 _LEVEL = 1e-3
 
-#: Rays along each side of a box, and boxes of which rays are traced at once.
+#: Rays along each box side, and boxes whose rays are traced at once.
 _TICKS, _PAIRS_AT_ONCE = 32, 256
 
-#: Largest size of a shape that lies on another one, over that of the other one.
+#: Largest size of a shape that lies on another one, relative to the other one.
 _SMALLER = 0.99
 
 #: Largest number of shapes that lie on each other.
@@ -38,9 +38,9 @@ _MOST_IN_A_STACK = 64
 
 @dataclass(frozen=True)
 class _Contact:
-    """A shape and a larger one that coincide: a point of their faces [m], and the normals of both there, shape (3,).
+    """A shape and a larger one that coincide: a point on their faces [m], and both normals there, shape (3,).
 
-    `has_body` says whether the shape has another face behind the one that coincides.
+    `has_body` states whether the shape has another face behind the one that coincides.
     """
 
     shape: mi.Shape
@@ -64,15 +64,16 @@ _Pair = tuple[mi.Shape, mi.Shape]
 
 
 def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
-    """Move solids 0.1 mm off others with which they coincide in a face; return those that have been moved.
+    """Move solids 0.1 mm off others with which they coincide in a face; return the moved ones.
 
-    Off a bottom a solid is moved upwards. Of two others whose faces look at each other the upper one is moved, or the
-    smaller one to the side; of two whose faces look the same way the smaller one, if it lies within the larger one.
+    Off a bottom a solid is moved upwards. If the faces of two other solids look at each other, the upper solid is moved
+    up, or the smaller one to the side. If they look the same way, the smaller solid is moved, if it lies within the
+    larger one.
 
     Raises
     ------
     UserError
-        If a solid coincides with the surface of the water, or if it is not defined which one of two solids is seen.
+        If a solid coincides with the water surface, or if it is not defined which one of two solids is seen.
     """
     # Waves coincide with nothing.
     waves = [sea for sea in scene.seas if np.isfinite(sea.sea.cell_size)]
@@ -85,8 +86,8 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
         if not any(separations):
             _refuse_visible(found, shapes, scene.groups)
             return list(moved.values())
-        # Once in a round, so that others on both sides of a shape do not push it to and fro; off what it looks at
-        # rather than off what it is flush with.
+        # Once per round, so that shapes on both sides do not push a shape to and fro; off the shape that it faces
+        # rather than off a shape that it is flush with.
         separations.sort(key=lambda one: one is not None and one.flush, reverse=True)
         for moving, direction, _ in {id(one.shape): one for one in separations if one is not None}.values():
             _move(moving, direction)
@@ -97,7 +98,7 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
 
 
 def _neighbours(shapes: Sequence[mi.Shape], surfaces: Sequence[mi.Shape]) -> list[_Pair]:
-    """Return pairs of shapes whose bounding boxes touch, those of two surfaces of the water aside."""
+    """Return pairs of shapes whose bounding boxes touch, except pairs of two water surfaces."""
     if len(shapes) < 2:
         return []
     low, high = _corners(shapes)
@@ -115,7 +116,7 @@ def _neighbours(shapes: Sequence[mi.Shape], surfaces: Sequence[mi.Shape]) -> lis
 
 
 def _contacts(pairs: Sequence[_Pair], groups: Sequence[mi.Shape]) -> list[_Contact]:
-    """Return where the shapes of pairs coincide, in the order of the pairs."""
+    """Return where paired shapes coincide, in pair order."""
     groups_of_pairs: dict[tuple[int, int], list[int]] = {}
     shapes = list({id(shape): shape for pair in pairs for shape in pair}.values())
     apart = _apart(shapes)
@@ -134,7 +135,7 @@ def _contacts(pairs: Sequence[_Pair], groups: Sequence[mi.Shape]) -> list[_Conta
 
 
 def _apart(shapes: Sequence[mi.Shape]) -> list[list[mi.Shape]]:
-    """Return shapes in few groups: a ray through the bounding box of one meets no other one of its group there."""
+    """Return shapes in few groups: a ray through a shape's bounding box meets no other shape in its group there."""
     if not shapes:
         return []
     low, high = _corners(shapes)
@@ -194,7 +195,7 @@ def _rays(larger: mi.Shape, other: mi.Shape) -> tuple[FloatArray, FloatArray, Fl
 def _have_bodies(
     shapes: Sequence[mi.Shape], points: FloatArray, normals: FloatArray, scene: mi.Scene
 ) -> NDArray[np.bool_]:
-    """Return which shapes of a scene have another face behind the points (n, 3) of theirs, within their boxes."""
+    """Return which shapes in a scene have another face behind their points (n, 3), within their boxes."""
     low, high = _corners(shapes)
     tolerance = _tolerance(np.abs(points).max(axis=1))
     starts = points - 2 * tolerance[:, None] * normals
@@ -215,7 +216,7 @@ def _separation(contact: _Contact, surfaces: Sequence[mi.Shape], bottoms: Sequen
         normal = contact.normal_of_larger if on_bottom else contact.normal
         return _Separation(pair[int(is_bottom)], np.copysign(1.0, normal[2]) * normal)
     if contact.normal @ contact.normal_of_larger < 0:
-        # Bodies leave each other, single faces pass each other; what goes up stays off all that lies below.
+        # Bodies leave each other, single faces pass each other; a shape that goes up stays off everything below.
         direction = contact.normal_of_larger if contact.has_body else contact.normal
         return _Separation(pair[int(direction[2] < -_LEVEL)], np.copysign(1.0, direction[2] + _LEVEL) * direction)
     return _Separation(contact.shape, contact.normal_of_larger, flush=True) if _lies_within(contact) else None
@@ -274,7 +275,7 @@ def _tolerance(coordinate: FloatArray | mi.Float) -> FloatArray | mi.Float:
 
 
 def _refusal(contact: _Contact, reason: str) -> UserError:
-    """Return the error of two shapes that coincide."""
+    """Return the error for two shapes that coincide."""
     return UserError(
         f"shapes {contact.shape.id()!r} and {contact.larger.id()!r} coincide in a face at z = {contact.point[2]:.4g} m "
         f"and {reason}: move one of them by 1 mm or more"

@@ -1,4 +1,4 @@
-"""Records that hold all light of a scene: their start and their number of time bins."""
+"""Records that contain all light in a scene: their start and their number of time bins."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of
 
-#: Share of the rays of beam or view that the sea must reflect totally for the record to end there.
+#: Share of beam or view rays that the sea must reflect totally for the record to end there.
 _REFLECTED = 0.1
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
 
-#: Smallest range of records of a lidar under water with laser and receiver at one place [m].
+#: Smallest record range for a lidar under water with laser and receiver at one location [m].
 NEAREST_RANGE = 0.05
 
 #: Bins before the surface echo in which its detection measures the noise, and the longest extension for them [ns].
@@ -41,9 +41,9 @@ _QUIET_BINS, _LONGEST_NS = 10, 100.0
 def fitted_axis(
     scene: WaterScene, transmitter: Transmitter, film: GatedFilm, shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),)
 ) -> tuple[TimeAxis, str]:
-    """Return time bins of a film for all light that returns, and what the last light comes from.
+    """Return a film's time bins for all light that returns, and the source of the last light.
 
-    `shifts` are horizontal displacements of a lidar above water [m]: the bins hold the light of all its positions.
+    `shifts` are horizontal displacements of a lidar above water [m]: the bins contain the light at all its positions.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def fitted_axis(
 def _light_above_water(
     scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None, shifts: Iterable[tuple[float, float]]
 ) -> tuple[float, float, str, float]:
-    """Return the times of the first and the last light [ns], what the last light comes from, and the lead of land.
+    """Return the times of the first and the last light [ns], the source of the last light, and the lead of land.
 
     Land and other solids above the sea return the first light earlier than it by this time [ns].
     """
@@ -90,7 +90,7 @@ def _light_above_water(
 
 
 def _is_dry(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> bool:
-    """Return whether all rays of the view, or of the beam, of a displaced lidar [m] meet solids above the sea."""
+    """Return whether all rays in the view, or in the beam, of a displaced lidar [m] meet solids above the sea."""
     lowest, highest = scene.sea_heights or (0.0, 0.0)
     if not scene.surfaces or all(float(solid.bbox().max.z) <= highest for solid in scene.solids):
         return False
@@ -126,11 +126,11 @@ def earliest_ns(scene: WaterScene, transmitter: Transmitter) -> float | None:
 def _light_under_water(
     scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None
 ) -> tuple[float, float, str, float]:
-    """Return the same of a lidar under water, and when the sea first reflects beam or view totally [ns].
+    """Return the same for a lidar under water, and when the sea first reflects beam or view totally [ns].
 
-    The first light is scattered at the lidar. The last one is the farthest echo of beam and view, with a quarter of its
-    time and 40 ns more for light that is scattered several times, or comes from the range where the signal of the
-    water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
+    The first light is scattered at the lidar. The last light is the farthest echo in beam and view, plus a quarter of
+    its time and 40 ns for multiply scattered light. If nearer, it comes from the range where the water's signal, exp(-2
+    K s) by the column's least diffuse attenuation K, has fallen to 1e-6.
     """
     view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
     beam = Rays.of_beam(scene, transmitter)
@@ -146,8 +146,8 @@ def _light_under_water(
 def total_reflection_ns(view: Rays, beam: Rays) -> float:
     """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
 
-    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
-    by few paths and in cells about an axis that light has left: it is not rendered.
+    Infinite where less than a tenth of beam and of view does so. Reflection alone shows the scene beyond, by few paths
+    and in cells about an axis that light has left: it is not rendered.
     """
     found, scene = [np.inf], view.scene
     lidar = [opaque_point(rays.pose.origin) for rays in (beam, view)]
@@ -161,7 +161,7 @@ def total_reflection_ns(view: Rays, beam: Rays) -> float:
 
 
 def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
-    """Return the end [ns] of what echo detection takes as the baseline of noise (`analysis.waveforms.records`)."""
+    """Return the end [ns] of the time that echo detection uses as the noise baseline (`analysis.waveforms.records`)."""
     pose, field = transmitter.pose, scene.receiver.pixels.field_of_view
     spot = pose.ground_point()
     arrival = sum(float(np.linalg.norm(spot - origin)) for origin in (pose.origin, scene.receiver.pose.origin))
@@ -174,7 +174,7 @@ def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
 
 
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
-    """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
+    """Return a lidar's geometry, displaced horizontally [m], over the level sea in a scene."""
     pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
     sides = pixels.sides or (pixels.field_of_view, pixels.field_of_view)
     blurred = 0.0 if blur is None else blur.reach
@@ -198,18 +198,18 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
 
 
 def _kd(column: WaterColumn) -> FloatArray:
-    """Return the diffuse attenuation coefficient of each layer [1/m]."""
+    """Return each layer's diffuse attenuation coefficient [1/m]."""
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     return np.array([InherentProperties(*map(float, row)).kd for row in rows])
 
 
 def _name(shape: mi.Shape) -> str:
-    """Return the id of a shape, else its type."""
+    """Return a shape's id, else its type."""
     return str(shape.id() or (shape.parameters["type"] if isinstance(shape, OwnPlugin) else shape.class_name()))
 
 
 def _triangles(shape: mi.Shape) -> FloatArray:
-    """Return the triangles of a mesh or rectangle, or of top and bottom of the bounding box of another shape [m]."""
+    """Return the triangles of a mesh or rectangle, or the top and bottom of another shape's bounding box [m]."""
     known = mi.traverse(shape)
     if "vertex_positions" in known:
         vertices = np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)

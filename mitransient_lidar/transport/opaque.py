@@ -26,19 +26,19 @@ def opaque_index(value: int) -> mi.UInt32:
 
 
 def opaque_vector(values: Sequence[float] | NDArray[np.float64]) -> mi.Vector3f:
-    """Return a vector, of values of shape (3,), that kernels read from memory."""
+    """Return a vector, from values with shape (3,), that kernels read from memory."""
     return mi.Vector3f(*(opaque(value) for value in values))
 
 
 def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
-    """Return a point, of values of shape (3,), that kernels read from memory."""
+    """Return a point, from values with shape (3,), that kernels read from memory."""
     return mi.Point3f(*(opaque(value) for value in values))
 
 
 def aligned_ray(origins: NDArray[np.float64], directions: NDArray[np.float64], ends: NDArray[np.float64]) -> mi.Ray3f:
     """Return rays from origins (n, 3) [m] in directions (n, 3) up to lengths (n,) [m].
 
-    Their coordinates are arrays of their own: parts of one array would make its size a part of kernels.
+    Their coordinates are separate arrays: parts of one array would make its size a part of kernels.
     """
     origin, direction = ([aligned(mi.Float, one) for one in values.T] for values in (origins, directions))
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
@@ -47,7 +47,7 @@ def aligned_ray(origins: NDArray[np.float64], directions: NDArray[np.float64], e
 
 
 def shape_number(shape: mi.Shape) -> int:
-    """Return the number of a shape, above 0, as kernels know it."""
+    """Return a shape's number, above 0, as kernels use it."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
@@ -61,7 +61,7 @@ def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
 
 
 def changed(given: ArrayT, **values: Any) -> ArrayT:
-    """Return a copy of an object with other values of some attributes."""
+    """Return a copy of an object with other values for some attributes."""
     found = copy.copy(given)
     vars(found).update(values)
     return found

@@ -1,11 +1,10 @@
-"""Derivatives of the contributions of paths by properties of water and solids.
+"""Derivatives of path contributions by properties of water and solids.
 
-A path of lengths L in the layers, with n scattering events by the angles theta and m reflections by a solid,
-contributes in proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over
-the path, and so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The derivative of the
-contribution is contribution times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001,
-doi:10.1364/OL.26.001335). The weights between techniques that find the same path add up to 1 in any water, and are not
-differentiated.
+A path with lengths L in the layers, n scattering events by the angles theta and m reflections by a solid contributes in
+proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over the path, and
+so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The contribution's derivative is contribution
+times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001, doi:10.1364/OL.26.001335). The weights
+between techniques that find the same path add up to 1 in any water, and are not differentiated.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Sums = list[Any]
 
 @dataclass(frozen=True)
 class LayerChange:
-    """What a perturbation adds for each metre and each scattering event between two depths.
+    """A perturbation's additions per metre and per scattering event between two depths.
 
     Attributes
     ----------
@@ -55,21 +54,21 @@ class LayerChange:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A change of water and solids by a parameter: the derivative of the logarithm of a path's contribution.
+    """A change in water and solids by a parameter: the derivative of a path contribution's logarithm.
 
     Attributes
     ----------
     layers
         Additions by water between depths.
     solids
-        Solids with what a reflection by each adds.
+        Solids with the addition by each reflection.
     focusing
         Derivative of `RippleFocusing.factors`; None where they do not change.
     ripples
-        Ripples of the sea with the parameter below and above its value, and the difference of these two values; None
-        where they do not change.
+        Sea ripples with the parameter below and above its value, and the difference between these values; None where
+        they do not change.
     beam
-        Change of the logarithm of the widths of a Gaussian beam with the parameter; None where they do not change.
+        Change in a Gaussian beam's logarithmic widths with the parameter; None where they do not change.
     """
 
     layers: tuple[LayerChange, ...] = ()
@@ -88,11 +87,11 @@ class _Layer:
         self.travels = change.per_metre != 0
         self.scatters = change.per_event != 0 or change.by_angle is not None
         self._per_metre, self._per_event = opaque(change.per_metre), opaque(change.per_event)
-        #: Number of the tables among which that of this change is, or None.
+        #: Number of the tables that include this change's, or None.
         self.tables: int | None = None
 
     def along(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
-        """Return the addition of segments: depth of the start [m], downward component, length [m]."""
+        """Return the addition by segments: depth of the start [m], downward component, length [m]."""
         if self._limits == (-np.inf, np.inf):
             return self._per_metre * length
         # Distances to the edges, which neighbouring layers share: their parts add up to the length exactly.
@@ -102,11 +101,11 @@ class _Layer:
         return self._per_metre * dr.abs(second - first)
 
     def about(self, depth: mi.Float, length: mi.Float) -> mi.Float:
-        """Return the addition of lengths [m] about depths [m], negative on the way back, all of it in one layer."""
+        """Return the addition by lengths [m] about depths [m], negative on the way back, all in one layer."""
         return self._within(depth, self._per_metre * length)
 
     def at_event(self, depth: mi.Float, by_angle: Sequence[mi.Float]) -> mi.Float:
-        """Return the addition of scattering events: depth [m], and values of the tables there."""
+        """Return the addition by scattering events: depth [m], and table values there."""
         return self._within(depth, self._per_event if self.tables is None else self._per_event + by_angle[self.tables])
 
     def _within(self, depth: mi.Float, addition: mi.Float) -> mi.Float:
@@ -121,7 +120,7 @@ class _Layer:
 
 
 class _Tables:
-    """Tables by scattering angle of changes between different depths, of which one holds at each."""
+    """Scattering angle tables for changes between different depths, of which one applies at each."""
 
     def __init__(self) -> None:
         self._changes: list[tuple[LayerChange, _Layer]] = []
@@ -132,7 +131,7 @@ class _Tables:
         return all(change.top >= other.bottom or change.bottom <= other.top for other, _ in self._changes)
 
     def add(self, change: LayerChange, layer: _Layer) -> None:
-        """Add the table of a change."""
+        """Add a change's table."""
         self._changes.append((change, layer))
         tables = [one.by_angle for one, _ in self._changes if one.by_angle is not None]
         self._values = aligned(mi.Float, np.concatenate(tables).astype(np.float32))
@@ -147,7 +146,7 @@ class _Tables:
 
 
 class Perturbations:
-    """Sums of perturbations along paths; without perturbations all of them are empty.
+    """Perturbation sums along paths; without perturbations all are empty.
 
     Parameters
     ----------
@@ -167,7 +166,7 @@ class Perturbations:
                     self._tables[layer.tables].add(change, layer)
 
     def _group(self, change: LayerChange) -> int:
-        """Return the number of the first tables that take a change, or of new ones."""
+        """Return the number of the first tables that can include a change, or of new ones."""
         for number, tables in enumerate(self._tables):
             if tables.takes(change):
                 return number
@@ -180,7 +179,7 @@ class Perturbations:
         return len(self.perturbations)
 
     def start(self) -> Sums:
-        """Return the sums of paths that start."""
+        """Return the sums for paths that start."""
         return [mi.Float(0) for _ in self.perturbations]
 
     def along(
@@ -216,7 +215,7 @@ class Perturbations:
     ) -> Sums:
         """Return sums beyond scattering events by water, from one direction to another.
 
-        `share` is that of the water among the scatterers that may have scattered, 1 by default.
+        `share` is the water's share among the scatterers that may have scattered, 1 by default.
         """
         if not sums:
             return sums
@@ -247,7 +246,7 @@ class Perturbations:
         return found
 
     def at_laser(self, sums: Sums, profile: BeamProfile, angle_x: mi.Float, angle_y: mi.Float) -> Sums:
-        """Return sums of paths that leave the laser, of a beam profile, at tangent-plane angles [rad]."""
+        """Return the sums for paths that leave the laser, with a beam profile, at tangent-plane angles [rad]."""
         if not isinstance(profile, GaussianBeam):
             return sums
         return [
@@ -256,7 +255,7 @@ class Perturbations:
         ]
 
     def at_sea(self, sums: Sums, si: mi.SurfaceInteraction3f, outgoing: mi.Vector3f, active: mi.Bool) -> Sums:
-        """Return sums beyond the sea surface, in a direction of the frame of the interaction."""
+        """Return the sums beyond the sea surface, in a direction in the interaction's frame."""
         found = []
         for total, one in zip(sums, self.perturbations, strict=True):
             if one.ripples is not None:
@@ -268,10 +267,10 @@ class Perturbations:
         return found
 
     def channels(self, energy: mi.Float, sums: Sums) -> list[mi.Float]:
-        """Return the derivatives of energies of complete paths."""
+        """Return the energy derivatives of complete paths."""
         return [energy * total for total in sums]
 
 
 def joined(first: Sums, second: Sums) -> Sums:
-    """Return the sums of paths of two parts."""
+    """Return the sums for paths with two parts."""
     return [one + other for one, other in zip(first, second, strict=True)]

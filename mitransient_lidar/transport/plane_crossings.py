@@ -23,11 +23,11 @@ from mitransient_lidar.transport.scene import LidarScene
 #: Paths end after this multiple of the distance to the deepest plane, or when absorption leaves this share of light.
 _LONGEST_WAY, _SMALLEST_REST = 50.0, 1e-6
 
-#: Initial capacity for segments of each photon, and capacity over the need of the last pass.
+#: Initial segment capacity per photon, and capacity over the last pass's need.
 _SEGMENTS, _CAPACITY_MARGIN = 2.5, 1.25
 
 
-#: What is stored of a segment: planes before and after it, start, direction and length, and the entry of its path.
+#: Stored segment: planes before and after it, start, direction and length, and its path's entry.
 _PACKETS = (("point", "length"), ("direction", "longest"), ("entry", "entry_length"), ("entry_direction", "throughput"))
 _FIELDS = dict.fromkeys(("before", "passed", "scatterings", "index_layer"), "UInt32") | {
     name: kind for packet in _PACKETS for name, kind in zip(packet, ("Vector3f", "Float"), strict=True)
@@ -60,20 +60,20 @@ class CrossingPath(RandomWalkPath):
 
 @dataclass(frozen=True)
 class PlaneCrossings:
-    """Crossings of planes, one for each element.
+    """Plane crossings, one per element.
 
     Attributes
     ----------
     plane
-        Number of the plane.
+        Plane number.
     downward
         Whether it is crossed downwards.
     x, y
         Position [m].
     weight
-        Energy of the light [J].
+        Light energy [J].
     length
-        Optical length of its path up to the crossing [m].
+        Optical path length up to the crossing [m].
     scatterings
         Number of scattering events before.
     shift_x, shift_y
@@ -99,7 +99,7 @@ class PlaneCrossings:
 
 
 class Crossings:
-    """Segments that cross horizontal planes, stored in place of a `SegmentBuffer` by random walks of `CrossingPath`.
+    """Segments that cross horizontal planes, stored in place of a `SegmentBuffer` by walks along a `CrossingPath`.
 
     Light counts before its first solid, and inside the surface mesh. At most `capacity` segments are stored, but all
     are counted; `longest` is the optical length in the water after which paths end [m].
@@ -192,7 +192,7 @@ class Crossings:
             # The horizontal part of index times direction is the same in all index layers.
             ratio = layers.refractive_index[0] / index
             ux, uy = ratio * direction[:, 0], ratio * direction[:, 1]
-            # The ray of the top index layer also reaches planes above the trough of a wave.
+            # The ray in the top index layer also reaches planes above the trough of a wave.
             drop = np.minimum(depth, bottom) - top
             distance = np.where(bottom == edges[0], drop, np.maximum(drop, 0)) / np.sqrt(1 - ux**2 - uy**2)
             x, y, length = x + distance * ux, y + distance * uy, length + distance * group
@@ -208,9 +208,9 @@ class CrossingTracer:
     scene
         Lidar scene with water.
     depths
-        Depths of the planes below the mean sea level [m], increasing, shape (planes,).
+        Plane depths below the mean sea level [m], increasing, shape (planes,).
     photons
-        Number of light paths in a pass.
+        Light paths per pass.
     """
 
     def __init__(self, scene: LidarScene, depths: FloatArray, photons: int) -> None:
@@ -226,7 +226,7 @@ class CrossingTracer:
         self._longest = float(longest * scene.required_water.index_layers.group_index.max())
 
     def trace(self, seed: int, number: int) -> tuple[PlaneCrossings, float]:
-        """Return the crossings of a pass, and the share of the energy that passes outside the surface mesh."""
+        """Return the crossings in a pass, and the share of the energy that passes outside the surface mesh."""
         scene, pose, count = self._scene, self._scene.transmitter.pose, self._photons
         while True:
             rng = pass_streams(seed, number, count)

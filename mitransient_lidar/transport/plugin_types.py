@@ -1,4 +1,4 @@
-"""What the transport needs of plugins, which lie in a layer above it."""
+"""Protocols that the transport needs from plugins, which lie in a layer above it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 
 @runtime_checkable
 class OwnPlugin(Protocol):
-    """Any plugin of this package, with its name as ``type`` and the values of its parameters."""
+    """Any plugin in this package, with its name as ``type`` and its parameter values."""
 
     parameters: dict[str, Any]
 
@@ -74,7 +74,7 @@ class SunEmitter(Daylight, Protocol):
         """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
 
     def sample(self, u: mi.Point2f) -> mi.Vector3f:
-        """Map uniform numbers to directions of the disc."""
+        """Map uniform numbers to directions within the disc."""
 
 
 class SkyEmitter(Daylight, Protocol):
@@ -112,7 +112,7 @@ class SeaShape(Protocol):
 
     @property
     def time_s(self) -> float:
-        """Time of the waves [s]."""
+        """Wave time [s]."""
 
     @property
     def footprint_size(self) -> float:
@@ -121,14 +121,14 @@ class SeaShape(Protocol):
     def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
         """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
 
-        Waves may follow depths of a bottom.
+        Waves may follow bottom depths.
         """
 
     def rippled(self, refractive_index: float) -> mi.BSDF:
         """Return the BSDF of a level sea, all of whose slopes are ripples."""
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
-        """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
+        """Return the ripple BSDF with the sea's ripple slope variances times a factor."""
 
 
 @runtime_checkable
@@ -141,7 +141,7 @@ class SeabedShape(Protocol):
 
     @property
     def height_map(self) -> HeightMap | None:
-        """Height map of the bottom; None without one."""
+        """Bottom height map; None without one."""
 
     def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return whether places [m] lie beyond the height map; nowhere without one."""

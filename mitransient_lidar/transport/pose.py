@@ -20,18 +20,18 @@ _SMALLEST_DISTANCE = 1e-12
 
 @dataclass(frozen=True)
 class KernelPose(Pose):
-    """Pose of all paths, or poses of the shots that paths belong to, as kernels read them.
+    """One pose for all paths, or the poses of their shots, as kernels read them.
 
-    Poses of several shots serve paths alone: `direction`, `tangent`, `point` and `RelativePose`.
+    Poses for several shots serve paths alone: `direction`, `tangent`, `point` and `RelativePose`.
 
     Parameters
     ----------
     delay
-        Length that is added to relative lengths [m], of each shot.
+        Length that is added to relative lengths [m], per shot.
     lanes
-        Lanes of the paths that have the pose of their shot; none for one pose of all paths.
+        Lanes of the paths that have their shot's pose; none if all paths have one pose.
     frame_origin
-        Place of the frame's origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
+        Frame origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
     """
 
     OF_SHOTS = ("lanes",)
@@ -49,18 +49,18 @@ class KernelPose(Pose):
         return np.asarray(points + self.frame_origin[: points.shape[-1]])
 
     def part(self, rows: slice | IntArray) -> KernelPose:
-        """Return the poses of some of the shots."""
+        """Return the poses for some shots."""
         return replace(super().part(rows), delay=np.broadcast_to(self.delay, len(self.origin))[rows])
 
     def number(self, values: float | FloatArray) -> mi.Float:
-        """Return a number of all paths, or that of the shot of each path of shape (shots,), as kernels read it."""
+        """Return a number for all paths, or the number for each path's shot from shape (shots,), as kernels read it."""
         if np.ndim(values) == 0:
             return opaque(float(values))
         assert self.lanes is not None
         return self.lanes.pick(aligned(mi.Float, np.asarray(values, np.float32)))
 
     def vector(self, values: FloatArray) -> mi.Vector3f:
-        """Return a vector of all paths, shape (3,), or of the shot of each path, shape (shots, 3)."""
+        """Return a vector for all paths, shape (3,), or for each path's shot, shape (shots, 3)."""
         return mi.Vector3f(*(self.number(values[..., axis]) for axis in range(3)))
 
     @property
@@ -83,7 +83,7 @@ class KernelPose(Pose):
 class RelativePose:
     """A pose relative to a reference point in the scene: accurate from orbit in single precision.
 
-    Distances are relative to that of the reference point r. With the pose's origin o and a point p,
+    Distances are relative to the reference point r. With the pose's origin o and a point p,
     |p - o| - |r - o| = (p - r) . (p - r + 2 (r - o)) / (|p - o| + |r - o|). Single precision has rounding errors of
     3 cm in coordinates and distances of 500 km, but of less than 0.1 mm in such differences to points within 100 m.
 
@@ -113,7 +113,7 @@ class RelativePose:
         return distance if self._delay is None else distance + self._delay
 
     def tangent(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Return (angle_x, angle_y) of points, and the cosine of their directions with the axis."""
+        """Return (angle_x, angle_y) of points, and the cosines between their directions and the axis."""
         offset = point - self._reference
         x, y, along = (dr.dot(offset, side) + constant for side, constant in self._sides)
         return x / along, y / along, along / dr.norm(offset + self._away)

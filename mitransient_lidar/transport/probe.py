@@ -23,7 +23,7 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
 
-#: Rays of a view and of a beam; those of a Gaussian beam reach 4.2 standard deviations.
+#: Rays in a view and in a beam; Gaussian beam rays reach 4.2 standard deviations.
 PROBE_RAYS = 4096
 
 #: Distance outside view or beam within which waves and scattering still light a shape, over its depth.
@@ -41,7 +41,7 @@ _MOST_PIXELS = 1024
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of a view or of a beam.
+    """Rays in a view or in a beam.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Rays:
     angles, direction
         Tangent-plane angles and unit directions.
     seen
-        Which rays count: of a view those that pixels see, of a beam all.
+        Which rays count: in a view the rays that pixels see, in a beam all.
     """
 
     scene: WaterScene
@@ -61,7 +61,7 @@ class Rays:
 
     @classmethod
     def of_view(cls, scene: WaterScene, sampler: SensorSampler) -> Rays:
-        """Return rays of the field of view."""
+        """Return rays in the field of view."""
         start = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
         seen = start.weight > 0
         dr.eval(start, seen)
@@ -69,13 +69,13 @@ class Rays:
 
     @classmethod
     def of_beam(cls, scene: WaterScene, transmitter: Transmitter) -> Rays:
-        """Return rays of the laser, of equal energy."""
+        """Return laser rays with equal energy."""
         angles, pose = mi.Point2f(transmitter.sample_tangent(unit_points(PROBE_RAYS))), transmitter.pose
         return cls(scene, pose, angles, pose.direction(*angles), mi.Bool(True))
 
     @cached_property
     def first(self) -> mi.SurfaceInteraction3f:
-        """What the rays meet first; nothing for those that do not count."""
+        """First intersections; none for rays that do not count."""
         start, _ = self.scene.first_points(self.pose, self.angles, self.direction)
         return self.scene.ray_intersect(mi.Ray3f(start, self.direction), self.seen)
 
@@ -86,7 +86,7 @@ class Rays:
 
     @cached_property
     def below(self) -> mi.SurfaceInteraction3f:
-        """What the rays meet after refraction by the facets of the sea, without ripples."""
+        """Intersections after refraction by the sea's facets, without ripples."""
         down = -dr.normalize(refract(-self.direction, self.first.n, 1 / self.scene.refractive_index))
         return self.scene.ray_intersect(self.scene.spawn_ray(self.first, down), self.on_sea)
 
@@ -97,7 +97,7 @@ class Rays:
 
     @cached_property
     def ranges(self) -> FloatArray:
-        """Distances to what the rays that count meet first [m], infinite for those that meet nothing."""
+        """Distances of counting rays to their first intersections [m], infinite without one."""
         return self._counted(dr.select(self.first.is_valid(), self.first.t, dr.inf))
 
     @cached_property
@@ -114,7 +114,7 @@ class Rays:
         return np.where(self.directions[:, 2:] < 0, self._counted(point), np.nan)
 
     def _counted(self, values: mi.Float | mi.Vector3f) -> FloatArray:
-        """Return values of the rays that count, rays first."""
+        """Return the values for rays that count, rays first."""
         array = np.array(values, dtype=np.float64).T
         return np.asarray(array[np.broadcast_to(np.array(self.seen), len(array))])
 
@@ -129,7 +129,7 @@ class Rays:
         return self.scene.level_sea.at_height(self.pose.origin, axes, z)
 
     def middle_height(self, shape: mi.Shape) -> float:
-        """Return the mean height of a shape's bounding box, at most half of that of the pose [m]."""
+        """Return the mean height of a shape's bounding box, at most half the pose's height [m]."""
         return float(min(0.5 * (shape.bbox().min.z + shape.bbox().max.z), 0.5 * self.pose.origin[2]))
 
     def covered_by(self, shape: mi.Shape) -> bool:
@@ -147,7 +147,7 @@ class Rays:
 
 
 def gaps(places: FloatArray, shape: mi.Shape) -> FloatArray:
-    """Return the horizontal distances of places (x, y), shape (n, 2), from the bounding box of a shape [m]."""
+    """Return the horizontal distances between points (x, y), shape (n, 2), and a shape's bounding box [m]."""
     low, high = box_of(shape)
     outside = np.maximum(np.maximum(low[:2] - places, places - high[:2]), 0)
     return np.asarray(np.hypot(*outside.T))
@@ -155,7 +155,7 @@ def gaps(places: FloatArray, shape: mi.Shape) -> FloatArray:
 
 @dataclass(frozen=True)
 class SolidEcho:
-    """Mean and latest arrival of the direct echo of a solid over all pixels [ns]."""
+    """Mean and latest arrival of a solid's direct echo over all pixels [ns]."""
 
     shape: mi.Shape
     mean_ns: float
@@ -164,24 +164,24 @@ class SolidEcho:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Expected arrival of echoes, weighted by the laser's beam.
+    """Expected echo arrival, weighted by the laser beam.
 
     Attributes
     ----------
     surface_ns, bottom_ns
-        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo of the first solid under
-        water [ns], shape (pixels, 2) each; NaN without one.
+        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo from the first solid
+        under water [ns], shape (pixels, 2) each; NaN without one.
     missed_beam
-        Share of the beam inside the field of view that passes outside the surface mesh, without what solids in the air
-        intercept.
+        Share of the beam inside the field of view that passes outside the surface mesh, without light that solids in
+        the air intercept.
     dry_ns
-        Earliest and latest arrival of the echo of land and other solids in the air [ns], shape (pixels, 2).
+        Earliest and latest arrival of the echo from land and other solids in the air [ns], shape (pixels, 2).
     on_land
         Share of the beam inside the field of view that meets them.
     pierced
         Solids visible in the air that reach below the crests of the sea.
     solids
-        Echoes of the solids that rays of beam and view meet, in the air and under water.
+        Echoes from the solids that rays in beam and view meet, in the air and under water.
     """
 
     surface_ns: FloatArray
@@ -199,9 +199,9 @@ class Probe:
     Attributes
     ----------
     scene
-        The scene; of several shots that of the first one.
+        The scene; with several shots the first one's.
     sampler
-        Sampler of the rays of its view.
+        Sampler for the rays of its view.
     """
 
     def __init__(self, scene: LidarScene) -> None:
@@ -209,12 +209,12 @@ class Probe:
 
     @cached_property
     def view(self) -> Rays:
-        """Rays of the view."""
+        """View rays."""
         return Rays.of_view(self.scene, self.sampler)
 
     @cached_property
     def beam(self) -> Rays:
-        """Rays of the beam."""
+        """Beam rays."""
         return Rays.of_beam(self.scene, self.scene.transmitter)
 
     @cached_property
@@ -233,7 +233,7 @@ class Probe:
         solid = on_sea & below.is_valid() & ~scene.is_surface(below.shape)
         water = 2 * below.t * opaque(scene.group_index)
         if scene.submerged:
-            # What rays meet first is the sea's or a solid's echo.
+            # A ray's first intersection is an echo from the sea or a solid.
             places = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
             length += opaque(scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
             below, solid, water = first, first.is_valid() & ~on_sea, mi.Float(0)

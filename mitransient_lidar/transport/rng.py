@@ -1,4 +1,4 @@
-"""Random numbers of a pass: independent streams for each path of each shot, and random shifts."""
+"""Random numbers in a pass: independent streams for each path in each shot, and random shifts."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Tree = TypeVar("Tree")
 
 @dataclass(frozen=True)
 class Lanes:
-    """Lanes of a kernel that belong to the shots of a pass.
+    """Kernel lanes that belong to the shots in a pass.
 
     Attributes
     ----------
     shots
         Number of shots.
     shot, number
-        Number of the shot of each lane, and of its path within the shot.
+        Each lane's shot number, and its path's number within the shot.
     """
 
     shots: int
@@ -34,7 +34,7 @@ class Lanes:
 
     @classmethod
     def of_paths(cls, lane: mi.UInt32, shots: int, per_shot: int) -> Lanes:
-        """Return lanes from the numbers of paths, of which each shot has `per_shot`, one shot after the other."""
+        """Return lanes from path numbers, `per_shot` in each shot, one shot after the other."""
         if shots == 1:
             return cls(1, mi.UInt32(0), lane)
         paths = dr.opaque(mi.UInt32, per_shot)
@@ -42,10 +42,10 @@ class Lanes:
         return cls(shots, shot, lane - shot * paths)
 
     def pick(self, tree: Tree) -> Tree:
-        """Return what the lanes' shots have of an array with one entry a shot, or of an object that holds such arrays.
+        """Return the lanes' entries in an array with one entry per shot, or in an object that holds such arrays.
 
-        An object names its arrays, and the objects that hold others, in ``OF_SHOTS``; arrays of one entry are those of
-        all shots. A pose names its ``lanes``, and looks up its own numbers as kernels need them.
+        An object names its arrays, and the objects that hold others, in ``OF_SHOTS``; one-entry arrays apply to all
+        shots. A pose names its ``lanes``, and looks up its own numbers as kernels need them.
         """
         picked: Tree = _each_array(tree, lambda values: dr.gather(type(values), values, self.shot), self)
         return picked
@@ -58,7 +58,7 @@ def tiled(tree: Tree, copies: int) -> Tree:
 
 
 def starts(shots: int, size: int) -> mi.UInt32:
-    """Return the number of the first of `size` entries of each shot."""
+    """Return the number of the first of `size` entries in each shot."""
     return mi.UInt32(0) if shots == 1 else aligned(mi.UInt32, np.arange(shots) * size)
 
 
@@ -76,18 +76,18 @@ def _each_array(tree: Any, change: Callable[[Any], Any], lanes: Lanes | None = N
 
 
 class Shots:
-    """Shots of a pass, with a seed each: random numbers of a shot do not depend on the other shots."""
+    """Shots in a pass, each with a seed: a shot's random numbers do not depend on the other shots."""
 
     def __init__(self, seeds: Sequence[int]) -> None:
         self.count = len(seeds)
         self._seeds = [int(seed) for seed in seeds]
 
     def paths(self, per_shot: int) -> Lanes:
-        """Return the lanes of `per_shot` paths of each shot."""
+        """Return the lanes for `per_shot` paths in each shot."""
         return Lanes.of_paths(dr.arange(mi.UInt32, self.count * per_shot), self.count, per_shot)
 
     def streams(self, purpose: int, lanes: Lanes) -> mi.PCG32:
-        """Return independent random number generators, of stage number `purpose` of a pass."""
+        """Return independent random number generators for stage number `purpose` in a pass."""
         words = [np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64) for seed in self._seeds]
         # Arrays, so that all seeds share a kernel.
         state, stream = (lanes.pick(aligned(mi.UInt64, word)) for word in np.array(words).T)
@@ -102,22 +102,22 @@ class Shots:
         return [aligned(mi.Float, column) for column in np.array(drawn).T]
 
     def keys(self, lanes: Lanes) -> mi.UInt32:
-        """Return 32 bits of the seeds."""
+        """Return 32 bits from the seeds."""
         bits = np.array([seed & 0xFFFFFFFF for seed in self._seeds], np.uint32)
         return lanes.pick(aligned(mi.UInt32, bits))
 
 
 def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
-    """Return independent random number generators for `count` paths, of stage number `purpose` of a pass."""
+    """Return independent random number generators for `count` paths, for stage number `purpose` in a pass."""
     shots = Shots([seed])
     return shots.streams(purpose, shots.paths(count))
 
 
 def stratified_point(index: mi.UInt32, count: int | mi.UInt64, rng: mi.PCG32) -> mi.Point2f:
-    """Return a random point of the unit square in stratum number `index` of `count`.
+    """Return a random point in stratum number `index` of `count` in the unit square.
 
     The strata are equal pieces of a Z-order curve (Morton 1966): neighbours in number are neighbours in the square, so
-    that rays of a packet and their memory accesses stay together.
+    that the rays in a packet and their memory accesses stay together.
     """
     # Dr.Jit compiles another kernel for every number by which it divides.
     strata = dr.opaque(mi.UInt64, count) if isinstance(count, int) else count
@@ -130,14 +130,14 @@ def stratified_point(index: mi.UInt32, count: int | mi.UInt64, rng: mi.PCG32) ->
 
 
 def interleaved_point(index: mi.UInt32, count: int, sets: int, rng: mi.PCG32) -> mi.Point2f:
-    """Return stratified points of `sets` sets, to which the lanes number `index` of `count` belong in turn."""
+    """Return stratified points for `sets` sets, to which the lanes number `index` of `count` belong in turn."""
     if count % sets == 0:
         return stratified_point(index // sets, count // sets, rng)
     return stratified_point(index // sets, mi.UInt64((opaque_index(count + sets - 1) - index % sets) // sets), rng)
 
 
 def unit_points(count: int, index: mi.UInt32 | None = None) -> mi.Point2f:
-    """Return the points of a rank-1 lattice of `count` in the unit square, by number or all."""
+    """Return the points of a rank-1 lattice with `count` points in the unit square, by number or all."""
     number = dr.arange(mi.Float, count) if index is None else mi.Float(index)
     y = number * 0.6180339887
     return mi.Point2f((number + 0.5) / count, y - dr.floor(y))

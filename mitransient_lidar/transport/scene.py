@@ -1,4 +1,4 @@
-"""The parts of a scene as paths meet them; `transport.scene_parts` finds them."""
+"""Scene parts as paths meet them; `transport.scene_parts` finds them."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from mitransient_lidar.transport.solids import box_of, children, scene_of_shapes
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
 
-#: Largest rounding error of intersections over their coordinates.
+#: Largest intersection rounding error over the coordinates.
 _ROUNDING = 2.0**-21
 
 #: Length over which slopes change, over the shortest wavelength.
 _FACET_PER_WAVE = 0.25
 
-#: Smallest side of a bottom, over that of the largest solid.
+#: Smallest bottom side over the largest solid's side.
 _BOTTOM_PER_LARGEST = 0.25
 
 
@@ -61,7 +61,7 @@ class ScenePart:
     turn: mi.Vector2f | None = None
 
     def ray(self, ray: mi.Ray3f) -> mi.Ray3f:
-        """Return rays of the lidar's frame among the shapes."""
+        """Return rays in the lidar's frame among the shapes."""
         moved = mi.Ray3f(ray)
         if self.turn is not None:
             moved.o, moved.d = (_turned(vector, self.turn) for vector in (ray.o, ray.d))
@@ -71,7 +71,7 @@ class ScenePart:
 
 @dataclass(frozen=True)
 class WaterScene:
-    """Receiver, water and sea surface of a scene.
+    """Receiver, water and sea surface in a scene.
 
     Attributes
     ----------
@@ -84,15 +84,15 @@ class WaterScene:
     surfaces
         Shapes that bound the water, with it as interior medium.
     slope_variance
-        Total slope variance of the sea, for the sampling of surface connections.
+        Total slope variance of the sea, for sampling surface connections.
     parts
-        Parts of the scene at places that differ between shots, in place of `mitsuba_scene`; none for a single shot.
+        Scene parts at locations that differ between shots, in place of `mitsuba_scene`; none for a single shot.
     receiver_poses
         Pose of the receiver in each shot, where they differ.
     perturbations
         Changes of water and solids whose effect on each path is summed.
     groups
-        Groups of shapes that instances repeat.
+        Shape groups that instances repeat.
     interpolates
         Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
     """
@@ -117,12 +117,12 @@ class WaterScene:
 
     @property
     def receiver_pose(self) -> KernelPose:
-        """Pose of the receiver for paths."""
+        """Receiver pose for paths."""
         return self.receiver_poses or self.receiver.pose
 
     @property
     def frame_origin(self) -> FloatArray:
-        """Place of the origin of the scene's coordinates, as rays have them, in the scene as it is given [m], (3,)."""
+        """Origin of the ray coordinates, in the scene as it is given [m], (3,)."""
         return self.receiver.pose.frame_origin
 
     @property
@@ -136,7 +136,7 @@ class WaterScene:
         return [surface for surface in self.surfaces if isinstance(surface, SeaShape)]
 
     def mean_slopes(self, shots: int) -> FloatArray:
-        """Return the mean slopes of the sea along x and y under the lidar of each shot [1], shape (shots, 2)."""
+        """Return the mean sea slopes along x and y under each shot's lidar [1], shape (shots, 2)."""
         slope = complex(*self.seas[0].sea.slope) if self.seas else 0j
         slopes = np.full(shots, slope)
         turns = [part.turn for part in self.parts if part.turn is not None]
@@ -150,7 +150,7 @@ class WaterScene:
         """Solids that are the bottom, or a part of it; all others are targets.
 
         The shorter horizontal side of a bottom's bounding box is at least the width of the field of view at its
-        distance, and at least a quarter of that of the largest solid.
+        distance, and at least a quarter of the largest solid's.
         """
         boxes = [box_of(solid) for solid in self.solids]
         sides = [float((high - low)[:2].min()) for low, high in boxes]
@@ -173,7 +173,7 @@ class WaterScene:
 
     @property
     def empty_heights(self) -> tuple[float, float]:
-        """Heights of the top of the highest solid and of the lowest point of the sea: no shape lies between [m]."""
+        """Heights of the highest solid's top and of the sea's lowest point: no shape lies between [m]."""
         highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
         return highest, -np.inf if self.sea_heights is None else self.sea_heights[0]
 
@@ -201,7 +201,7 @@ class WaterScene:
         return self._have_solids(mi.BSDFFlags.Null.value)
 
     def _have_solids(self, flags: int) -> bool:
-        """Return whether the BSDF of a solid has one of the flags."""
+        """Return whether a solid's BSDF has one of the flags."""
         grouped = [shape for group in self.groups for shape in children(group)]
         return any(int(shape.bsdf().flags()) & flags for shape in (*self.solids, *grouped))
 
@@ -209,9 +209,9 @@ class WaterScene:
     def facet_size(self) -> float:
         """Length over which slopes of the sea surface change [m].
 
-        A quarter of the shortest waves that the beam needs or, if longer, the side of a cell; in meshes of other
-        plugins the mean side of a cell, a pair of triangles. Waves that are shorter for the pixels of an image, and
-        cells that are finer than their waves, do not count.
+        A quarter of the shortest waves that the beam needs or, if longer, the cell side; in meshes from other plugins
+        the mean side of a cell, a pair of triangles. Shorter waves for an image's pixels, and cells finer than their
+        waves, do not count.
         """
         sizes = [
             max(surface.sea.cell_size, _FACET_PER_WAVE * surface.sea.beam_wave)
@@ -224,7 +224,7 @@ class WaterScene:
 
     @property
     def required_water(self) -> Water:
-        """The water, of a scene that has one."""
+        """The water, for a scene that has one."""
         if self.water is None:
             raise UserError("the scene has no water: give its surface a layered_water as interior medium")
         return self.water
@@ -281,7 +281,7 @@ class WaterScene:
         return replace(plan.train, start_ns=start)
 
     def relative(self, pose: KernelPose) -> RelativePose:
-        """Return a pose relative to the reference point of the scene, as lengths of paths are."""
+        """Return a pose relative to the scene's reference point, as path lengths are."""
         return RelativePose(pose, self.receiver.pose.nearby_point())
 
     def first_points(self, pose: KernelPose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
@@ -299,7 +299,7 @@ class WaterScene:
         return point, relative.distance(point)
 
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
-        """Return the first intersections of rays."""
+        """Return the first ray intersections."""
         if not self.parts:
             return self.mitsuba_scene.ray_intersect(ray, active)
         nearest, shift = dr.zeros(mi.PreliminaryIntersection3f), mi.Vector3f(0)
@@ -307,7 +307,7 @@ class WaterScene:
         turn = mi.Vector2f(1, 0)
         for part in self.parts:
             moved = part.ray(ray)
-            # What lies beyond a shape of another part does not matter.
+            # Intersections beyond a shape in another part do not matter.
             moved.maxt = dr.minimum(ray.maxt, nearest.t)
             found = part.shapes.ray_intersect_preliminary(moved, active=active)
             is_nearer = found.t < nearest.t
@@ -382,9 +382,9 @@ class WaterScene:
     def spawn_ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         """Return rays that leave surfaces, from points beside them so that they do not meet these again.
 
-        Mitsuba's own offset grows with the distance from the origin of the world: 250 m away it is 2 cm, and 0.2 ns of
-        the way to a bottom and back are lost. This one grows with that from the reference point of the scene, and with
-        the rounding of coordinates.
+        Mitsuba's own offset grows with the distance from the world's origin: 250 m away it is 2 cm, and a path to a
+        bottom and back loses 0.2 ns. This offset grows with the distance from the scene's reference point, and with
+        coordinate rounding.
         """
         reference = self.receiver.pose.nearby_point()
         farthest = opaque(float(np.abs(reference).max()))
@@ -423,7 +423,7 @@ class LidarScene(WaterScene):
     axis
         Time bins of the record.
     record_end
-        What the last light of the record comes from, where the scene decides its end.
+        Source of the last light in the record, where the scene decides its end.
     gates
         Gates of the ``time_gated_film``, or None.
     transmitter_poses
@@ -440,7 +440,7 @@ class LidarScene(WaterScene):
 
     @property
     def transmitter_pose(self) -> KernelPose:
-        """Pose of the transmitter for paths."""
+        """Transmitter pose for paths."""
         return self.transmitter_poses or self.transmitter.pose
 
     @property

@@ -37,16 +37,16 @@ from mitransient_lidar.transport.solids import children, shape_groups, without_u
 
 logger = logging.getLogger(__name__)
 
-#: Largest number of instances without a warning of the time that they take.
+#: Largest number of instances without a warning about the time that they need.
 _MANY_INSTANCES = 20
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
-#: Difference of wavelengths that no water tells apart [nm].
+#: Wavelength difference that changes no water [nm].
 _SAME_NM = 1.0
 
-#: Relative difference of refractive indices that does not matter, more than the index of air.
+#: Relative refractive index difference that does not matter, more than the index of air.
 _SAME_INDEX = 1e-3
 
 #: Vertical component of an axis under water above which it looks up.
@@ -62,7 +62,7 @@ def find_lidar_scene(
 ) -> LidarScene:
     """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
 
-    Time bins that the film does not give are those of `axis`, or hold the light of all positions of the lidar, above
+    `axis` gives the time bins that the film does not; without it they contain the light at all lidar positions, above
     water displaced by `shifts` (x, y) [m].
 
     Raises
@@ -88,21 +88,21 @@ def find_lidar_scene(
         _check_cells(parts.surfaces, transmitters[0])
     axis, end = film.axis or axis, ""
     if axis is None:
-        # The bins are those of the sensor, whatever replaces its receiver.
+        # The bins are the sensor's, even if another receiver replaces its own.
         axis, end = fitted_axis(replace(parts, receiver=find_receiver(sensor)), transmitters[0], film, shifts)
     end = end if film.bin_count is None else ""
     return LidarScene(**vars(parts), transmitter=transmitters[0], axis=axis, gates=film.gates, record_end=end)
 
 
 def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
-    """Return the receiver among the sensors of a scene, wherever cameras stand beside it; of several, the first.
+    """Return the receiver among a scene's sensors, wherever cameras stand beside it; of several, the first.
 
-    `wanted` is the id of the receiver instead.
+    `wanted` is another receiver's id.
 
     Raises
     ------
     UserError
-        If the scene has none, or none of that id.
+        If the scene has none, or none with that id.
     """
     sensors = scene.sensors()
     receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
@@ -127,11 +127,11 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
 
 
 def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
-    """Set the automatic values of each ``ocean_surface`` that has none from the lasers and receivers of the scene.
+    """Set the missing automatic values of each ``ocean_surface`` from the scene's lasers and receivers.
 
-    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
-    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves. Those of
-    shallow seas follow the bottom, of the model as well.
+    Plugins load without their siblings: this is done for loaded scenes, before they are used. With the lasers and
+    receivers of a `model` instead, the meshes in both scenes have the same cells and waves. Shallow seas follow the
+    bottom, also of the model.
     """
     if not (waiting := [sea for sea in seas_of(scene) if sea.footprints is None]):
         return
@@ -178,7 +178,7 @@ def _without_sea(pose: KernelPose) -> Footprint:
 
 
 def seas_of(scene: mi.Scene) -> list[SeaShape]:
-    """Return the ``ocean_surface`` shapes of a scene."""
+    """Return a scene's ``ocean_surface`` shapes."""
     return [shape for shape in scene.shapes() if isinstance(shape, SeaShape)]
 
 
@@ -215,7 +215,7 @@ def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     moved = separate_contacts(found)
     if not moved:
         return found
-    # Other scenes of these shapes have taken notice of their changes.
+    # Other scenes with these shapes have noticed their changes.
     for shape in moved:
         shape.parameters_changed([])
     scene.parameters_changed([])
@@ -263,9 +263,9 @@ def _check_bsdf(shape: mi.Shape) -> bool:
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
-    """Return water, surfaces and slope variance of a scene, see `WaterScene`.
+    """Return water, surfaces and slope variance in a scene, see `WaterScene`.
 
-    The slope variance is that of the roughest surface, or a typical one without ``ocean_surface``.
+    The slope variance belongs to the roughest surface, or is a typical one without ``ocean_surface``.
 
     Raises
     ------
@@ -299,7 +299,7 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
 
 
 def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
-    """Refuse surfaces that bend light by another index than that of the water, in which paths are timed."""
+    """Refuse surfaces that bend light by another index than the water's, in which paths are timed."""
     index = float(water.refractive_index)
     for surface in surfaces:
         bsdf = surface.bsdf()
@@ -315,7 +315,7 @@ def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
 
 
 def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
-    """Refuse a water of another wavelength than the laser's."""
+    """Refuse a water at another wavelength than the laser's."""
     laser = transmitter.wavelength_nm
     if water is None or water.wavelength_nm is None or abs(water.wavelength_nm - laser) <= _SAME_NM:
         return
@@ -329,7 +329,7 @@ def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
 def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
     """Return whether laser and receiver are under water.
 
-    Refuse both on the sea level, on different sides of the sea, or in layers of different indices.
+    Refuse both on the sea level, on different sides of the sea, or in layers with different indices.
     """
     heights = [float(each.pose.origin[2]) for each in (transmitter, scene.receiver)]
     if min(heights) > 0:

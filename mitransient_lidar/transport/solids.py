@@ -1,4 +1,4 @@
-"""Solids as light meets them: without those of no effect, and instances in place of the shapes that they repeat."""
+"""Solids as light meets them: without ineffective ones, and with instances in place of the shapes that they repeat."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import FloatArray
 #: BSDFs that have no effect where the indices of refraction on both sides are equal.
 _DIELECTRICS = ("SmoothDielectric", "ThinDielectric")
 
-#: Places of rays within the cells of a side, as shares of these, and distance before a box at which they begin [m].
+#: Ray positions within the cells along a side, as cell shares, and distance before a box at which rays begin [m].
 _PLACES, BEFORE = (0.4142, 0.5858), 1e-3
 
 #: Thickness of a flat box over its coordinates, or 1 m: rays along it would meet edges alone.
@@ -46,7 +46,7 @@ def children(parent: mi.Object) -> list[mi.Object]:
 
 
 def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
-    """Return the groups of shapes that instances of a scene repeat.
+    """Return the shape groups that a scene's instances repeat.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
 
 
 def scene_of_shapes(shapes: Sequence[mi.Shape], groups: Sequence[mi.Shape]) -> mi.Scene:
-    """Return a scene of shapes, and of the groups that instances among them repeat."""
+    """Return a scene with shapes, and with the groups that instances among them repeat."""
     parts = *shapes, *groups
     ids = [shape.id() for shape in parts]
     named = {f"shape{number}": shape for number, shape in enumerate(parts)}
@@ -100,7 +100,7 @@ def _is_unseen(shape: mi.Shape) -> bool:
 
 
 def box_of(shape: mi.Shape) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest and highest coordinates of the bounding box of a shape [m], shape (3,) each."""
+    """Return the lowest and highest coordinates of a shape's bounding box [m], shape (3,) each."""
     box = shape.bbox()
     return np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
 
@@ -129,10 +129,10 @@ def box_rays(low: FloatArray, high: FloatArray, ticks: int) -> tuple[FloatArray,
 
 
 def met_shape(si: mi.SurfaceInteraction3f) -> mi.ShapePtr:
-    """Return the shapes of the scene at intersections: an instance in place of the shape that it repeats."""
+    """Return the scene's shapes at intersections: an instance in place of the shape that it repeats."""
     return dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711
 
 
 def met_numbers(si: mi.SurfaceInteraction3f) -> NDArray[np.uint32]:
-    """Return the numbers of the shapes that rays meet, as of `shape_number`; 0 where they meet none."""
+    """Return the numbers of the shapes that rays meet, as by `shape_number`; 0 where they meet none."""
     return np.array(dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, met_shape(si)), 0))

@@ -1,1 +1,1 @@
-"""Phase-function plugins of water and particles."""
+"""Phase-function plugins for water and particles."""

@@ -12,7 +12,7 @@ from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 logger = logging.getLogger(__name__)
 
-#: Largest relative error of the normalisation without a warning.
+#: Largest relative normalisation error without a warning.
 _TOLERATED = 0.02
 
 

@@ -1,4 +1,4 @@
-"""Phase-function plugin ``petzold``: measured phase functions of natural waters."""
+"""Phase-function plugin ``petzold``: measured phase functions for natural waters."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Petzold(TabulatedPhaseFunction):
     .. parameters::
 
     Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised, with power laws below 0.1 degrees.
-    The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
-    0.0183 and a mean cosine of 0.924. The waters include the scattering of pure water.
+    The average particle is the table in Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
+    0.0183 and a mean cosine of 0.924. The waters include scattering by pure water.
 
     .. code-block:: xml
 

@@ -17,7 +17,7 @@ class SeaWater(TabulatedPhaseFunction):
     .. parameters::
 
     :math:`p \propto 1 + \frac{1 - \delta}{1 + \delta} \cos^2 \theta` (Morel 1974), with a backscatter ratio of 0.5.
-    The parameter ``water_scattering`` of ``layered_water`` mixes it with the function of particles.
+    The ``layered_water`` parameter ``water_scattering`` mixes it with the particles' function.
 
     .. code-block:: xml
 

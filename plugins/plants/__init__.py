@@ -1,1 +1,1 @@
-"""Plugins of plants on a bottom."""
+"""Plugins for plants on a bottom."""

@@ -23,17 +23,17 @@ class CanopyShape(mi.Mesh):
 
     Each leaf is a flat rectangle of two triangles. ``blades`` stand on the bottom, as seagrass does, lean by
     ``bending_deg`` and face any way. ``leaves`` are squares that look in all directions alike, everywhere in the layer:
-    a turbid layer, of leaves of any size. Light passes plants unhindered at the angle :math:`\theta` from the vertical
+    a turbid layer with leaves of any size. Light passes plants unhindered at the angle :math:`\theta` from the vertical
     with the probability
 
     .. math:: P = e^{-G\,L / \cos\theta}, \quad G = \tfrac{1}{2} \text{ for leaves}, \quad
               G = \tfrac{2}{\pi} \overline{\sin\gamma} \text{ for blades at the angle } \gamma \text{ to the light},
 
     with the leaf area index *L* (Nilson 1971, doi:10.1016/0002-1571(71)90092-6). Laser and receiver look through the
-    same gaps: the direct echo of the bottom is weakened by :math:`P`, not :math:`P^2`, as far as ripples of the sea do
-    not part the paths of light and view by the width of a gap.
+    same gaps. The direct bottom echo is thus weakened by :math:`P`, not :math:`P^2`, unless sea ripples part the paths
+    of light and view by a gap's width.
 
-    So that gaps stay open for both, ``lidar_merging`` connects the solids of a scene with plants to the laser, instead
+    So that gaps stay open for both, ``lidar_merging`` connects the solids in a scene with plants to the laser, instead
     of merging light on them (its parameter ``solids``).
 
     Plants stand in a square, on the level ``depth``, or on a ``seabed`` to which a reference is nested, as

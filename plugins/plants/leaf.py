@@ -12,12 +12,12 @@ from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 
 @closed
 class Leaf(mi.BSDF):
-    r"""Leaf of a plant (``leaf``).
+    r"""Plant leaf (``leaf``).
 
     .. parameters::
 
-    Light that arrives on either side is reflected by the share *R* and transmitted by the share *T*, both evenly over
-    the directions of their side (bi-Lambertian, as of Verhoef 1984, doi:10.1016/0034-4257(84)90057-9):
+    Either side reflects the share *R* and transmits the share *T* of the arriving light, both evenly over the
+    directions on their side (bi-Lambertian, as in Verhoef 1984, doi:10.1016/0034-4257(84)90057-9):
 
     .. math:: f = \frac{R}{\pi} \text{ on the side of the light}, \quad f = \frac{T}{\pi} \text{ on the other side}.
 

@@ -155,5 +155,5 @@ def test_layer_is_water_in_many_thin_layers(lidar_scene, passes, integrator):
 
 
 def test_bubbles_of_waves_and_of_a_wake_are_alternatives():
-    with pytest.raises(RuntimeError, match=r"plume_scattering = 0\.5 must be 0 with bubbles of"):
+    with pytest.raises(RuntimeError, match=r"plume_scattering = 0\.5 must be 0 with bubbles by"):
         mi.load_dict({"type": "layered_water", "bubble_wind_speed": 10.0, "plume_scattering": 0.5})

@@ -90,6 +90,6 @@ def test_an_origin_far_outside_the_map_is_refused_before_anything_is_written(tmp
     assert done.exit_code == 2
     # Above it is what the log tells of the other files.
     last = done.stderr.splitlines()[-1]
-    allowed = f"origin_x = 412345 must lie within 10 km of {tmp_path / 'bottom.asc'}, whose x is 512335 to 512365."
+    allowed = f"origin_x = 412345 must lie within 10 km of {tmp_path / 'bottom.asc'}, whose x is 512335 to 512365"
     assert last == f"{allowed} (origin_x is set by map_x = 412345)"
     assert not (tmp_path / "out").exists()

@@ -1,1 +1,1 @@
-"""Detection of a target in noise and clutter."""
+"""Target detection in noise and clutter."""

@@ -1,8 +1,8 @@
-"""Detection of a target in the images of a gated camera, by the best weighted sum of its pixels and gates.
+"""Target detection in a gated camera's images, by the best weighted sum over pixels and gates.
 
 The mean images of renders with and without the target are vectors x of digital numbers. With the covariance D of the
-camera's noise, every matched filter, also behind the clutter of seas, is D^-1 times a sum of these vectors. So all
-filters follow from scalar products of the vectors, `FilterProducts`. A shadow counts as an echo does: its difference is
+camera's noise, every matched filter, also against clutter between seas, is D^-1 times a sum of these vectors. So all
+filters follow from scalar products of the vectors, `FilterProducts`. A shadow counts like an echo: its difference is
 negative, and so are its weights.
 """
 
@@ -22,13 +22,13 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.receiver.camera import Camera, Noise
 from mitransient_lidar.physics.receiver.electronics import Expected
 
-_TOLERANCE, _MOST_STEPS = 1e-4, 200  # of weights in noise that pixels share; what they detect is exact for any weights
+_TOLERANCE, _MOST_STEPS = 1e-4, 200  # of weights in noise that pixels share; their detection is exact for any weights
 _ROUNDING = 1e-9
 _SHARES = 0.5, 0.25, 0.1, 0.02, 0.75  # of the covariance with the target that are tried
 
 
 class GateImages(NamedTuple):
-    """What a camera records in one gate; pixels have the shape (row, column) or (pixel,)."""
+    """A camera's record of one gate; pixels have the shape (row, column) or (pixel,)."""
 
     #: Means [DN] of the target's difference and of the images without it, shape (*pixels, 4 renders), in the order
     #: (difference or background, render, half).
@@ -41,11 +41,11 @@ class GateImages(NamedTuple):
 
 @dataclass(frozen=True)
 class FilterProducts:
-    """Scalar products of the vectors of renders.
+    """Scalar products of the renders' vectors.
 
     `products` has the shape (3, gate, vector, vector): x D^-1 y, and x D^-1 C D^-1 y with the covariance C without and
-    with the target. `thirds`, of shape (2, gate), are the third cumulants without and with the target behind the mean
-    filter of all renders. Renders are those of different `seas`, whose differences are clutter, or of one.
+    with the target. `thirds`, shape (2, gate), are the third cumulants without and with the target after the mean
+    filter over all renders. Renders belong to different `seas`, whose differences are clutter, or to one.
     """
 
     seas: bool
@@ -58,7 +58,7 @@ class FilterProducts:
         return int(self.products.shape[-1]) // 4
 
     def of(self, gate: int) -> FilterProducts:
-        """Return the products of a gate alone."""
+        """Return the products for a gate alone."""
         return replace(self, products=self.products[:, [gate]], thirds=self.thirds[:, [gate]])
 
     def skewness(self) -> FloatArray:
@@ -68,7 +68,7 @@ class FilterProducts:
         return _ratio(self.thirds.sum(axis=1), variance**1.5)
 
     def coefficients(self, frames: int, renders: Sequence[int]) -> FloatArray:
-        """Return the sum of filters that is best behind the clutter of some renders, and scaled to their difference.
+        """Return the filter sum that is best in the clutter of some renders, scaled to their difference.
 
         It is 0 if the target changes nothing.
         """
@@ -79,17 +79,17 @@ class FilterProducts:
             clutter = np.zeros((2 * first, len(renders)))
             clutter[first + halves, np.arange(len(renders))[:, None]] = 0.5
             clutter = (clutter - clutter.mean(axis=1, keepdims=True)) / np.sqrt(len(renders) - 1)
-            # Woodbury: the inverse of D / frames and the outer products of the clutter.
+            # Woodbury: the inverse of D / frames and the clutter's outer products.
             inner = clutter.T @ product @ clutter + np.eye(len(renders)) / frames
             found = template - clutter @ np.linalg.solve(inner, clutter.T @ product @ template)
         scale = float(template @ product @ found)
         return found / scale if scale > 0 else np.zeros_like(found)
 
     def statistic(self, frames: int, left_out: Sequence[int] = ()) -> Statistic | None:
-        """Return the filter of the mean of some frames, and its distribution; None if the target changes nothing.
+        """Return the filter for the mean over some frames, and its distribution; None if the target changes nothing.
 
-        Each render is filtered with the weights of the others, without those that are left out. The clutter is the
-        covariance of the halves of its passes over the seas, which is free from the noise of the renders.
+        Each render is filtered with the others' weights, without renders that are left out. The clutter is the
+        covariance over the seas between the halves of the passes, which is free from render noise.
         """
         renders = np.setdiff1d(np.arange(self.renders), left_out)
         product, *noises = self.products.sum(axis=1)
@@ -112,12 +112,12 @@ class FilterProducts:
 
 
 def _halves(renders: Sequence[int]) -> IntArray:
-    """Return the places of the halves of renders among the vectors of the difference, shape (renders, 2)."""
+    """Return the positions of the renders' halves among the difference vectors, shape (renders, 2)."""
     return 2 * np.array(renders)[:, None] + [0, 1]
 
 
 def _template(count: int, renders: Sequence[int]) -> FloatArray:
-    """Return the sum of vectors that is the mean difference of some of `count` renders."""
+    """Return the vector sum that is the mean difference in some of `count` renders."""
     found = np.zeros(4 * count)
     found[_halves(renders)] = 0.5 / len(renders)
     return found
@@ -125,30 +125,30 @@ def _template(count: int, renders: Sequence[int]) -> FloatArray:
 
 @dataclass(frozen=True)
 class ImageTrial:
-    """Light of a scene in the gates of a camera.
+    """A scene's light in a camera's gates.
 
     Parameters
     ----------
     light : ndarray
-        Energies [J] with and without the target in two halves of the passes of each render, shape (with or without,
-        render, half, *pixels, gate).
+        Energies [J] with and without the target in two halves of each render's passes, shape (with or without, render,
+        half, *pixels, gate).
     seas : bool
-        Whether renders are those of different seas.
+        Whether renders belong to different seas.
     open_ns : float
-        Integral of the transmission of a gate [ns].
+        Integrated gate transmission [ns].
     pulses : int
-        Pulses of a frame.
+        Pulses per frame.
     sky : float
-        Power of the daylight on each pixel [W].
+        Daylight power on each pixel [W].
     slope : ndarray, optional
-        Derivative of the light with the time of the gates [J/ns], for the camera's jitter, which is one for all pixels
-        of a gate's frame; without it, the jitter has no effect.
+        Derivative of the light with respect to the gate time [J/ns], for the camera's jitter, which all pixels in a
+        gate's frame share; without it, the jitter has no effect.
     target_share : float
         Share of the noise with the target in the covariance D that the filters are for, 0 to 1.
 
     Notes
     -----
-    The camera's fixed pattern is known to the filters, as of a camera that was calibrated.
+    The filters use the camera's fixed pattern, as for a calibrated camera.
     """
 
     light: FloatArray
@@ -186,12 +186,12 @@ class ImageTrial:
 
     @cached_property
     def _known(self) -> dict[str, Any]:
-        """What the camera's functions need besides the light."""
+        """Arguments of the camera's functions besides the light."""
         pattern = self.camera.pattern(self.light.shape[3:-1])
         return {"open_ns": self.open_ns, "background": self.sky, "pulses": self.pulses, "pattern": pattern}
 
     def images(self) -> Iterator[GateImages]:
-        """Return what the camera records in each gate."""
+        """Return the camera's record of each gate."""
         camera, known = self.camera, self._known
         for gate in range(self.light.shape[-1]):
             energy = _by_render(self.light[..., gate])
@@ -241,7 +241,7 @@ class ImageTrial:
 
     @cached_property
     def products(self) -> FilterProducts:
-        """Scalar products of each gate."""
+        """Scalar products for each gate."""
         found, thirds = [], []
         for one in self.images():
             size = one.vectors.shape[-1]
@@ -251,11 +251,11 @@ class ImageTrial:
         return FilterProducts(self.seas, np.moveaxis(np.array(found), 0, 1), np.transpose(thirds))
 
     def maps(self, frames: int) -> dict[str, FloatArray]:
-        """Return what the camera sees in each pixel and gate, shape (*pixels, gate), of one frame.
+        """Return the camera's maps over pixels and gates, shape (*pixels, gate), for one frame.
 
-        ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for a number of
-        frames, ``snr`` and probability of ``saturation`` of the light with the target, ``contrast`` of the target (NaN
-        without light), and ``contrast_to_noise`` with its standard error over the renders.
+        The maps are ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for
+        a number of frames, ``snr`` and the probability of ``saturation`` of the light with the target. Also the
+        target's ``contrast`` (NaN without light), and ``contrast_to_noise`` with its standard error over the renders.
         """
         renders = range(self.light.shape[1])
         coefficients, found = self.products.coefficients(frames, renders), []
@@ -291,7 +291,7 @@ def _without_and_with(values: FloatArray) -> FloatArray:
 
 
 def detected(products: FilterProducts, frames: Sequence[int], pfa: float, pd: float) -> Variables:
-    """Return the probability of detection for numbers of frames, and the number that the required one needs.
+    """Return the detection probability for numbers of frames, and the number that the required one needs.
 
     Variables with limits: ``detection`` over ``frames``, and ``frames_needed``, infinite if none of these is enough.
     """
@@ -320,7 +320,7 @@ def detected(products: FilterProducts, frames: Sequence[int], pfa: float, pd: fl
 def single_gates(trial: ImageTrial, counts: Sequence[int], apart: int, frames: int, pfa: float) -> Variables:
     """Return the detection with the images of one gate alone, as it is and as wide as several gates that adjoin.
 
-    ``gate_detection`` and ``gate_deflection`` are over ``adjoining`` (`counts`, of gates `apart` steps from each other)
+    ``gate_detection`` and ``gate_deflection`` are over ``adjoining`` (`counts`, gates `apart` steps from each other)
     and ``gate``, the first of them; NaN where the train ends before the last.
     """
     table = np.full((2, len(counts), trial.light.shape[-1]), np.nan)

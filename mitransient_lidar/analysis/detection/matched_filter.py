@@ -1,8 +1,8 @@
-"""Time of a known echo of unknown height in noisy samples: the matched filter, and the lower bound of its error.
+"""Time of a known echo with unknown height in noisy samples: the matched filter, and the lower bound of its error.
 
-The arguments are ``samples`` (records less the background, shape (shots, samples)), ``templates`` (the echo at delays,
-shape (delays, samples)), ``delays_ns`` (in equal steps [ns], at least three) and the positive definite ``covariance``
-of the noise, shape (samples, samples).
+The arguments ``samples`` are records minus the background, shape (shots, samples), and ``templates`` the echo at
+delays, shape (delays, samples). ``delays_ns`` are at least three equal steps [ns]. The noise ``covariance``, shape
+(samples, samples), is positive definite.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from mitransient_lidar.core.validation import FloatArray
 
 
 def delays(samples: FloatArray, templates: FloatArray, delays_ns: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the delays [ns] of echoes of unknown height with the largest likelihood, shape (shots,).
+    """Return the most likely delays [ns] of echoes with unknown height, shape (shots,).
 
     Notes
     -----
-    The maximum of (x C^-1 s)/sqrt(s C^-1 s) over delays is that of the likelihood with the height fitted, for normal
-    noise (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 2, 1998, section 7.4.2). It is interpolated
-    by a parabola through the best delay and its neighbours, within `delays_ns`.
+    The maximum of (x C^-1 s)/sqrt(s C^-1 s) over delays equals the likelihood's maximum with the height fitted, for
+    normal noise (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 2, 1998, section 7.4.2). It is
+    interpolated by a parabola through the best delay and its neighbours, within `delays_ns`.
     """
     step = float(delays_ns[1] - delays_ns[0])
     filters = _solved(covariance, templates.T)
@@ -33,7 +33,7 @@ def delays(samples: FloatArray, templates: FloatArray, delays_ns: FloatArray, co
 
 
 def delay_bound(templates: FloatArray, delays_ns: FloatArray, covariance: FloatArray) -> float:
-    """Return the smallest standard deviation [ns] of an unbiased time of the middle template of unknown height.
+    """Return the smallest standard deviation [ns] of an unbiased time for the middle template with unknown height.
 
     Notes
     -----
@@ -48,7 +48,7 @@ def delay_bound(templates: FloatArray, delays_ns: FloatArray, covariance: FloatA
 
 
 def _solved(covariance: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the inverse of the covariance times `right`."""
+    """Return the covariance's inverse times `right`."""
     try:
         return np.asarray(np.linalg.solve(covariance, right))
     except np.linalg.LinAlgError:

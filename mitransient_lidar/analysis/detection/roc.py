@@ -11,7 +11,7 @@ from mitransient_lidar.core.validation import FloatArray
 
 
 class Rates(NamedTuple):
-    """Fractions of trials, and the limits of their confidence intervals; arrays of one shape."""
+    """Fractions of trials, and the limits of their confidence intervals; arrays with one shape."""
 
     rate: FloatArray
     low: FloatArray
@@ -33,7 +33,7 @@ def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.
     Notes
     -----
     C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), doi:10.1093/biomet/26.4.404: exact and conservative, so
-    that `confidence` is the smallest coverage probability. The limits are quantiles of beta distributions.
+    that `confidence` is the smallest coverage probability. The limits are beta distribution quantiles.
     """
     from scipy.special import betaincinv
 
@@ -46,8 +46,8 @@ def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.
 def exceedance(values: npt.ArrayLike, thresholds: npt.ArrayLike, confidence: float = 0.95) -> Rates:
     """Return the rates of values, shape (trials,), above thresholds, in the shape of `thresholds`.
 
-    For shots without a target these are probabilities of false alarm, with a target those of detection; both for one
-    threshold are a point of the receiver operating characteristic. The thresholds must not depend on the values;
+    For shots without a target these are false alarm probabilities, with a target detection probabilities; both at one
+    threshold are a point on the receiver operating characteristic. The thresholds must not depend on the values;
     otherwise the intervals of `binomial_rates` are too narrow.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
@@ -62,10 +62,10 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
 
     Notes
     -----
-    The standard error is that of E. R. DeLong, D. M. DeLong and D. L. Clarke-Pearson, Biometrics 44, 837 (1988),
-    doi:10.2307/2531595, equation 5 for one curve. The interval is normal in the logit of the area and thus below 1. If
-    all pairs are separated, the standard error is 0 and the lower limit is the area at which as many pairs of
-    independent shots would all be separated with a probability of 1 - confidence.
+    The standard error follows E. R. DeLong, D. M. DeLong and D. L. Clarke-Pearson, Biometrics 44, 837 (1988),
+    doi:10.2307/2531595, equation 5 for one curve. The interval is normal in the area's logit and thus below 1. If all
+    pairs are separated, the standard error is 0. The lower limit is then the area at which as many pairs of independent
+    shots would all be separated with a probability of 1 - confidence.
     """
     from scipy.special import ndtri
     from scipy.stats import rankdata
@@ -73,7 +73,7 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
     without, with_target = np.asarray(null, dtype=np.float64), np.asarray(target, dtype=np.float64)
     n, m, tail = without.size, with_target.size, (1 - confidence) / 2
     ranks = rankdata(np.concatenate([without, with_target]))
-    # For each shot, the fraction of the shots of the other kind on the correct side of it.
+    # For each shot, the fraction of the other kind's shots on the correct side of it.
     above = (ranks[n:] - rankdata(with_target)) / n
     below = 1 - (ranks[:n] - rankdata(without)) / m
     value = float(np.mean(above))

@@ -1,4 +1,4 @@
-"""Detection of a known echo in noise and clutter by the best weighted sum of samples."""
+"""Detection of a known echo in noise and clutter by the best weighted sample sum."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SYMMETRIC = 1e-6  # least skewness that counts
 
 
 class ShotMoments(NamedTuple):
-    """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of the samples of a shot."""
+    """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of a shot's samples."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -26,21 +26,21 @@ class ShotMoments(NamedTuple):
 def sample_moments(
     chain: ReceiverChain, power: npt.ArrayLike, bin_width_ns: float, samples: slice, background: npt.ArrayLike = 0.0
 ) -> ShotMoments:
-    """Return mean and covariance of some samples of a shot in closed form, in `chain.units` and their square.
+    """Return mean and covariance of some samples in a shot in closed form, in `chain.units` and their square.
 
-    The arguments are those of `ReceiverChain.expected`, and the indices of the samples, without a step.
+    Arguments as for `ReceiverChain.expected`, plus the sample indices, without a step.
 
     Notes
     -----
-    Mean and variance are those of `ReceiverChain.expected`. The correlation of samples is that of charge and noise
-    after the low-pass, which a logarithm changes little; rounding errors are assumed independent.
+    Mean and variance come from `ReceiverChain.expected`. Samples are correlated like charge and noise after the
+    low-pass, which a logarithm changes little; rounding errors are assumed independent.
     """
     expected = chain.expected(power, bin_width_ns, background)
     chosen = range(*samples.indices(expected.mean.shape[-1]))
     light = np.asarray(power, dtype=np.float64)
     sky = np.broadcast_to(np.asarray(background, dtype=np.float64), light.shape[:-1])
     stride, low_pass = chain.stride(bin_width_ns), chain.low_pass(bin_width_ns)
-    # Covariance of the charges in the parts of bins that the samples depend on, and weights of them in each sample.
+    # Covariance of the charges in the bin parts on which the samples depend, and their weights in each sample.
     rows = stride * low_pass.parts * (np.array(chosen) - chosen[0])
     reach, begin = int(rows[-1]) + low_pass.weights.size, low_pass.start + stride * low_pass.parts * chosen[0]
     part = bin_width_ns / low_pass.parts
@@ -75,20 +75,20 @@ def within_range(
 ) -> ReceiverChain:
     """Return the chain with the transimpedance reduced, if necessary, for samples in the range of its electronics.
 
-    The arguments are those of `sample_moments`, and the range that of `ReceiverChain.fitting_gain`; other samples, such
-    as a surface echo, may be clipped.
+    Arguments as for `sample_moments`, and the range as for `ReceiverChain.fitting_gain`; other samples, such as a
+    surface echo, may be clipped.
     """
     gain = chain.fitting_gain(power, bin_width_ns, background, samples)
     return chain if gain == 1 else chain.with_gain(gain)
 
 
 class Statistic(NamedTuple):
-    """A weighted sum of samples, and its distribution without and with the target.
+    """A weighted sample sum, and its distribution without and with the target.
 
-    Weights of the samples, shape (cases, samples), offsets that are subtracted from their sums, shape (cases,), and
-    means, standard deviations and skewnesses over shots and cases. The weighted sum has a Pearson distribution of type
-    III with these moments, the normal one without skewness, by the cube root of E. B. Wilson and M. M. Hilferty, Proc.
-    Natl. Acad. Sci. 17, 684 (1931), doi:10.1073/pnas.17.12.684.
+    Sample weights, shape (cases, samples), offsets that are subtracted from their sums, shape (cases,), and means,
+    standard deviations and skewnesses over shots and cases. The weighted sum has a Pearson distribution of type III
+    with these moments, normal without skewness, by the cube root of E. B. Wilson and M. M. Hilferty, Proc. Natl. Acad.
+    Sci. 17, 684 (1931), doi:10.1073/pnas.17.12.684.
     """
 
     weights: FloatArray
@@ -112,11 +112,11 @@ class Statistic(NamedTuple):
         return np.asarray(self.null_mean + self.null_sd * _skewed(-ndtri(false_alarm), self.null_skewness))
 
     def quantile(self, false_alarm: npt.ArrayLike) -> FloatArray:
-        """Return the quantile of the normal distribution that has the probability of detection."""
+        """Return the normal quantile whose probability is the detection probability."""
         return -_normal((self.threshold(false_alarm) - self.target_mean) / self.target_sd, self.target_skewness)
 
     def detection(self, false_alarm: npt.ArrayLike) -> FloatArray:
-        """Return the probability of detection at a probability of false alarm, above 0 and below 1."""
+        """Return the detection probability at a false alarm probability, above 0 and below 1."""
         from scipy.special import ndtr
 
         return np.asarray(ndtr(self.quantile(false_alarm)))
@@ -129,7 +129,7 @@ class Statistic(NamedTuple):
 
 
 def _skewed(quantile: npt.ArrayLike, skewness: float) -> FloatArray:
-    """Return the value, of mean 0 and deviation 1, of a skewed distribution at a quantile of the normal one."""
+    """Return the value, with mean 0 and deviation 1, of a skewed distribution at a normal quantile."""
     if abs(skewness) < _SYMMETRIC:
         return np.asarray(quantile, np.float64)
     share = skewness / 6
@@ -137,7 +137,7 @@ def _skewed(quantile: npt.ArrayLike, skewness: float) -> FloatArray:
 
 
 def _normal(value: npt.ArrayLike, skewness: float) -> FloatArray:
-    """Return the quantile of the normal distribution at a value of a skewed one; the inverse of `_skewed`."""
+    """Return the normal quantile at a value of a skewed distribution; the inverse of `_skewed`."""
     if abs(skewness) < _SYMMETRIC:
         return np.asarray(value, np.float64)
     share = skewness / 6
@@ -151,7 +151,7 @@ class Cases:
     Parameters
     ----------
     null_mean, target_mean, null_covariance, target_covariance : ndarray
-        Mean over the shots of each case, shape (cases, samples), and covariance of the receiver's noise, shape (cases,
+        Mean over each case's shots, shape (cases, samples), and covariance of the receiver's noise, shape (cases,
         samples, samples).
     detectors : int
         Number of detectors, each with an equal, contiguous part of the samples.
@@ -184,11 +184,11 @@ class Cases:
         return np.asarray((self.target_mean - self.null_mean).mean(axis=0))
 
     def covariance(self, with_target: bool = False) -> FloatArray:
-        """Return the covariance for the independent weights of each detector, shape (samples, samples).
+        """Return the covariance for each detector's independent weights, shape (samples, samples).
 
-        It is that of the noise, with the target or else the mean of that without and with it. For several cases it
-        includes, for each detector, the strongest principal component of its samples without the target: mostly the
-        level of the backscatter.
+        It is the noise covariance, with the target or else the mean without and with it. For several cases it includes,
+        for each detector, the strongest principal component of its samples without the target: mostly the backscatter
+        level.
         """
         covariance = self.target_covariance.mean(axis=0)
         if not with_target:
@@ -202,7 +202,7 @@ class Cases:
         return np.asarray(covariance)
 
     def weights(self) -> FloatArray:
-        """Return the best weights of the samples, shape (samples,), scaled as those of `matched_weights`."""
+        """Return the best sample weights, shape (samples,), scaled as by `matched_weights`."""
         rise, covariance = self.rise(), self.covariance()
         if len(self.null_mean) == 1:
             return matched_weights(rise, covariance)
@@ -216,9 +216,9 @@ class Cases:
     def statistic(self) -> Statistic:
         """Return the best weighted sum of the samples, and its distribution.
 
-        One case is weighted for its noise alone; at least three for noise and clutter, with the weights of each case
-        estimated from the others. Since few seas do not determine a weight for every sample, the samples of each
-        detector are weighted for its noise and the strongest component of its clutter, and then the detectors for noise
+        One case is weighted for its noise alone; at least three for noise and clutter, with each case's weights
+        estimated from the others. Few seas do not determine a weight for every sample. Each detector's samples are
+        therefore weighted for its noise and the strongest component of its clutter, and then the detectors for noise
         and their common clutter.
 
         Raises
@@ -257,9 +257,9 @@ class Cases:
 
 
 def matched_weights(signal: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return C^-1 s / (s C^-1 s), the weights of the matched filter of a signal s with noise of the covariance C.
+    """Return C^-1 s / (s C^-1 s), the matched filter weights for a signal s in noise with covariance C.
 
-    The weights of samples without variance are 0. Without a signal in the samples with noise, `UserError` is raised.
+    Samples without variance have weight 0. Without a signal in the samples with noise, `UserError` is raised.
     """
     filtered = _solved(covariance, signal)
     square = float(signal @ filtered)
@@ -272,7 +272,7 @@ def _solved(covariance: FloatArray, signal: FloatArray) -> FloatArray:
     """Return the inverse of the covariance times the signal, 0 without variance."""
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
     noisy = np.flatnonzero(deviation > 0)
-    # In units of the standard deviations, which may differ by orders of magnitude.
+    # In standard deviations, which may differ by orders of magnitude.
     correlation = covariance[np.ix_(noisy, noisy)] / np.outer(deviation[noisy], deviation[noisy])
     found = np.zeros_like(signal)
     try:
@@ -287,9 +287,9 @@ def clutter_covariance(values: FloatArray) -> FloatArray:
 
     Notes
     -----
-    J. Schaefer and K. Strimmer, Stat. Appl. Genet. Mol. Biol. 4, 32 (2005), doi:10.2202/1544-6115.1175, table 2,
-    target D with unequal variances: the shrinkage is the estimated variance of the correlations over their sum of
-    squares. With few cases, the sample covariance is singular, and weights would ignore the clutter in its null space.
+    J. Schaefer and K. Strimmer, Stat. Appl. Genet. Mol. Biol. 4, 32 (2005), doi:10.2202/1544-6115.1175, table 2, target
+    D with unequal variances: the shrinkage is the correlations' estimated variance over their sum of squares. With few
+    cases, the sample covariance is singular, and weights would ignore the clutter in its null space.
     """
     n = len(values)
     deviation = values.std(axis=0, ddof=1)

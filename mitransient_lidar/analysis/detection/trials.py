@@ -1,6 +1,6 @@
 """Performance of target detection by a receiver, in closed form and from random shots.
 
-The functions return variables of the dataset of `studies.detection.detect`.
+The functions return variables for the dataset of `studies.detection.detect`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
 Variables = dict[str, Any]
 
-#: Combinations of pixels: one detector for all pixels, and three combinations of the signals of one detector per pixel.
+#: Pixel combinations: one detector for all pixels, and three combinations of the signals from one detector per pixel.
 COMBINATIONS = ("single", "sum", "brightest", "best")
 
 #: Half widths of the gate about the target's echo, and of the search for its time, in pulse widths.
@@ -33,19 +33,19 @@ HALF_GATE, HALF_SEARCH = 1.5, 0.8
 CONFIDENCE = 0.95
 
 _LEVELS = (1e-8, 1e4)  # smallest and largest fraction of the target's signal, or of the pulse energy
-_DELAYS = 41  # of the matched filter
-_GROUPS, MOST_GROUPS = 20, 10  # jackknife groups of shots of one scene, and largest number of groups of renders
+_DELAYS = 41  # in the matched filter
+_GROUPS, MOST_GROUPS = 20, 10  # jackknife groups of shots in one scene, and largest number of groups of renders
 
 
 @dataclass(frozen=True)
 class Level:
-    """Logarithm of the level of the required detection, and its changes when groups of renders are left out."""
+    """Logarithm of the level for the required detection, and its changes when groups of renders are left out."""
 
     log: float
     changes: FloatArray
 
     def limits(self, other: Level | None = None) -> tuple[float, float, float]:
-        """Return the level, or the ratio of another level to it, and the limits of its confidence interval."""
+        """Return the level, or another level's ratio to it, and the limits of its confidence interval."""
         log, changes = self.log, self.changes
         if other is not None:
             log, changes = other.log - log, other.changes - changes
@@ -55,11 +55,11 @@ class Level:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Mean light of a scene on its pixels, and the receiver that records it.
+    """A scene's mean light on its pixels, and the receiver that records it.
 
-    `background` and `difference` are the power without the target, and that added by the target [W], shape (renders,
-    pixels, time), from different `seas` or one. `sky` is the steady power on each pixel [W], `samples` are those about
-    the target's echo, and `brightest` is the index of the pixel with the strongest echo.
+    `background` and `difference` are the power without the target, and the power that the target adds [W], shape
+    (renders, pixels, time), from different `seas` or one. `sky` is the steady power on each pixel [W], `samples` are
+    the samples about the target's echo, and `brightest` is the index of the pixel with the strongest echo.
     """
 
     background: FloatArray
@@ -73,13 +73,13 @@ class Experiment:
 
     @property
     def groups(self) -> int:
-        """Number of groups of renders for the jackknife."""
+        """Number of render groups for the jackknife."""
         return min(len(self.background), MOST_GROUPS)
 
     def light(self, share: float, energy: float, left_out: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Return powers [W] without and with a fraction of the target's signal, shape (cases, pixels, time).
 
-        The group of renders `left_out` is excluded.
+        The render group `left_out` is excluded.
         """
         numbers = np.arange(len(self.background))
         kept = numbers if left_out is None else np.setdiff1d(numbers, np.array_split(numbers, self.groups)[left_out])
@@ -106,7 +106,7 @@ class Experiment:
         return chain.amplifier.transimpedance_ohm / self.chain.amplifier.transimpedance_ohm
 
     def cases(self, name: str | int, share: float, energy: float, left_out: int | None = None) -> Cases:
-        """Return the samples of a combination, or those of the pixel of an index alone."""
+        """Return a combination's samples, or the samples of one pixel by index."""
         single = name == "single"
         pair = self.light(share, energy, left_out)
         chain = self.ranged(single, np.maximum(*pair))
@@ -124,7 +124,7 @@ class Experiment:
         return Cases(found[0], found[1], found[2], found[3], detectors).combined(matrix, len(matrix) // samples)
 
     def matrix(self, name: str | int) -> FloatArray:
-        """Return the matrix from the samples of all detectors to those of a combination or of a pixel."""
+        """Return the matrix from all detectors' samples to a combination's or a pixel's."""
         pixels, samples = self.background.shape[1], self.samples.stop - self.samples.start
         weights: dict[str | int, FloatArray] = {
             "single": np.ones((1, 1)),
@@ -143,7 +143,7 @@ class Experiment:
         return signal.reshape(*signal.shape[:2], -1).astype(np.float64)
 
     def needed(self, name: str, kind: str, pfa: float, pd: float) -> Level:
-        """Return the fraction of the target's signal, or of the pulse energy, of the required detection."""
+        """Return the fraction of the target's signal, or of the pulse energy, for the required detection."""
         from scipy.optimize import brentq
         from scipy.special import ndtri
 
@@ -178,7 +178,7 @@ def needs(trial: Experiment, pfa: float, pd: float) -> Variables:
 
 
 def detected(trial: Experiment, pfa: float) -> Variables:
-    """Return the probability of detecting the full signal at a probability of false alarm, combined and by pixel.
+    """Return the probability of detecting the full signal at a false alarm probability, combined and by pixel.
 
     A detector that does not see the target raises only false alarms.
     """
@@ -203,7 +203,7 @@ def detected(trial: Experiment, pfa: float) -> Variables:
 
 
 def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) -> Variables:
-    """Return rates of random shots with a fraction of the target's signal, and those of the closed form."""
+    """Return rates for random shots with a fraction of the target's signal, and the closed-form rates."""
     count = len(trial.background) if trial.seas else 1
     nominal = np.union1d(np.logspace(math.log10(min(1e-4, pfa / 3)), -0.05, 80), pfa)
     pair = trial.light(share, 1)
@@ -242,7 +242,7 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
 
 
 def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float, metres_per_ns: float) -> Variables:
-    """Return bias and spread of the depth of the full echo, from the time of the matched filter."""
+    """Return bias and spread of the full echo's depth, from the time by the matched filter."""
     steps = HALF_SEARCH * pulse_fwhm_ns * np.linspace(-1, 1, _DELAYS)
     background, target = trial.light(1, 1)
     count = len(background)

@@ -1,4 +1,4 @@
-"""Gates cut from the waveforms of a result."""
+"""Gates cut from a result's waveforms."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
 
     Notes
     -----
-    The energy of a gate is the sum of the mean power times bin width times the exact mean of the gate over the bin. The
-    errors of bins are correlated: the standard error follows from those of the bins and their ``error_correlation``,
-    measured over the passes of the render. Without it, as in a result from an EXR file, it is the quadrature sum times
-    the median inflation of the error of a sum over as many bins (attributes ``error_inflation_bins`` and
-    ``error_inflation``; linear in the logarithm of the number of bins, and beyond the last one proportional to the
-    square root), and at most the sum of the errors, which is used if nothing is known. A gate with weights w is
-    equivalent to (sum w)^2 / sum w^2 bins. Derivatives of a result are cut in the same way, with the correlation of the
-    waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too. For gates that are narrower
-    than the bins a warning states the largest error, `GateTrain.cutting_error`; those of a film are exact.
+    A gate's energy is the sum over bins of mean power times bin width times the gate's exact mean over the bin. The
+    errors of bins are correlated: the standard error follows from bin errors and their ``error_correlation``, measured
+    over the render's passes. Without it, as in a result from an EXR file, it is the quadrature sum times the median
+    error inflation for a sum over as many bins. The attributes ``error_inflation_bins`` and ``error_inflation`` give
+    the inflation: linear in the logarithm of the number of bins, and beyond the last one proportional to the square
+    root. The error is at most the sum of the errors, which is used if nothing is known. A gate with weights w is
+    equivalent to (sum w)^2 / sum w^2 bins. Derivatives in a result are cut in the same way, with the waveform's
+    correlation: ``gate_energy_derivative`` and its standard error, over ``parameter`` too. For gates that are narrower
+    than the bins a warning states the largest error, `GateTrain.cutting_error`; gates in a film are exact.
     """
     dataset = results.dataset_of("dataset", dataset, "waveforms")
     if "waveform_stderr" not in dataset:
@@ -52,7 +52,7 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     if errors is None:
         _LOG.info("the result has no error_inflation: the errors of the gates are upper bounds")
     energy, stderr = _cut(dataset, "waveform", dims, train, errors)
-    # Gates of the result itself are replaced.
+    # The result's own gates are replaced.
     coords = {name: one for name, one in dataset.coords.items() if "gate" not in one.dims}
     stack = build_gates(energy, stderr, train, coords=coords, attributes=dataset.attrs)
     if "waveform_derivative" not in dataset:
@@ -61,7 +61,7 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
 
 
 def _warn_of_narrow_gates(train: GateTrain, attributes: Mapping[str, Any], bin_width_ns: float) -> None:
-    """Warn of gates that are narrower than the bins."""
+    """Warn about gates that are narrower than the bins."""
     if train.width_ns >= bin_width_ns:
         return
     response = optional_number(attributes, "response_time_ns") or 0.0

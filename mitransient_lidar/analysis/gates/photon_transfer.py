@@ -17,7 +17,7 @@ _SATURATION = 1e-6  # largest probability of a saturated frame
 
 
 class PhotonTransfer(NamedTuple):
-    """Variance of frames against their mean at levels of light, and the line through them."""
+    """Frame variance against frame mean at light levels, and the line through them."""
 
     mean: FloatArray  #: Mean of the pixels at each level, less their levels without light [DN], shape (level,).
     variance: FloatArray  #: Mean variance over the frames [DN^2], shape (level,).
@@ -29,11 +29,11 @@ class PhotonTransfer(NamedTuple):
 
 
 def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
-    """Return the photon transfer of frames of `analysis.receiver.detect_waveforms`, without saturated pixels.
+    """Return the photon transfer of frames from `analysis.receiver.detect_waveforms`, without saturated pixels.
 
-    Pixels are sorted into levels by the mean of the first half of the frames; means and variances are those of the
-    second half, without which the sorting would change them. The relation is a line where each pixel has its own light:
-    behind an intensifier, for light that changes little over its blur; of a photon counter, for few counts.
+    Pixels are sorted into levels by their mean in the first half of the frames; means and variances come from the
+    second half, as sorting would bias the first. The relation is a line where each pixel has its own light: with an
+    intensifier, for light that changes little over its blur; in a photon counter, for few counts.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ _BLOCK = 8192  # pixels computed at once
 
 
 class RangeImage(NamedTuple):
-    """Depth of the echo in every pixel: centroid and standard error, in the unit of the gates' middles.
+    """Echo depth in every pixel: centroid and standard error, in the unit of the gates' middles.
 
     They are NaN where no gate exceeds the column. `confidence` is the probability, 0 to 1, that noise alone would not
     exceed the column as much.
@@ -37,11 +37,11 @@ class RangeImage(NamedTuple):
 
 
 class DepthImage(NamedTuple):
-    """Depth of the echo in every pixel below the mean sea level [m], with two errors, and confidence.
+    """Echo depth in every pixel below the mean sea level [m], with two errors, and confidence.
 
     `sigma` is the standard error by noise. `method_error` is the typical error by scattering, by the light's
-    distribution in the pixel and by waves, of `depth_errors.DepthErrors`; NaN without the geometry of the lidar. Both
-    are NaN where no gate exceeds the column. `confidence` is that of `RangeImage`.
+    distribution in the pixel and by waves, from `depth_errors.DepthErrors`; NaN without the lidar geometry. Both are
+    NaN where no gate exceeds the column. `confidence` is as in `RangeImage`.
     """
 
     depth: FloatArray
@@ -53,7 +53,7 @@ class DepthImage(NamedTuple):
 def range_from_gates(
     energy: npt.ArrayLike, stderr: npt.ArrayLike, gate_mid: npt.ArrayLike, *, reach: int | None = None
 ) -> RangeImage:
-    """Find the echo of every pixel above the backscatter of the water column.
+    """Find every pixel's echo above the water column's backscatter.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ def range_from_gates(
     gate_mid : array_like, shape (gate,)
         Middles of the gates, strictly increasing: depths [m] or times [ns].
     reach : int, optional
-        Largest extent of an echo on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the
-        number of overlapping gates. By default 2, less with fewer than 7 gates.
+        Largest echo extent on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the number of
+        overlapping gates. By default 2, less with fewer than 7 gates.
 
     Returns
     -------
@@ -77,20 +77,19 @@ def range_from_gates(
 
     Notes
     -----
-    Column: the larger of the exponential extrapolated from up to 4 gates before the echo, and of that interpolated
-    between these and the 2 gates behind the echo; behind the echo, at most the level of these 2 gates, since a target
-    may end the column. Energies below their error are replaced by it.
+    Column: the larger of two exponentials. One is extrapolated from up to 4 gates before the echo, the other
+    interpolated between these and the 2 gates after it. After the echo it is at most the level of these 2 gates, since
+    a target may end the column. Energies below their error are replaced by it.
 
-    Echo: the gate with the largest excess over the column, of those that exceed it by 4 standard errors or are at least
-    half as significant as the most significant one, which excludes the noise of the bright column near the surface. The
-    depth is the centroid of the
-    excess within `reach`. Its error assumes independent errors and gates not wider than the pulse; the position of an
-    echo within a wider gate is unknown.
+    Echo: the gate with the largest excess over the column. It must exceed the column by 4 standard errors or be at
+    least half as significant as the most significant gate, which excludes the bright column's noise near the surface.
+    The depth is the centroid of the excess within `reach`. Its error assumes independent errors and gates not wider
+    than the pulse; an echo's position within a wider gate is unknown.
 
-    The confidence is Phi(z)^m for an excess of z standard errors, the largest of m gates.
+    The confidence is Phi(z)^m for an excess of z standard errors, the largest in m gates.
 
-    The first `reach` + 1 gates are only used to estimate the column, behind a single one constant: start the train
-    between surface and target, since a surface echo would be found instead of the target.
+    The first `reach` + 1 gates are only used to estimate the column, which is constant after a single one. Start the
+    train between surface and target, since a surface echo would be found instead of the target.
     """
     e, s = np.asarray(energy, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
     mid = finite_array("gate_mid", gate_mid)
@@ -117,20 +116,20 @@ def range_from_gates(
 
 
 def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
-    """Find the depth of the strongest echo of every pixel in a gate stack, along the pixel's line of sight.
+    """Find the depth of every pixel's strongest echo in a gate stack, along the pixel's line of sight.
 
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack of at least 3 gates, of which the last dimension is ``gate``; or frames of a camera, whose mean
-        above the level without light counts, with the noise of frames and the error of the render.
+        A gate stack with at least 3 gates, whose last dimension is ``gate``; or camera frames, whose mean above the
+        level without light counts, with frame noise and render error.
     reach : int, optional
         As for `range_from_gates`.
 
     Returns
     -------
     DepthImage
-        Arrays of shape (row, column) or (pixel,).
+        Arrays with the shape (row, column) or (pixel,).
 
     Raises
     ------
@@ -140,10 +139,9 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
 
     Notes
     -----
-    The echo is located in time, and its depth follows from `geometry.LinesOfSight`; without the attributes of the
-    geometry, from ``gate_depth`` in all pixels. On the axis of a receiver 20
-    degrees off nadir at 200 m, a pixel 10 mrad farther from nadir receives the same depth 5.2 ns later, 0.55 m on the
-    axis's scale of depth.
+    The echo is located in time, and its depth follows from `geometry.LinesOfSight`; without the geometry attributes,
+    from ``gate_depth`` in all pixels. Take the axis of a receiver 20 degrees off nadir at 200 m: a pixel 10 mrad
+    farther from nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
     """
     stack = dataset_of("stack", stack, "gates", "frames")
     stack = _light_of_frames(stack) if has_frames(stack) else average_frames(stack)
@@ -177,9 +175,9 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
 
 
 def _light_of_frames(frames: xr.Dataset) -> xr.Dataset:
-    """Return the mean of frames as a gate stack, whose errors are those of the noise and of the render [DN]."""
+    """Return the frames' mean as a gate stack, with errors by noise and render [DN]."""
     stack, rendered = as_stack(frames), frames["signal_mean_stderr"]
-    if "frame" in rendered.dims:  # of as many seas
+    if "frame" in rendered.dims:  # on as many seas
         rendered = (rendered**2).mean("frame") ** 0.5 / math.sqrt(frames.sizes["frame"])
     return stack.assign(gate_energy_stderr=(stack["gate_energy_stderr"] ** 2 + rendered**2) ** 0.5)
 
@@ -187,7 +185,7 @@ def _light_of_frames(frames: xr.Dataset) -> xr.Dataset:
 def _column(
     stack: xr.Dataset, found: RangeImage, lines: LinesOfSight, geometry: LidarGeometry, pulse_ns: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the attenuation of the column [1/m] and its power at the surface [W] of the pixels, NaN where unknown.
+    """Return the pixels' column attenuation [1/m] and column power at the surface [W], NaN where unknown.
 
     Single pixels have too little light: an exponential is fitted to the sum of the pixels, in the gates before the
     first echoes. Columns that begin at other times have the same decay.
@@ -207,18 +205,19 @@ def _column(
         return unknown, unknown
     # The sum of the pixels' columns from their surfaces on has this logarithm at time 0.
     gathered = np.log(np.sum(lines.beam_share * np.exp(-slope * (lines.surface_time - middles[0]))))
-    in_joules = stack["gate_energy"].attrs.get("units") != "DN"  # as of frames, whose level is no power
+    in_joules = stack["gate_energy"].attrs.get("units") != "DN"  # as for frames, whose level is no power
     open_s = 1e-9 * float(width[0]) * float(stack.attrs.get("pulses", 1))
     level = math.exp(start + slope * middles[0] - gathered) / open_s if in_joules else math.nan
     return np.full(unknown.size, -0.5 * slope / geometry.metres_per_ns), lines.beam_share * level
 
 
 class _ColumnModel:
-    """Linear maps from the logarithms of a pixel's energies to those of the column in the gate k of an echo.
+    """Linear maps from the logarithms of a pixel's energies to the column's in an echo's gate k.
 
     An echo includes `half` gates on each side of k, which is at least `first`. Columns k of `mean` and `slope` give the
-    line through the gates before the echo, k being `lever` behind their middle; that of `between` the line between the
-    gates before and behind the echo; that of `deep`, applied to energies, the mean of the gates behind, if `has_deep`.
+    line through the gates before the echo, with k `lever` after their middle. Column k of `between` gives the line
+    between the gates before and after the echo. Column k of `deep`, applied to energies, gives the mean of the gates
+    after it, if `has_deep`.
     """
 
     def __init__(self, mid: FloatArray, half: int) -> None:
@@ -244,7 +243,7 @@ class _ColumnModel:
 
 
 def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> FloatArray:
-    """Return depth, sigma and confidence of pixels, shape (3, pixel), from energies of shape (pixel, gate)."""
+    """Return the pixels' depth, sigma and confidence, shape (3, pixel), from energies with the shape (pixel, gate)."""
     from scipy.special import ndtr
 
     known = np.asarray(np.isfinite(energy + stderr).all(axis=1))
@@ -285,7 +284,7 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
         depth = np.sum(weight * place, axis=1) / total
         lever = np.where(inside, place - depth[:, None], 0) / total[:, None]
         variance = np.sum((lever * np.take_along_axis(s, window, 1)) ** 2, axis=1)
-        # The column's error moves all its gates, and that of its slope those more that are farther behind its gates.
+        # The column's error moves all its gates, and its slope error moves gates more that are farther after its gates.
         shift = np.where(limited | (weight == 0), 0, lever * level)
         own, tilt = shift.sum(axis=1, keepdims=True), np.sum(shift * away, axis=1, keepdims=True)
         falls, ends = (np.take_along_axis(one, at_peak, 1) for one in (slope < 0, before < between))

@@ -22,7 +22,7 @@ from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 
-_BLOCK = 2**22  # values of a block of gates that is drawn at once
+_BLOCK = 2**22  # values in a block of gates that is drawn at once
 _DIMMED = ("gate_energy", "gate_energy_stderr", "waveform", "waveform_stderr")  # light behind a filter
 _MOMENTS = ("signal_mean", "signal_deviation", "snr", "saturation", "signal_mean_stderr")
 
@@ -30,16 +30,16 @@ _MOMENTS = ("signal_mean", "signal_deviation", "snr", "saturation", "signal_mean
 def record_gates(
     dataset: xr.Dataset, camera: Camera, frames: int, seed: int, background_power: Any, settings: tuple[Any, Any]
 ) -> xr.Dataset:
-    """Return the frames of a camera for a gate stack, of one sea or with one for each ``frame``.
+    """Return a camera's frames for a gate stack, on one sea or with one for each ``frame``.
 
-    The arguments are those of `analysis.receiver.detect_waveforms`, with gain and optical density as settings.
+    Arguments as for `analysis.receiver.detect_waveforms`, with gain and optical density as settings.
 
     Notes
     -----
-    The jitter of the gates needs the energy at shifted gates: that of the waveforms of the same dataset, or else of
-    the gates before and after one if they follow within the longer of the pulse and the gate's edges. With neither, it
-    is left out, and a warning says so. The mean of a stack that was rendered with jitter has it already. The standard
-    errors of the mean are as if those of all pixels had one sign.
+    Gate jitter needs the energy in shifted gates. It comes from waveforms in the same dataset, or else from the gates
+    before and after one if they follow within the longer of the pulse and the gate's edges. With neither, it is left
+    out, and a warning reports it. The mean of a stack that was rendered with jitter has it already. The standard errors
+    of the mean assume one sign for all pixel errors.
     """
     if "auto" in settings:
         name = ("gain", "optical_density")[settings.index("auto")]
@@ -63,7 +63,7 @@ def record_gates(
 
 
 def _recorded(dataset: xr.Dataset, camera: Camera, frames: int, seed: int, sky: FloatArray) -> xr.Dataset:
-    """Return frames of a gate stack for the power of the daylight on each pixel [W]."""
+    """Return frames for a gate stack with the daylight power on each pixel [W]."""
     energy = dataset["gate_energy"]
     if not (np.isfinite(energy) & (energy >= 0)).all():
         raise UserError(f"gate_energy holds {float(energy.min()):g} J; it must be finite and not negative")
@@ -129,7 +129,7 @@ def describe_frames(recorded: xr.Dataset) -> list[str]:
 
 
 def _shape(dataset: xr.Dataset) -> GateShape:
-    """Return the shape of the gates of a stack."""
+    """Return the shape of a stack's gates."""
     attributes = dataset.attrs
     if "gate_profile" in attributes:
         return GateShape.sampled(attributes["gate_profile_ns"], attributes["gate_profile"])
@@ -160,7 +160,7 @@ def _jittered(dataset: xr.Dataset, camera: Camera, energy: FloatArray) -> tuple[
 def jittered_beside(
     energy: FloatArray, jitter: float, included: float, step: float, longest: float
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the mean energy of gates over a jitter, and its derivative with their time, from the gates beside each.
+    """Return the mean gate energy over a jitter, and its derivative by gate time, from the neighbouring gates.
 
     Without gates that follow within the longer of pulse and edges, it is left out with a warning.
 
@@ -169,9 +169,9 @@ def jittered_beside(
     energy : ndarray
         Energy in the gates, shape (..., gate) [J].
     jitter, included : float
-        Standard deviation of the gates' time, and the part of it that the energy has already [ns].
+        Standard deviation of the gate time, and the part of it that the energy has already [ns].
     step, longest : float
-        Time from gate to gate, and the longest one that tells the energy between them [ns].
+        Time from gate to gate, and the longest one that shows the energy between them [ns].
 
     Returns
     -------
@@ -193,13 +193,13 @@ def jittered_beside(
 def _moments(
     energy: FloatArray, before: FloatArray, after: FloatArray, apart: float, jitter: float, included: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and derivative of the energy with the gates' time, from that of gates `apart` before and after."""
+    """Return mean and derivative of the energy with respect to gate time, from gates `apart` before and after."""
     mean = energy + 0.5 * (jitter**2 - included**2) / apart**2 * (before + after - 2 * energy)
     return np.maximum(mean, 0), (after - before) / (2 * apart)
 
 
 def _warn(dataset: xr.Dataset, camera: Camera) -> None:
-    """Warn of gates that the camera does not open, and of blur that is left out."""
+    """Warn about gates that the camera does not open, and about blur that is left out."""
     start, width = float(dataset["gate_start"].min()), float(dataset["gate_width"].min())
     if start < camera.insertion_delay_ns:
         text = "the first gate opens at %g ns, before the insertion delay of %g ns"
@@ -231,7 +231,7 @@ def powers_of(of_pixels: xr.DataArray, power: npt.ArrayLike | xr.DataArray, dims
 
 
 def parameters_of(name: str, part: Any) -> Mapping[str, int | float | str | list[float]]:
-    """Return the parameters of a stage and of its nested stages as attributes; None and () are left out."""
+    """Return the parameters of a stage and its nested stages as attributes; None and () are left out."""
     found: dict[str, int | float | str | list[float]] = {}
     if is_dataclass(part):
         if name != "receiver":
@@ -241,7 +241,7 @@ def parameters_of(name: str, part: Any) -> Mapping[str, int | float | str | list
     elif isinstance(part, bool):
         found[name] = int(part)
     elif isinstance(part, tuple) and part and isinstance(part[0], tuple):
-        # A measured response; the record holds that of its bins.
+        # A measured response; the record contains its bin values.
         found[name] = f"{len(part[0])} samples, {part[0][0]:g} to {part[0][-1]:g} ns"
     elif isinstance(part, tuple):
         found |= {name: list(part)} if part else {}

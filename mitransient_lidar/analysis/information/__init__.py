@@ -1,1 +1,1 @@
-"""Information of records about the parameters of a scene: bounds of errors, and fits."""
+"""Information in records about scene parameters: error bounds, and fits."""

@@ -1,4 +1,4 @@
-"""Differences of a model and waveforms that are fitted, and the time of a waveform within a record."""
+"""Differences between a model and fitted waveforms, and the time of a waveform within a record."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from mitransient_lidar.core.validation import FloatArray
 
 _COMPRESSED = 0.02  # of the largest sample, above which a logarithm is compared
 _LEAST_OVERLAP = 0.5  # share of a model's energy that lies within the record
-_BRIGHT = 1e-3  # of the largest sample of a pixel, above which it has light: the bottom's is far below the surface's
-_MOST_LAGS = 64  # of an estimated correlation, in samples
+_BRIGHT = 1e-3  # of a pixel's largest sample, above which it has light: the bottom's is far below the surface's
+_MOST_LAGS = 64  # in an estimated correlation, in samples
 
 
 class Misfit(NamedTuple):
-    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
+    """Differences between model and waveforms, whose squares are added up: 0 for samples with weight 0.
 
-    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening). With `blur` they are
-    those of both after a Gaussian filter, so that echoes agree partly before they coincide.
+    Differences between values, or with `softening` between logarithms of samples above it: asinh(value/softening). With
+    `blur` both are filtered by a Gaussian, so that echoes agree partly before they coincide.
     """
 
     weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
@@ -34,7 +34,7 @@ class Misfit(NamedTuple):
         return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
 
     def slopes(self, mean: FloatArray, derivative: FloatArray) -> FloatArray:
-        """Return the derivatives of the differences for those of the mean, shape (parameter, pixel, time)."""
+        """Return the differences' derivatives from the mean's derivatives, shape (parameter, pixel, time)."""
         if self.softening is None:
             return np.asarray(self.weights * self.blurred(derivative))
         return np.asarray(self.weights / np.hypot(self.blurred(mean), self.softening) * self.blurred(derivative))
@@ -50,11 +50,11 @@ class Misfit(NamedTuple):
 
 
 def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, mean: FloatArray) -> float:
-    """Return the time [ns] that waveforms are later than a model, whose light is searched for in the whole record.
+    """Return the time [ns] by which waveforms are later than a model, whose light is searched for in the whole record.
 
-    At this time the squared difference of compressed samples, asinh(value / 2 % of the largest), is least over the
-    record, with a scale of their own and a model that is dark outside its own record. The column and faint echoes
-    count beside the surface echo.
+    At this time the squared difference between compressed samples, asinh(value / 2 % of the largest), is least over the
+    record. The samples have a scale of their own, and the model is dark outside its own record. The column and faint
+    echoes count beside the surface echo.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def light_duration(times: FloatArray, mean: FloatArray) -> float:
 def residual_correlation(residuals: FloatArray) -> FloatArray:
     """Return the correlation of residuals, shape (pixel, time), by their distance, up to the first insignificant one.
 
-    It holds the correlation of unknown noise and what neighbours share of a misfit.
+    It contains the correlation of unknown noise and the misfit that neighbours share.
     """
     total, count = float(np.sum(residuals**2)), max(int(np.count_nonzero(residuals)), 1)
     found = [1.0]
@@ -98,6 +98,6 @@ def residual_correlation(residuals: FloatArray) -> FloatArray:
 
 
 def _compressed(values: FloatArray) -> FloatArray:
-    """Return the compressed samples of a row."""
+    """Return a row's compressed samples."""
     level = max(_COMPRESSED * float(np.max(values, initial=0.0)), 1e-300)
     return np.asarray(np.arcsinh(values / level))

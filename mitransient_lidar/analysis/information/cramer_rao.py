@@ -9,40 +9,40 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 
-#: Eigenvalue of the matrix of unit diagonal below which parameters cannot be told apart.
+#: Eigenvalue of the unit-diagonal matrix below which parameters are indistinguishable.
 SINGULAR = 1e-8
-#: Correlation of two estimates above which they are named.
+#: Correlation between two estimates above which they are named.
 CORRELATED = 0.999
 
 _INVOLVED = 1e-3  # component of an eigenvector from which on a parameter belongs to it
 
 
 class Bounds(NamedTuple):
-    """Cramer-Rao bounds of unbiased estimates, in the units of the parameters."""
+    """Cramer-Rao bounds of unbiased estimates, in the parameters' units."""
 
     bound: FloatArray  #: Standard deviation with all parameters unknown, shape (parameter,); infinite without one.
     bound_known: FloatArray  #: With all other parameters known.
-    correlation: FloatArray  #: Of the estimates, shape (parameter, parameter); NaN without a bound.
-    smallest: float  #: Smallest eigenvalue of the matrix of unit diagonal, of the parameters with information.
+    correlation: FloatArray  #: Estimate correlation, shape (parameter, parameter); NaN without a bound.
+    smallest: float  #: Smallest eigenvalue of the unit-diagonal matrix, for the parameters with information.
     remarks: list[str]  #: Sentences on parameters that the record does not determine, or not apart.
 
 
 def bounds(information: FloatArray, names: Sequence[str]) -> Bounds:
-    """Return the Cramer-Rao bounds of a Fisher information matrix.
+    """Return the Cramer-Rao bounds from a Fisher information matrix.
 
     Parameters
     ----------
     information : ndarray, shape (parameter, parameter)
-        Symmetric; an estimate of it may have negative eigenvalues.
+        Symmetric; an estimate may have negative eigenvalues.
     names : sequence of str
-        Names of the parameters, for the remarks.
+        Parameter names, for the remarks.
 
     Notes
     -----
-    The square root of the diagonal of the inverse (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 1,
-    1993, equation 3.20). The matrix is scaled to unit diagonal before it is inverted, so that units do not matter.
-    A parameter without information has an infinite bound, and so have those of an eigenvector whose eigenvalue is below
-    `SINGULAR`, as only other combinations of them are determined; negative eigenvalues come from the noise of a render.
+    The square root of the inverse's diagonal (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 1, 1993,
+    equation 3.20). The matrix is scaled to unit diagonal before it is inverted, so that units do not matter. A
+    parameter without information has an infinite bound. So have the parameters of an eigenvector whose eigenvalue is
+    below `SINGULAR`, as only their other combinations are determined; negative eigenvalues come from render noise.
     """
     count = len(names)
     diagonal = np.diagonal(information)

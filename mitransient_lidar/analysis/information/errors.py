@@ -1,4 +1,4 @@
-"""Errors of fitted parameters, for errors of samples that neighbours share, and the chi-squared of a fit."""
+"""Errors of fitted parameters, for sample errors that neighbours share, and the chi-squared of a fit."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 
-_DEGENERATE = 0.999  # correlation of two parameters above which only one combination of them is known
+_DEGENERATE = 0.999  # correlation between two parameters above which only one combination is known
 _SMOOTHED = 9  # samples over which variances are smoothed
-_TERMS = 20  # of the series of errors by rounding
-#: Said where errors are too small, because nothing tells how those of far samples agree.
+_TERMS = 20  # in the series for rounding errors
+#: Message where errors are too small, because nothing shows the correlation between distant samples.
 NO_BATCHES = (
     "stated errors are too small: errors of a render agree over its whole record, and neither the waveforms nor the "
     "model have batches of passes, which show this"
@@ -27,7 +27,7 @@ _SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combi
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of parameters.
+    """Parameter errors.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Errors:
     by_model
         Standard errors by the Monte Carlo of the model alone, shape (parameter,).
     influence
-        Change of the waveforms per unit of each parameter in standard deviations, shape (parameter,).
+        Waveform change per unit of each parameter in standard deviations, shape (parameter,).
     held
         Whether a parameter is at a bound.
     chi_squared, expected, freedom
@@ -139,7 +139,7 @@ def estimate_errors(
     borrows: bool = False,
     recorded: FloatArray | None = None,
 ) -> Errors:
-    """Return the errors of the solution of a weighted least-squares problem.
+    """Return the errors of a weighted least-squares solution.
 
     Parameters
     ----------
@@ -148,39 +148,39 @@ def estimate_errors(
     derivatives
         Derivatives of the model in standard deviations per unit of each parameter, shape (parameter, pixel, time).
     noise, model
-        Errors of the waveforms and of the Monte Carlo of the model: standard deviations in those of the difference,
-        shape (pixel, time), 0 where a sample is not used, and correlations by the distance in samples, shape (lags,).
+        Errors of the waveforms and of the model's Monte Carlo. Standard deviations are relative to the difference's,
+        shape (pixel, time), 0 where a sample is not used; correlations are by the distance in samples, shape (lags,).
     held
         Parameters at a bound, which are fixed, shape (parameter,).
     scaled
         Whether to multiply the covariance by the reduced chi-squared.
     known_noise
-        Whether the errors of the waveforms are known. If not, all are the same, differences are in the unit of the
-        waveforms, `noise` is 1, and the covariance is multiplied by the reduced chi-squared in any case.
+        Whether the waveform errors are known. If not, all are the same, differences are in the waveforms' unit, `noise`
+        is 1, and the covariance is multiplied by the reduced chi-squared in any case.
     batches
-        Deviations of the batches of passes of waveforms and model, in standard deviations, shape (batch, pixel, time),
-        whose outer products add up to the covariance of the errors; None where there are none.
+        Deviations of the pass batches of waveforms and model, in standard deviations, shape (batch, pixel, time), whose
+        outer products add up to the errors' covariance; None where there are none.
     borrows
-        Whether waveforms without batches are of a render, whose errors agree over its samples as those of the model do:
-        the batches of the model, scaled to the variances of the waveforms, are theirs, too.
+        Whether waveforms without batches come from a render, whose errors are correlated over its samples like the
+        model's. The model's batches, scaled to the waveform variances, then serve the waveforms, too.
     recorded
-        Standard deviations of the render that waveforms are a record of, in those of the difference, shape
-        (pixel, time): errors beside `noise`, with the correlations and batches of the model.
+        Standard deviations of the render that recorded waveforms come from, relative to the difference's, shape (pixel,
+        time): errors beside `noise`, with the model's correlations and batches.
 
     Notes
     -----
-    With the weighted derivatives J and the covariance C of the weighted differences, the covariance of the parameters
-    is (J^T J)^-1 J^T C J (J^T J)^-1, which is (J^T J)^-1 for independent errors. The chi-squared has the mean tr(Q C)
-    and the variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, those of a scaled chi-squared distribution
-    (F. E. Satterthwaite, Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
+    With the weighted derivatives J and the covariance C of the weighted differences, the parameter covariance is (J^T
+    J)^-1 J^T C J (J^T J)^-1. For independent errors this is (J^T J)^-1. The chi-squared has the mean tr(Q C) and the
+    variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, as has a scaled chi-squared distribution (F. E. Satterthwaite,
+    Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
 
-    Errors of bins that are far apart agree, too, since they share paths, and their standard errors from few passes are
-    uncertain. With batches D of passes, J^T C J is therefore J^T D^T D J instead. The inverse of such an estimate with
-    f degrees of freedom, one less than batches, is on average too large by f/(f - P - 1) for P parameters (J. Hartlap,
-    P. Simon and P. Schneider, Astron. Astrophys. 464, 399 (2007), doi:10.1051/0004-6361:20066170). The covariance is
-    multiplied by this, so that the squared distance of estimates from the truth has the mean P. Where the share s of
-    the covariance is from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not used,
-    nor are any for the chi-squared.
+    Errors in distant bins are correlated, too, since they share paths, and their standard errors from few passes are
+    uncertain. With pass batches D, J^T C J is therefore J^T D^T D J instead. The inverse of such an estimate with f
+    degrees of freedom, one less than batches, is on average too large by f/(f - P - 1) for P parameters (J. Hartlap, P.
+    Simon and P. Schneider, Astron. Astrophys. 464, 399 (2007), doi:10.1051/0004-6361:20066170). The covariance is
+    multiplied by this, so that the squared distance between estimates and truth has the mean P. Where the share s of
+    the covariance comes from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not
+    used, nor are any for the chi-squared.
     """
     own, by_render = batches
     if borrows := borrows and own is None and by_render is not None:
@@ -192,7 +192,7 @@ def estimate_errors(
     flat = scaled_derivatives.reshape(count, -1)
     eigenvalues, vectors = np.linalg.eigh(flat @ flat.T)
     inverse = (vectors / np.maximum(eigenvalues, _SMALLEST)) @ vectors.T
-    # Residuals, from which unknown errors are taken, hold those of the model, too.
+    # Residuals, which give unknown errors, include the model's, too.
     kinds, deviations = [noise, model], [own, by_render]
     if recorded is not None:
         kinds.append((recorded, model[1]))
@@ -204,9 +204,9 @@ def estimate_errors(
     known_parts = sum(parts[: len(kinds)], np.zeros_like(inverse))
     widening = _widening(known_parts, [*zip(parts, deviations, strict=True)][: len(kinds)], borrows)
     kept = eigenvalues > _SMALLEST * count
-    # Rounding decides on the sign of what is left in directions without information.
+    # Rounding decides on the sign of the rest in directions without information.
     known_parts += (vectors[:, ~kept] / _SMALLEST) @ vectors[:, ~kept].T
-    # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
+    # The matrices of an orthonormal derivative basis, for the traces of Q C and of Q C Q C.
     basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)
     image = sum((_correlated(basis, *errors) for errors in kinds), np.zeros_like(basis))
     projected = image.reshape(len(basis), -1) @ basis.reshape(len(basis), -1).T
@@ -224,7 +224,7 @@ def estimate_errors(
 
 
 def refusal_of_unknown_noise(unexplained: float) -> str:
-    """Return why a scene that leaves a share of the squares of the samples does not explain them, empty if it does."""
+    """Return why a scene that leaves a share of the samples' squares does not explain them, empty if it does."""
     if unexplained <= WORST_UNEXPLAINED:
         return ""
     return (
@@ -234,7 +234,7 @@ def refusal_of_unknown_noise(unexplained: float) -> str:
 
 
 def smoothed_variance(variance: FloatArray) -> FloatArray:
-    """Return the geometric mean of the variances of neighbouring samples, shape (pixel, time); 0 where they are 0."""
+    """Return the geometric mean variance of neighbouring samples, shape (pixel, time); 0 where they are 0."""
     from scipy.ndimage import uniform_filter1d
 
     positive = variance > 0
@@ -256,7 +256,7 @@ def _with_variance(batches: FloatArray, variance: FloatArray) -> FloatArray:
 def _projected(
     derivatives: FloatArray, errors: tuple[FloatArray, FloatArray], batches: FloatArray | None
 ) -> FloatArray:
-    """Return J^T C J of derivatives, shape (parameter, pixel, time), by batches of passes where there are enough."""
+    """Return J^T C J for derivatives, shape (parameter, pixel, time), by pass batches where there are enough."""
     count = len(derivatives)
     flat = derivatives.reshape(count, -1)
     if batches is None or len(batches) < count + 3:
@@ -288,7 +288,7 @@ def _correlated(vectors: FloatArray, deviation: FloatArray, correlation: FloatAr
 
 
 def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
-    """Return the trace of the square of the covariance of all kinds of errors together."""
+    """Return the trace of the squared covariance of all error kinds together."""
     pixels, count = kinds[0][0].shape
     total = 0.0
     for lag in range(min(count, max(correlation.size for _, correlation in kinds))):
@@ -301,11 +301,11 @@ def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
 
 
 def noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int) -> FloatArray:
-    """Return the variance of the mean of records from that of one record.
+    """Return the variance of the mean over records from one record's variance.
 
-    Rounding errs alike in all records where the noise before it is less than half a step. The mean square of this
-    error, over voltages within a step q with noise of the variance s^2, is q^2 / (2 pi^2) times the sum over k = 1, 2,
-    ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
+    Rounding has the same error in all records where the preceding noise is less than half a step. Take the mean square
+    of this error over voltages within a step q with noise variance s^2. It is q^2 / (2 pi^2) times the sum over k = 1,
+    2, ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
     doi:10.1017/CBO9780511754661), which is q^2/12 without noise.
     """
     if digitiser is None or shots == 1:

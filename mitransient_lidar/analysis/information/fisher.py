@@ -1,4 +1,4 @@
-"""Fisher information of the record of a receiver about the parameters of a scene."""
+"""Fisher information in a receiver's record about scene parameters."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class _Gram(NamedTuple):
     covariance: FloatArray
 
     def information(self, renders: npt.NDArray[np.int64], part: str = "") -> FloatArray:
-        """Return the information by some of the renders, unbiased from two on; `part` names one of the parts."""
+        """Return the information from some renders, unbiased from two on; `part` names one of the parts."""
         gram = getattr(self, part) if part else self.mean + self.covariance
         own = gram[renders][:, :, renders]
         if len(renders) == 1:
             return np.asarray(own[0, :, 0])
-        # Products of different renders: the errors of each render would add their variance to its own square.
+        # Products of different renders: each render's errors would add their variance to its own square.
         all_pairs, same = own.sum(axis=(0, 2)), np.einsum("kakb->ab", own)
         found = (all_pairs - same) / (len(renders) * (len(renders) - 1))
         return np.asarray(0.5 * (found + found.T))
@@ -65,7 +65,7 @@ def fisher_information(
     optical_density: Setting | None = None,
     nuisances: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
-    """Return the Fisher information of one shot's record about the parameters of a scene, and Cramer-Rao bounds.
+    """Return the Fisher information in one shot's record about scene parameters, and Cramer-Rao bounds.
 
     Parameters
     ----------
@@ -77,21 +77,21 @@ def fisher_information(
         As for `analysis.receiver.detect_waveforms`.
     nuisances : mapping of str to float, optional
         Unknown quantities besides the parameters, with the standard deviation to which each is known, above 0 and
-        infinite for not at all: ``time_offset`` [ns] of all pixels and ``scale`` [1] of the laser's light.
+        infinite for not at all: ``time_offset`` [ns] in all pixels and ``scale`` [1] of the laser light.
 
     Returns
     -------
     xarray.Dataset
-        Over ``parameter``, that of the derivatives and then the nuisances: ``bound``, the smallest standard deviation
-        of an unbiased estimate from one shot with all parameters unknown, ``bound_stderr`` by the render's noise (NaN
-        for less than three renders), ``bound_known`` with all others known, in the unit of the parameter;
-        ``variance_share``, the share of the information that is in the variance of the samples, and
-        ``monte_carlo_share``, what the noise of all renders together would add, relative to the information (see
-        Notes). Over (parameter, other_parameter): ``information`` and ``correlation`` of the estimates. Over
-        (render, parameter), from three renders on: ``bound_left_out``, without one of the renders. Per pixel
-        ``lost_samples``, the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``,
-        ``parameter_method`` and ``prior`` (the standard deviation of a nuisance, infinite elsewhere). The attribute
-        ``remarks`` has sentences on parameters that the record does not determine, one a line.
+        Over ``parameter``, the derivatives' parameters and then the nuisances: ``bound``, the smallest standard
+        deviation of an unbiased estimate from one shot with all parameters unknown, in the parameter's unit.
+        ``bound_stderr`` is its error by render noise (NaN for less than three renders), and ``bound_known`` the bound
+        with all others known. ``variance_share`` is the share of the information that is in the sample variance.
+        ``monte_carlo_share`` is the addition by the noise of all renders together, relative to the information (see
+        Notes). Over (parameter, other_parameter): ``information`` and ``correlation`` of the estimates. Over (render,
+        parameter), from three renders on: ``bound_left_out``, without one of the renders. Per pixel ``lost_samples``,
+        the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method``
+        and ``prior`` (a nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on
+        parameters that the record does not determine, one per line.
 
     Raises
     ------
@@ -105,23 +105,23 @@ def fisher_information(
 
         F_ab = m_a C^-1 m_b + tr(C^-1 C_a C^-1 C_b)/2
 
-    (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 1, 1993, equation 3.31). C holds the shot noise
-    and the noise of the amplifier, correlated by the bandwidth, and that of rounding (`sample_moments`). A logarithm
-    loses nothing, so that samples count before it. Samples that saturate in more than 5 % of the shots are lost.
+    (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 1, 1993, equation 3.31). C contains shot noise and
+    amplifier noise, correlated by the bandwidth, and rounding noise (`sample_moments`). A logarithm loses nothing, so
+    that samples count before it. Samples that saturate in more than 5 % of the shots are lost.
 
-    Electrons and counts without an amplifier have F_ab = m_a C^-1 m_b, exact for Poisson counts, m_a m_b/m. For
-    others this is a lower bound of the information (M. Stein, A. Mezghani and J. A. Nossek, IEEE Signal Process. Lett.
-    21, 796 (2014), doi:10.1109/LSP.2014.2316008). Behind an amplifier the second term assumes normal samples, which a
-    few photoelectrons are not: ``variance_share`` says how much depends on it. Samples without any noise are left out.
+    Electrons and counts without an amplifier have F_ab = m_a C^-1 m_b, exact for Poisson counts, m_a m_b/m. For others
+    this is a lower bound of the information (M. Stein, A. Mezghani and J. A. Nossek, IEEE Signal Process. Lett. 21, 796
+    (2014), doi:10.1109/LSP.2014.2316008). After an amplifier the second term assumes normal samples, which a few
+    photoelectrons are not: ``variance_share`` states how much depends on it. Samples without any noise are left out.
 
     A nuisance with a standard deviation s adds 1/s^2 to its diagonal (H. L. Van Trees, Detection, Estimation, and
     Modulation Theory, part I, 1968, section 2.4). The time offset's derivative is taken from differences of
     neighbouring bins, which should be narrow against the pulse.
 
-    Errors of derivatives by Monte Carlo add their variance over that of the samples to F. Of several renders, only
-    products of different ones are averaged, which is free of it; ``monte_carlo_share`` is what all products would have
-    added. Of a single one, it is estimated from ``waveform_derivative_stderr``, without the receiver's response, and
-    not removed. Bounds of a noisy F are themselves biased a little, by the square of their relative error.
+    Monte Carlo errors in derivatives add their variance divided by the sample variance to F. With several renders, only
+    products of different ones are averaged, which is free of it; ``monte_carlo_share`` is the addition by all products.
+    With a single one, it is estimated from ``waveform_derivative_stderr``, without the receiver's response, and not
+    removed. Bounds from a noisy F are themselves biased a little, by their squared relative error.
     """
     renders = [dataset] if isinstance(dataset, xr.Dataset) else list(dataset)
     dims = _check(renders)
@@ -222,9 +222,9 @@ def _products(
     bin_width_ns: float,
     errors: Sequence[FloatArray],
 ) -> tuple[_Gram, FloatArray, FloatArray]:
-    """Return products of derivatives, the share of lost samples of each pixel, and the information by errors.
+    """Return derivative products, each pixel's share of lost samples, and the information by errors.
 
-    `changes` are of shape (render, parameter, pixel, time); `errors` holds the standard errors of a single render, or
+    `changes` have the shape (render, parameter, pixel, time); `errors` contains a single render's standard errors, or
     nothing.
     """
     renders, count = changes.shape[:2]
@@ -246,7 +246,7 @@ def _products(
             sums[1] += 0.5 * (flat @ flat.T)
         if errors:
             stride = receiver.chain.stride(bin_width_ns)
-            # The response of the receiver is left out: a bin changes the sample of its own time alone.
+            # The receiver's response is left out: a bin changes the sample at its own time alone.
             steady = np.ones((1, power.size))
             per_watt = sample_moments(receiver.chain, own[0], steady, *own[2:]).mean_derivatives[0]
             error = receiver.transmittance * errors[0][:, number, ::stride][:, kept]
@@ -258,12 +258,12 @@ def _products(
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """Return the Cholesky factor of a covariance."""
+    """Return a covariance's Cholesky factor."""
     return np.asarray(np.linalg.cholesky(covariance + _JITTER * np.diag(np.diagonal(covariance))))
 
 
 def _whitened(root: FloatArray, change: FloatArray) -> FloatArray:
-    """Return a change of the covariance between the inverse roots of the covariance, as a vector."""
+    """Return a covariance change between the covariance's inverse roots, as a vector."""
     half = solve_triangular(root, change, lower=True)
     return np.asarray(solve_triangular(root, half.T, lower=True).ravel())
 
@@ -303,7 +303,7 @@ def _labelled(
     remarks: Sequence[str],
     dims: tuple[str, ...],
 ) -> xr.Dataset:
-    """Return the dataset of `fisher_information`."""
+    """Return the dataset for `fisher_information`."""
     own = len(names) - len(prior)
     stderr = [jackknife_error(one) if len(one) and np.isfinite(one).all() else math.nan for one in without.T]
     pixels = tuple(dim for dim in dims if dim != "time")

@@ -1,4 +1,4 @@
-"""The table of a fit: parameters, fitted waveforms, residuals, and sentences on what they do not tell."""
+"""Fit table: parameters, fitted waveforms, residuals, and sentences on what they do not determine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mitransient_lidar.core.validation import FloatArray
 
 
 class FittedSamples(NamedTuple):
-    """Samples of a model at the end of a fit, each of shape (pixel, time)."""
+    """Model samples at the end of a fit, each with the shape (pixel, time)."""
 
-    mean: FloatArray  #: In the unit of the waveforms.
-    by_model: FloatArray  #: Variance by the Monte Carlo of the model.
-    noise: FloatArray | None  #: Variance of the waveforms, None where it is unknown.
+    mean: FloatArray  #: In the waveforms' unit.
+    by_model: FloatArray  #: Variance by the model's Monte Carlo.
+    noise: FloatArray | None  #: Waveform variance, None where it is unknown.
     weights: FloatArray  #: 1 over the standard deviation of the difference, 0 where a sample is not used.
 
 
@@ -36,9 +36,9 @@ def fit_table(
     units: Mapping[str, str],
     messages: Sequence[str],
 ) -> xr.Dataset:
-    """Return parameters, waveforms and quality of a fit as `fits.WaveformFit.run` describes them, without its ending.
+    """Return a fit's parameters, waveforms and quality as `fits.WaveformFit.run` describes them, without its ending.
 
-    Unknown noise is that of the residuals: these are then divided by their own standard deviation, and the chi-squared
+    Unknown noise is the residuals' noise: these are then divided by their own standard deviation, and the chi-squared
     is the expected one.
     """
     mean, by_model, noise, weights = samples
@@ -46,7 +46,7 @@ def fit_table(
     residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
     sentences = list(messages)
     if noise is None:
-        # Noise of a sample is independent of that of the next one: it is left out of what the scene does not explain.
+        # A sample's noise is independent of the next one's: it is left out of the unexplained part.
         shared = float(np.nansum(residual[:, 1:] * residual[:, :-1]))
         unexplained = max(shared, 0.0) / max(float(np.nansum(found.values[weights > 0] ** 2)), 1e-300)
         deviation = math.sqrt(errors.reduced) if errors.reduced > 0 else 1.0

@@ -1,8 +1,8 @@
-"""Weighted nonlinear least squares of waveforms, with exact derivatives of the model.
+"""Weighted nonlinear least squares for waveforms, with the model's exact derivatives.
 
 Scale and time offset of uncalibrated waveforms are parameters like the others, not projected out, so that bounds,
-weights and the covariance treat all parameters alike. They start at the time of the largest correlation with the model
-and at the scale of linear least squares. Positive parameters are fitted as logarithms.
+weights and the covariance treat all parameters alike. They start at the time with the largest model correlation and at
+the linear least-squares scale. Positive parameters are fitted as logarithms.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ from mitransient_lidar.analysis.information.measured import Measured, Prediction
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 
-#: A function that returns a render, with derivatives, of values of the free parameters.
+#: A function that returns a render, with derivatives, for values of the free parameters.
 Model = Callable[[Mapping[str, float]], "xr.Dataset"]
 
 _WINDOW = 10.0  # model bins by which the time offset may change before samples in use are chosen anew
 _MOST_ROUNDS = 8  # of weights that follow the model
 _SETTLED = 0.05  # standard errors by which parameters may still change in the last round
 _LINEAR = 0.2  # standard errors from a render within which the model is taken as linear, and not rendered again
-_TOLERANCE, _COARSE_TOLERANCE = 1e-3, 0.03  # relative change of the sum of squares that ends a round, and an approach
-_CONDITION = 1e6  # of correlations of parameters, above which their inverse is not used
-_RELATIVE_ERROR = 0.1  # of every sample while a fit approaches the solution
+_TOLERANCE, _COARSE_TOLERANCE = 1e-3, 0.03  # relative change in the sum of squares that ends a round, and an approach
+_CONDITION = 1e6  # of parameter correlations, above which their inverse is not used
+_RELATIVE_ERROR = 0.1  # for every sample while a fit approaches the solution
 _UNKNOWN_ERROR = 0.01  # standard deviation in place of unknown ones then, over the largest sample
-#: Standard deviations of the filters under which waveforms of unknown time approach a model, over its light's duration.
+#: Standard deviations of the filters under which waveforms with unknown time approach a model, over its light's
+#: duration.
 _BLURS = (0.15, 0.04, 0.0)
-_DARK = 0.01  # of the largest sample of a model, below which it is dark beyond an end of its record
-_DIGITS = 12  # of values that are rendered: logarithms and back change the last ones
+_DARK = 0.01  # of a model's largest sample, below which it is dark beyond an end of its record
+_DIGITS = 12  # of rendered values: logarithms and back change the last ones
 
 
 class _Rendered(NamedTuple):
@@ -51,12 +52,12 @@ class _Rendered(NamedTuple):
 
     values: dict[str, float]
     prediction: Prediction
-    information: FloatArray  #: Inverse of the covariance of the parameters, shape (parameter, parameter).
-    influence: FloatArray  #: Change of the differences per unit of each parameter, shape (parameter,).
+    information: FloatArray  #: Inverse of the parameter covariance, shape (parameter, parameter).
+    influence: FloatArray  #: Change in the differences per unit of each parameter, shape (parameter,).
 
 
 class WaveformFit:
-    """Fit of the parameters of a model to waveforms.
+    """Fit of a model's parameters to waveforms.
 
     Parameters
     ----------
@@ -66,16 +67,16 @@ class WaveformFit:
         Returns ``waveform``, optionally ``waveform_stderr``, and ``waveform_derivative`` over (parameter, pixel, time)
         or (parameter, row, column, time) for values of the parameters. The same values give the same waveform.
     starts
-        Starts of the parameters of the model, and optionally of ``scale`` and ``time_offset_ns``.
+        Starts of the model parameters, and optionally of ``scale`` and ``time_offset_ns``.
     bounds
         Lowest and highest values by name; see `free_parameters`.
     free_scale, free_time
-        Whether scale and time offset of the waveforms are unknown, by default only those of uncalibrated waveforms.
+        Whether scale and time offset of the waveforms are unknown, by default only for uncalibrated waveforms.
 
     Raises
     ------
     UserError
-        If a start or bounds are invalid, there is nothing to fit, no sample lies within the time of the model, or the
+        If a start or bounds are invalid, there is nothing to fit, no sample lies within the model's time, or the
         waveforms have no light where the model has.
     """
 
@@ -122,11 +123,11 @@ class WaveformFit:
         self._kept, self._rendered = {}, None
 
     def approach(self, *, most_renders: int = 60, until: float = math.inf) -> None:
-        """Move `values` from the starts towards the solution, which `run` begins from, by a model that may be coarse.
+        """Move `values` from the starts towards the solution, where `run` begins, by a model that may be coarse.
 
-        Light falls exponentially with coefficients of water, so that logarithms of samples are nearly linear in them
-        where values are not. Least squares of logarithms, of samples with a relative error of a tenth besides their
-        own, come close to the solution from starts from which those of values take many steps, or end elsewhere.
+        Light falls exponentially with water coefficients, so that logarithms of samples are nearly linear in them where
+        values are not. Least squares of logarithms, for samples with a relative error of a tenth besides their own,
+        come close to the solution. From some starts, least squares of values need many steps, or end elsewhere.
 
         Parameters
         ----------
@@ -140,19 +141,20 @@ class WaveformFit:
             blurs = tuple(share * light_duration(model.time_ns, model.mean) for share in _BLURS)
         for self._blur_ns in blurs:
             found = self._approached()
-            # Without time for another render, the last one is what is left.
+            # Without time for another render, the last one remains.
             self.values = self._rendered.values if self._is_over and self._rendered is not None else found
         self._blur_ns = 0.0
 
     def _approached(self) -> dict[str, float]:
-        """Return the solution of least squares of logarithms from `values`, after a filter if waveforms are blurred."""
+        """Return the least-squares solution for logarithms from `values`, after a filter if waveforms are blurred."""
         used = self._used(self.values)
         mean, _, by_model, noise = self._at(self.values)
         largest = float(np.abs(self.found.values[used]).max())
         variance = np.full_like(mean, (_UNKNOWN_ERROR * largest) ** 2) if noise is None else noise
         known = used & (variance > 0)
         softening = np.sqrt(np.where(known, variance, 1.0))
-        # Samples that are in the noise on one side alone say little: their logarithms are far from linear.
+        # Samples that are in the noise on one side alone contain little information: their logarithms are far from
+        # linear.
         darker = np.minimum(np.abs(np.nan_to_num(self.found.values)), np.abs(mean))
         if self._blur_ns:
             darker = np.abs(mean)
@@ -163,9 +165,9 @@ class WaveformFit:
         return self._solution(self.values, misfit, used, _COARSE_TOLERANCE)
 
     def noise_ratio(self) -> float:
-        """Return the variance of the model's Monte Carlo over that of the waveforms, at `values`.
+        """Return the variance of the model's Monte Carlo over the waveform variance, at `values`.
 
-        The median over the samples that carry information, 0 where the errors of the waveforms are unknown.
+        The median over the samples that carry information, 0 where the waveform errors are unknown.
         """
         values = self.values
         used = self._used(values)
@@ -188,15 +190,15 @@ class WaveformFit:
         Returns
         -------
         xarray.Dataset
-            Over ``parameter``, each in the unit of ``parameter_units``: ``value``, ``stderr``, ``stderr_by_model``
-            (part by the Monte Carlo of the model), ``start``, ``low`` and ``high`` (bounds) and ``at_bound``;
-            ``covariance`` and ``correlation`` over (parameter, other_parameter). Over the dimensions of the waveforms:
-            ``measured``, ``measured_stderr``, ``fitted``, ``fitted_stderr`` (Monte Carlo of the model), ``residual`` in
-            standard deviations of both, and ``used`` (1 for samples that were fitted). Attributes: ``chi_squared``,
-            its mean ``expected`` and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger
-            one, ``renders``, ``rounds``, ``converged``, ``refused`` (1 where the scene does not explain the waveforms),
-            ``interrupted`` (1 after Ctrl-C), and ``messages``, sentences on what the waveforms do not determine. The
-            squares of ``residual`` add up to ``chi_squared``.
+            Over ``parameter``, each in the unit ``parameter_units``: ``value``, ``stderr``, ``stderr_by_model`` (part
+            by the model's Monte Carlo), ``start``, ``low`` and ``high`` (bounds) and ``at_bound``; ``covariance`` and
+            ``correlation`` over (parameter, other_parameter). Over the waveform dimensions: ``measured``,
+            ``measured_stderr``, ``fitted``, ``fitted_stderr`` (the model's Monte Carlo), ``residual`` in standard
+            deviations of both, and ``used`` (1 for fitted samples). Attributes: ``chi_squared``, its mean ``expected``
+            and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger one, ``renders``,
+            ``rounds``, ``converged``, ``refused`` (1 where the scene does not explain the waveforms), ``interrupted``
+            (1 after Ctrl-C), and ``messages``, sentences on what the waveforms do not determine. The squared
+            ``residual`` values add up to ``chi_squared``.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         self._rendered, self._exhausted = None, False
@@ -215,7 +217,7 @@ class WaveformFit:
     def _solution(
         self, values: Mapping[str, float], misfit: Misfit, used: BoolArray, tolerance: float = _TOLERANCE
     ) -> dict[str, float]:
-        """Return the values of the smallest sum of the squares of differences, from others."""
+        """Return the values with the smallest sum of squared differences, starting from others."""
         from scipy.optimize import least_squares
 
         self._refusal = ""
@@ -239,7 +241,7 @@ class WaveformFit:
         return self._named(solution.x)
 
     def _prediction(self, values: Mapping[str, float]) -> Prediction:
-        """Return the samples of the model, rendered unless one of the last renders has these values or near ones."""
+        """Return the model samples, rendered unless one of the last renders has these values or near ones."""
         key = self._key(values)
         if key in self._kept:
             return self._kept[key]
@@ -267,10 +269,10 @@ class WaveformFit:
         return self._kept[key]
 
     def _is_near(self, values: Mapping[str, float]) -> bool:
-        """Return whether the model of values follows from the last accepted render and its derivatives.
+        """Return whether the model at some values follows from the last accepted render and its derivatives.
 
-        Where they are near in standard errors, and a relative curvature of 1 by each positive parameter would matter
-        little, too, as it might for parameters that are hardly told apart.
+        They must be near in standard errors. A relative curvature of 1 by each positive parameter must also matter
+        little, which may fail for hardly distinguishable parameters.
         """
         if (last := self._rendered) is None:
             return False
@@ -288,14 +290,14 @@ class WaveformFit:
         return self.interrupted or self.renders >= self._limit or time.perf_counter() >= self._until
 
     def _key(self, values: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the values of the parameters of the model that are rendered."""
+        """Return the rendered values of the model parameters."""
         return tuple(float(f"{values[name]:.{_DIGITS}g}") for name in self.names)
 
     def _at(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray | None]:
-        """Return what is expected at the times of the waveforms.
+        """Return the expectation at the times of the waveforms.
 
         Mean and variance by Monte Carlo, shape (pixel, time), derivatives by all free parameters, shape (parameter,
-        pixel, time), and variance of the waveforms, None if unknown.
+        pixel, time), and waveform variance, None if unknown.
         """
         model = self._prediction(values)
         scale, times = values.get(SCALE, 1.0), self._model_times(values)
@@ -319,9 +321,9 @@ class WaveformFit:
         return self.found.time_ns - values.get(TIME_OFFSET, 0.0)
 
     def _resampled(self, values: Mapping[str, float], array: FloatArray, order: int = 0) -> FloatArray:
-        """Return an array of the model, shape (..., pixel, time), or its derivative, at the times of the waveforms.
+        """Return a model array, shape (..., pixel, time), or its derivative, at the times of the waveforms.
 
-        It is 0 outside the record of the model.
+        It is 0 outside the model's record.
         """
         known, times = self._prediction(values).time_ns, self._model_times(values)
         if order == 0 and np.array_equal(times, known):
@@ -359,9 +361,9 @@ class WaveformFit:
         return np.asarray(used)
 
     def _weights(self, values: Mapping[str, float], used: BoolArray) -> FloatArray:
-        """Return 1 over the standard deviation of the difference of waveforms and model, 0 where it is not used.
+        """Return 1 over the standard deviation of the difference between waveforms and model, 0 where it is not used.
 
-        Variances from few passes are smoothed, since bins of a variance that is low by chance would count too much.
+        Variances from few passes are smoothed, since bins with a variance that is low by chance would count too much.
         """
         _, _, by_model, noise = self._at(values)
         if noise is not None and self.found.estimated:
@@ -389,7 +391,7 @@ class WaveformFit:
             self._refusal = str(error)
             return unknown
         except KeyboardInterrupt:
-            # What was rendered before is what is left.
+            # The previous renders are all that is left.
             self._exhausted = True
             return unknown
         return np.asarray(misfit.of(mean, np.nan_to_num(self.found.values))[used])
@@ -401,12 +403,12 @@ class WaveformFit:
         if (rendered := self._kept.get(self._key(values))) is not None:
             scaled = slopes
             if misfit.softening is None and noise is None:
-                # Unknown errors are those of the residuals.
+                # Unknown errors are the residuals' errors.
                 scaled = slopes / (float(np.std((self.found.values - mean)[used])) or 1.0)
             information = scaled.T @ scaled
             if misfit.softening is None and noise is not None:
                 errors = self._errors(values, used, False)
-                # The inverse of parameters that are hardly told apart would be that of rounding.
+                # The inverse for hardly distinguishable parameters would come from rounding.
                 if not np.isnan(errors.covariance).any() and np.linalg.cond(errors.correlation) < _CONDITION:
                     information = np.linalg.inv(errors.correlation) / np.outer(errors.stderr, errors.stderr)
             self._rendered = _Rendered(values, rendered, information, np.linalg.norm(scaled, axis=0))
@@ -416,10 +418,10 @@ class WaveformFit:
         return {free.name: free.value(float(one)) for free, one in zip(self.free, x, strict=True)}
 
     def _narrow(self, ends: tuple[FloatArray, FloatArray], values: Mapping[str, float]) -> None:
-        """Narrow the bounds of the time offset to those that the samples in use allow, and those of blurred echoes."""
+        """Narrow the time offset bounds to the offsets that used samples allow, and the bounds for blurred echoes."""
         for index, free in enumerate(self.free):
             if self._blur_ns and free.is_logarithm and free.name != SCALE:
-                # Blurred echoes hardly tell some parameters, which would run away.
+                # Blurred echoes hardly determine some parameters, which would run away.
                 at = free.internal(values[free.name])
                 ends[0][index] = max(ends[0][index], at - 1)
                 ends[1][index] = min(ends[1][index], at + 1)
@@ -434,7 +436,7 @@ class WaveformFit:
         return max(bins, 2 * self._blur_ns)
 
     def _align(self, starts: dict[str, float]) -> dict[str, float]:
-        """Return the starts with those of the time offset and of the scale, which follow from the first render."""
+        """Return the starts, with time offset and scale from the first render."""
         values = np.nan_to_num(self.found.values)
         if TIME_OFFSET in self.nuisances and TIME_OFFSET not in starts:
             model = self._prediction(starts)
@@ -445,7 +447,7 @@ class WaveformFit:
         return starts
 
     def _errors(self, values: Mapping[str, float], used: BoolArray, scale_errors: bool) -> Errors:
-        """Return the errors of values."""
+        """Return the errors at some values."""
         mean, derivative, by_model, noise = self._at(values)
         weights = self._weights(values, used)
         model = self._prediction(values)

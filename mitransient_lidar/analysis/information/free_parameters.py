@@ -1,4 +1,4 @@
-"""Free parameters of a fit: starts, bounds, and what is fitted instead of their values."""
+"""Free parameters in a fit: starts, bounds, and the fitted numbers in place of their values."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Free:
         return self.low >= 0 and self.start > 0
 
     def internal(self, value: float) -> float:
-        """Return what is fitted instead of a value: of starts 1, so that a first step may change all by their size."""
+        """Return the fitted number for a value: 1 for starts, so that a first step may change all by their size."""
         if not self.is_logarithm:
             return value
         return 1 + math.log(value / self.start) if value > 0 else -math.inf
 
     def is_bound(self, value: float) -> bool:
-        """Return whether a value is one of the bounds within the accuracy of a fit."""
+        """Return whether a value is one of the bounds within a fit's accuracy."""
         return any(abs(value - end) <= max(1e-3 * abs(end), 1e-6 * abs(self.start)) for end in self._finite_ends)
 
     @property
@@ -43,17 +43,17 @@ class Free:
         return [end for end in (self.low, self.high) if math.isfinite(end)]
 
     def value(self, internal: float) -> float:
-        """Return the value of what is fitted."""
+        """Return the value of a fitted number."""
         return self.start * math.exp(internal - 1) if self.is_logarithm else internal
 
 
 def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[float, float]] | None = None) -> list[Free]:
-    """Return free parameters with their bounds, by default the range of their names.
+    """Return free parameters with their bounds, by default the ranges of their names.
 
     Raises
     ------
     UserError
-        If bounds are those of no free parameter or do not increase, or a start is not between them.
+        If bounds belong to no free parameter or do not increase, or a start is not between them.
     """
     given = dict(bounds or {})
     found = []

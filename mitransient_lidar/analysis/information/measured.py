@@ -1,4 +1,4 @@
-"""Measured or simulated waveforms that a model is fitted to, and what a render predicts for them."""
+"""Measured or simulated waveforms to which a model is fitted, and a render's prediction for them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from mitransient_lidar.results import waveform_files
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import described
 
-_TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
-_STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
+_TIME, _STDERR = "time_ns", "_stderr"  # time column, and end of the error columns' names
+_STEP = 1e-4  # of the differences that give derivatives after a receiver, relative to the largest power
 _SATURATED = 1e-3  # probability of saturation above which a sample is left out
 
 
 @dataclass(frozen=True)
 class ReceiverSettings:
-    """Receiver that recorded a signal: chain, optical density of the filter and background [W] of each pixel."""
+    """Receiver that recorded a signal: chain, filter optical density and background [W] on each pixel."""
 
     chains: tuple[ReceiverChain, ...]
     optical_densities: FloatArray
@@ -50,26 +50,26 @@ class Measured:
     values
         Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
     stderr
-        Their standard errors in the same unit, of the same shape; None where they are unknown or those of the model.
+        Their standard errors in the same unit and shape; None where they are unknown or the model's.
     time_ns
-        Times of the samples [ns], shape (time,), increasing strictly.
+        Sample times [ns], shape (time,), increasing strictly.
     correlation
-        Correlation of the errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
+        Correlation between errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
     template
         Array with dimensions, coordinates and attributes of the waveforms.
     calibrated
-        Whether values and times are those of a model, so that neither scale nor offset are unknown.
+        Whether values and times are a model's, so that neither scale nor offset are unknown.
     receiver, shots
-        Receiver of a signal, None for waveforms, and number of records whose mean it is.
+        Receiver of a signal, None for waveforms, and number of averaged records.
     render_variance
-        Variance of the render that a signal is a record of, which `stderr` and the receiver's noise leave out, shape
+        Variance of the render whose record a signal is, which `stderr` and the receiver's noise leave out, shape
         (pixel, time); None without one.
     rounding
-        Variance of the samples of a table with a receiver by its converter, shape (pixel, time); None without one.
+        Sample variance by the converter in a table with a receiver, shape (pixel, time); None without one.
     estimated
         Whether `stderr` is from the spread of a few passes.
     batches
-        Deviations of the waveforms of batches of passes, shape (batch, pixel, time); see `batch_deviations`.
+        Deviations of the waveforms in pass batches, shape (batch, pixel, time); see `batch_deviations`.
     """
 
     values: FloatArray
@@ -91,12 +91,12 @@ class Measured:
         return tuple(str(dim) for dim in self.template.dims[:-1])
 
     def labelled(self, values: npt.ArrayLike, name: str) -> xr.DataArray:
-        """Return values of shape (pixel, time) with the dimensions and coordinates of the waveforms."""
+        """Return values with the shape (pixel, time) under the dimensions and coordinates of the waveforms."""
         about = {"units": self.template.attrs.get("units", ""), "long_name": name, **described(name)}
         return self.template.copy(data=np.reshape(values, self.template.shape)).assign_attrs(about)
 
     def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
-        """Return the scale of the samples of a model, of the same shape, by least squares with variances `noise`.
+        """Return the scale of a model's samples, in the same shape, by least squares with variances `noise`.
 
         Raises
         ------
@@ -113,27 +113,27 @@ class Measured:
 
 
 class Prediction(NamedTuple):
-    """Samples of a model, at its own times."""
+    """Model samples, at their own times."""
 
     time_ns: FloatArray  #: Shape (time,).
     mean: FloatArray  #: In the unit of the waveforms before any scale, shape (pixel, time).
     derivative: FloatArray  #: Per unit of each parameter, shape (parameter, pixel, time).
-    model_variance: FloatArray  #: Of the model's Monte Carlo, shape (pixel, time).
-    noise_variance: FloatArray | None  #: Of the mean of the receiver's records, shape (pixel, time); None without one.
+    model_variance: FloatArray  #: Variance by the model's Monte Carlo, shape (pixel, time).
+    noise_variance: FloatArray | None  #: Variance of the mean record, shape (pixel, time); None without a receiver.
     valid: npt.NDArray[np.bool_]  #: Samples that are not saturated, shape (pixel, time).
-    correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
+    correlation: FloatArray  #: Correlation of Monte Carlo errors by the distance in samples, shape (lags,).
     batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
 
     def interpolated(self, times: FloatArray, values: FloatArray, outside: float | None = None) -> FloatArray:
         """Return rows of values, shape (pixel, time), at other times, linear between its own ones.
 
-        Outside they are those of the ends, or another value.
+        Outside they have the end values, or another value.
         """
         return np.array([np.interp(times, self.time_ns, row, left=outside, right=outside) for row in values])
 
 
 def with_waveforms(source: Given) -> Given:
-    """Return the dataset of a result or of signals, given itself or by its file; the path of a table as it is.
+    """Return the dataset of a result or of signals, given itself or by its file; a table's path unchanged.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def measured(
     noise: float | None = None,
     receiver: str | os.PathLike[str] | ReceiverChain | None = None,
 ) -> Measured:
-    """Return the waveforms of a result, of a recorded signal, or of a table.
+    """Return the waveforms in a result, a recorded signal, or a table.
 
     Parameters
     ----------
@@ -162,17 +162,17 @@ def measured(
         unit, and optionally columns ``NAME_stderr`` with their standard errors. Waveforms of LAS, LAZ and PulseWaves
         files (`results.waveform_files`) are such a table: their mean, less the level before the surface.
     noise
-        Standard deviation of every sample of waveforms, above 0 and in their unit, instead of their own.
+        Standard deviation of every waveform sample, above 0 and in the waveforms' unit, instead of their own.
     receiver
-        Receiver of a signal, as of `detect_waveforms`; by default the one that its attributes name. Of a table, the
-        receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. Behind a logarithm,
-        samples are volts, which are expanded; limits and rounding are taken from the samples.
+        Receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
+        receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
+        samples are volts, which are expanded; limits and rounding are found from the samples.
 
     Raises
     ------
     UserError
-        If the file cannot be read, there is more than one shot of a series, the receiver is unknown, or a value is out
-        of range.
+        If the file cannot be read, a series has more than one shot, the receiver is unknown, or a value is out of
+        range.
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
@@ -202,9 +202,9 @@ def measured(
 
 
 def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Prediction:
-    """Return what a render with derivatives predicts for the pixels of waveforms, behind their receiver if any.
+    """Return a render's prediction, with derivatives, for the pixels of waveforms, after their receiver if any.
 
-    Derivatives behind a receiver are central differences of its closed form in the direction of the derivative.
+    Derivatives after a receiver are central differences of its closed form in the direction of the derivative.
 
     Raises
     ------
@@ -248,8 +248,8 @@ def _recorded(
 ) -> Prediction:
     """Return the mean record of light, shape (pixel, time), with derivatives and errors, by the receiver's closed form.
 
-    Errors of neighbouring bins of a render agree in sign, so that they are propagated as one change of the light, as is
-    the deviation of each batch of passes.
+    Errors in a render's neighbouring bins agree in sign, so that they are propagated as one change in the light, as is
+    each pass batch's deviation.
     """
     largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=0)
     reach = np.divide(_STEP * light.max(), largest, out=np.zeros_like(largest), where=largest > 0)
@@ -287,10 +287,10 @@ def _recorded(
 
 
 def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:
-    """Return the deviations of a render's batches of passes from its mean, shape (batch, pixel, time), or None.
+    """Return the deviations of a render's pass batches from its mean, shape (batch, pixel, time), or None.
 
-    The sum of their outer products is an unbiased estimate of the covariance of the errors of all bins: deviations of
-    the means of n of N passes in B batches are multiplied by the root of n/N/(B - 1).
+    The sum of their outer products is an unbiased estimate of the error covariance over all bins. For N passes in B
+    batches, the deviations of means over n passes are multiplied by the root of n/N/(B - 1).
     """
     if "waveform_batch" not in dataset or dataset.sizes["batch"] < 2:
         return None
@@ -301,11 +301,12 @@ def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray |
 
 
 def correlation(attributes: Any) -> FloatArray:
-    """Return the correlation of the errors of bins of a render by their distance in bins, shape (lags,).
+    """Return the correlation between a render's bin errors by their distance in bins, shape (lags,).
 
-    The pulse smooths the errors of bins, so that neighbours agree. The attribute ``error_inflation`` holds the standard
-    deviation of means of n = 1, 2, 4, ... bins over that of independent bins, f(n)^2 = 1 + 2 sum (1 - k/n) r(k) over
-    the lags 0 < k < n. It is solved for r constant between these numbers of bins. Without it, bins are independent.
+    The pulse smooths bin errors, so that neighbours agree. The attribute ``error_inflation`` is the ratio of two
+    standard deviations for means over n = 1, 2, 4, ... bins: the actual one and the one for independent bins. Its
+    square is f(n)^2 = 1 + 2 sum (1 - k/n) r(k) over the lags 0 < k < n. It is solved for r constant between these
+    numbers of bins. Without it, bins are independent.
     """
     bins, inflation = (np.atleast_1d(attributes.get(name, ())) for name in ("error_inflation_bins", "error_inflation"))
     found = [1.0]
@@ -317,7 +318,7 @@ def correlation(attributes: Any) -> FloatArray:
 
 
 def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
-    """Return the mean of the records of a signal, whose errors are those of its receiver."""
+    """Return the mean over a signal's records, whose errors come from its receiver."""
     results.record_dims(dataset, "signal", shots=True)
     if "signal_mean" in dataset and "shot" in dataset["signal_mean"].dims:
         raise UserError("the signals are those of a series of shots: select one shot with isel(shot=...)")
@@ -345,7 +346,7 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
     of_render = None
     if "signal_mean_stderr" in dataset:
         error = dataset["signal_mean_stderr"].transpose(*dims)
-        # Few passes know their errors badly, and bins whose variance is low by chance would count too much.
+        # Few passes determine their errors badly, and bins whose variance is low by chance would count too much.
         of_render = smoothed_variance(_by_pixel(error, dims) ** 2)
     return Measured(
         _by_pixel(values, dims),
@@ -366,9 +367,9 @@ def _of_file(dataset: xr.Dataset) -> Measured:
 
 
 def _behind(table: Measured, receiver: ReceiverChannels) -> Measured:
-    """Return waveforms of a table with their receiver, as samples that are linear in the light, above the dark level.
+    """Return a table's waveforms with their receiver, as samples that are linear in the light, above the dark level.
 
-    Rounding is that of the smallest difference of two samples.
+    The rounding step is the smallest difference between two samples.
     """
     pixels = [str(name) for name in table.template["pixel"].values]
     given = [receiver.of(pixel).chain for pixel in pixels]
@@ -405,7 +406,7 @@ def _linear(chain: ReceiverChain) -> ReceiverChain:
 
 
 def _response_correlation(chain: ReceiverChain, step_ns: float, count: int) -> FloatArray:
-    """Return the correlation of the noise of samples that are `step_ns` apart, behind the amplifier's low-pass."""
+    """Return the noise correlation between samples that are `step_ns` apart, after the amplifier's low-pass."""
     low_pass = chain.low_pass(step_ns)
     weights = low_pass.weights
     whole = np.correlate(weights, weights, "full")[weights.size - 1 :: low_pass.parts][:count]
@@ -413,7 +414,7 @@ def _response_correlation(chain: ReceiverChain, step_ns: float, count: int) -> F
 
 
 def _same_pixels(found: Measured, dataset: xr.Dataset) -> xr.Dataset:
-    """Return the pixels of a model that are those of waveforms, by their names; a single pixel may have any name."""
+    """Return the model pixels that match the waveforms', by their names; a single pixel may have any name."""
     if "waveform" not in dataset:
         raise UserError("the model has no variable waveform")
     own = tuple(str(dim) for dim in dataset["waveform"].dims if dim != "time")
@@ -452,11 +453,11 @@ def _times(dataset: xr.Dataset) -> FloatArray:
 
 
 def _read_csv(path: Path) -> Measured:
-    """Read a table of waveforms; see `measured`."""
+    """Read a waveform table; see `measured`."""
     try:
         lines = [line for line in csv.reader(read_text(path).splitlines()) if any(cell.strip() for cell in line)]
     except csv.Error as problem:
-        raise UserError(f"{path} is not a CSV file.") from problem
+        raise UserError(f"{path} is not a CSV file") from problem
     heading = [name.strip() for name in lines[0]] if lines else []
     if _TIME not in heading or len(heading) < 2:
         raise UserError(f"{path} must begin with a heading of {_TIME} and names of pixels, separated by commas")

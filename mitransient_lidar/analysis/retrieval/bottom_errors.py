@@ -1,4 +1,4 @@
-"""Errors of depth and reflectance of a bottom, and reasons for which the reflectance is unknown."""
+"""Depth and reflectance errors of a bottom, and reasons for which the reflectance is unknown."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ LARGEST_ERROR = 0.5
 #: Smallest share of the beam's energy in the pixels at which scattered light does not dominate their echoes.
 LEAST_SHARE = 0.05
 
-_FEWEST_SHOTS = 8  # whose scatter of reflectance is known
-_OF_ECHO = 0.01  # relative error of the energy of the bottom echo with its tail
+_FEWEST_SHOTS = 8  # whose reflectance scatter is known
+_OF_ECHO = 0.01  # relative energy error of the bottom echo with its tail
 _AROUND = (2.0, 4.0)  # echo widths before and behind a bottom echo whose light counts
 _APART = 4.0  # echo widths between a bottom echo and others that leave this light its own
 _OF_GAIN = 0.07  # error of the column's gain on the bottom by scattering, relative to it: bb/b is not known
 _OF_SHAPE = 0.01  # error of the optical depth for a bottom as far below the surface as the column's fit is long
 _UNTESTED = 0.03  # relative error of the optical depth where a column is too short to be tested for layers
-_DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
+_DEEPEST_CHANGE = 0.65  # in the column, over the bottom depth
 _CERTAIN = 0.1  # relative error of a sum by noise above which a fit counts
 _WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
 # Relative deviation of the light at a bottom by waves that focus it, over the deviation of the sea's slopes, times the
-# width of the beam [m]; and width that is added to it. At 5 m/s and 8 m eight seas each had 21 % with a beam of 0.2 m
-# and 5 % with one of 0.6 m; three had 2 % with one of 2.1 m.
+# beam width [m]; and width that is added to it. At 5 m/s and 8 m eight seas each had 21 % with a beam of 0.2 m and 5 %
+# with one of 0.6 m; three had 2 % with one of 2.1 m.
 _FOCUSING, _NARROWEST = 0.24, 0.1
-_GRID, _REACH = 128, 4.0  # points along each side of a beam, and half of its side in standard deviations
+_GRID, _REACH = 128, 4.0  # points along each side of a beam, and half its side in standard deviations
 
 
 class ReflectanceFlag(IntFlag):
@@ -54,10 +54,10 @@ class ReflectanceFlag(IntFlag):
     NO_DIRECT_LIGHT = 2  # the pixels see less than a twentieth of the beam
     TARGET = 4  # the echo comes from the depth of a target
     EARLIER_ECHO = 8  # a target or a layer returns or absorbs an unknown share of the light before the bottom
-    UNCERTAIN = 16  # its standard error would exceed half of the reflectance
+    UNCERTAIN = 16  # its standard error would exceed half the reflectance
 
 
-#: What the flags say to a user.
+#: Explanations of the flags.
 REASONS = {
     ReflectanceFlag.NO_COLUMN: "no column that can be fitted",
     ReflectanceFlag.NO_DIRECT_LIGHT: "the pixels see too little of the beam",
@@ -75,24 +75,24 @@ def loss_error(
     attenuation: float,
     light: ScatteredLight | None,
 ) -> float:
-    """Return the error of the optical depth of both ways to the bottom by the method [1], infinite if unknown.
+    """Return the method's error in the optical depth of both ways to the bottom [1], infinite if unknown.
 
-    The loss is that of homogeneous water. Two signs that the water differs below count in full: the loss by two
+    The loss assumes homogeneous water. Two signs that the water differs below count in full: the loss by two
     exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over the
-    column's, each less that of homogeneous water. Both are means over the shots, of the same water.
+    column's. From each its value for homogeneous water is subtracted. Both are means over the shots, in the same water.
 
     Parameters
     ----------
     waveforms
         Waveforms of one pixel.
     echoes
-        Table of `echo_table.extract` of these waveforms with `layers`, without the dimension pixel.
+        Table from `echo_table.extract` for these waveforms with `layers`, without the dimension pixel.
     depth, path
-        Depths of the bottom and one-way paths to it in the water [m], of the shots.
+        Bottom depths and one-way paths to them in the water [m], per shot.
     attenuation
-        Mean attenuation of the columns along the path [1/m].
+        Mean column attenuation along the path [1/m].
     light
-        Scattered light of homogeneous water.
+        Scattered light in homogeneous water.
     """
     depths = 2 * attenuation * path
     if light is None or not np.isfinite(depths).any():
@@ -126,7 +126,7 @@ def _loss_of_layers(
 
 
 def _excess_before_bottom(waveforms: Waveforms, echoes: xr.Dataset, light: ScatteredLight) -> FloatArray:
-    """Return the logarithm of the signal before bottom echoes over the columns', NaN without both; of the shots."""
+    """Return the logarithm of the signal before bottom echoes over the columns', per shot, NaN without both."""
     rows = slice(0, waveforms.count)
     time, width = waveforms.records(rows).time_ns, waveforms.echo_fwhm_ns
     start, middle = (echoes["time_ns"].sel(echo=name).values.reshape(-1, 1) for name in ("surface", "bottom"))
@@ -144,13 +144,13 @@ def whole_energy(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
-    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy are
-    not in the Gaussian that is fitted to the echo. The sum of the signal about the echo, less the column before it and
-    the column's late light behind it, is all of it. The Gaussian counts where noise makes the sum less certain than
-    10 %, there is no column, the sum would reach beyond the record, or another echo is less than four echo widths
-    before the bottom's.
+    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy is not
+    in the Gaussian fitted to the echo. The signal sum about the echo contains all of it, after subtraction of the
+    column before the echo and the column's late light after it. The Gaussian counts where noise makes the sum less
+    certain than 10 %, or there is no column. It also counts where the sum would reach beyond the record, or another
+    echo is less than four echo widths before the bottom's.
 
-    Parameters are those of `loss_error`.
+    Parameters as for `loss_error`.
     """
     rows = slice(0, waveforms.count)
     records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
@@ -196,7 +196,7 @@ def slope_variance(attributes: Mapping[str, Any]) -> float:
 def focusing(attributes: Mapping[str, Any], slant_range: float) -> float:
     """Return the relative standard deviation of the light at a bottom by waves that focus it [1], 0 without waves.
 
-    The light of a beam is a mean over facets, of a number that grows with the area of the beam.
+    A beam's light is a mean over facets, whose number grows with the beam's area.
     """
     if not np.any(attributes.get("surface_heights_m", 1.0)):
         return 0.0
@@ -208,10 +208,10 @@ def focusing(attributes: Mapping[str, Any], slant_range: float) -> float:
 def sea_variances(
     lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
 ) -> tuple[dict[str, npt.NDArray[np.bool_]], dict[str, tuple[FloatArray, FloatArray]]]:
-    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance.
+    """Return whether slopes and ranges from `surface_slopes` lower the variances of depth and log reflectance.
 
-    Also return these variances without and with them, [m^2] and [1]. The former of the depth is infinite if the sea is
-    unknown; that of the reflectance is then that over a typical sea.
+    Also return these variances without and with them, [m^2] and [1]. The former depth variance is infinite if the sea
+    is unknown; the reflectance variance is then the value over a typical sea.
     """
 
     def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
@@ -248,7 +248,7 @@ def sea_variances(
 
 
 def echo_error(energy: FloatArray, stderr: FloatArray) -> FloatArray:
-    """Return the relative error of the energies of bottom echoes by noise and by the method."""
+    """Return the relative energy error of bottom echoes by noise and by the method."""
     return np.hypot(_OF_ECHO, np.nan_to_num(stderr / energy))
 
 
@@ -267,21 +267,21 @@ def steadier(corrected: FloatArray, uncorrected: FloatArray) -> bool:
 def target_flags(
     echoes: xr.Dataset, attributes: Mapping[str, Any], margin: float, *, one_place: bool
 ) -> tuple[IntArray, float]:
-    """Return flags of bottom echoes that targets disturb, and the share of the beam that targets hide from the bottom.
+    """Return flags for bottom echoes that targets disturb, and the share of the beam that targets hide from the bottom.
 
-    Targets are those of the attribute ``target_outlines``, for shots of `one_place`. Otherwise the share is 0, and
-    every echo before the bottom's has a flag.
+    The attribute ``target_outlines`` gives the targets, for shots at `one_place`. Otherwise the share is 0, and every
+    echo before the bottom's has a flag.
 
     Parameters
     ----------
     echoes
-        Table of `echo_table.extract` with depths below the mean sea level.
+        Table from `echo_table.extract` with depths below the mean sea level.
     attributes
-        Those of the result.
+        The result's attributes.
     margin
-        Distance between a target and the depth of its echo [m].
+        Distance between a target and its echo depth [m].
     one_place
-        Whether all shots are of one place.
+        Whether all shots are at one location.
     """
     bottom, before = (echoes["depth_m"].sel(echo=name).values for name in ("bottom", "target"))
     targets = json.loads(attributes.get("target_outlines", "[]"))
@@ -298,7 +298,7 @@ def target_flags(
 
 
 def hidden_share(attributes: Mapping[str, Any], targets: list[dict[str, Any]]) -> float:
-    """Return the share of a Gaussian beam that meets targets of a result, 0 to 1; 0 if the beam is unknown."""
+    """Return the share of a Gaussian beam that meets targets in a result, 0 to 1; 0 if the beam is unknown."""
     divergence = optional_number(attributes, "divergence_mrad")
     pose = pose_of(attributes)
     if pose is None or divergence is None:

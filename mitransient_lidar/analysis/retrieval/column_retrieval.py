@@ -1,7 +1,7 @@
-"""Optical properties of the water and reflectance of the bottom from the signal of the water column.
+"""Optical properties of the water and bottom reflectance from the water column's signal.
 
-Coefficients are in 1/m, lengths in m. Level and decay of a column determine two properties, bb and a (hence Kd). The
-third, c, requires a narrow field of view or an assumption of bb/b.
+Coefficients are in 1/m, lengths in m. A column's level and decay determine two properties, bb and a (hence Kd). The
+third, c, requires a narrow field of view or an assumption about bb/b.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.physics.water.seawater import water_scattering
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 
-#: Smallest diameter of the field of view on the sea [m]: below it, the loss of light from the view is not distinct from
+#: Smallest diameter of the field of view on the sea [m]: below it, light that leaves the view is not distinct from
 #: attenuation.
 SMALLEST_SPOT = 6.0
 
 #: Relative error of bb and Kd by the method.
 METHOD_ERROR = 0.1
 
-#: bb/b of particles: the typical one, and a range that includes those of most natural waters.
+#: Particle bb/b: the typical value, and a range that includes most natural waters.
 BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.05)
 
 
 @dataclass(frozen=True)
 class WaterEstimate:
-    """Water of a column's signal [1/m]; arrays of one shape, NaN where no water fits.
+    """Water from a column's signal [1/m]; arrays with one shape, NaN where no water fits.
 
-    They are a, bb, and Kd of downwelling irradiance with the sun at the zenith, and the beam attenuation c for the
-    typical bb/b of particles, and for the largest and the smallest.
+    They are a, bb, and Kd for downwelling irradiance with the sun at the zenith. The beam attenuation c is given for
+    the typical particle bb/b, and for the largest and the smallest.
     """
 
     absorption: FloatArray
@@ -46,8 +46,8 @@ class WaterEstimate:
     def errors(self, decay_error: FloatArray, level_error: FloatArray) -> dict[str, FloatArray]:
         """Return the standard errors of ``absorption``, ``backscattering`` and ``kd`` by noise and method [1/m].
 
-        `decay_error` is that of the column's attenuation [1/m], `level_error` the relative one of its level. Those of
-        the method are 10 % of bb and Kd: in ten rendered waters the largest errors were 10 and 13 %.
+        `decay_error` is the error of the column's attenuation [1/m], `level_error` the relative error of its level. The
+        method's errors are 10 % of bb and Kd: in ten rendered waters the largest errors were 10 and 13 %.
         """
         backscattering = self.backscattering * np.hypot(METHOD_ERROR, level_error)
         kd = np.hypot(METHOD_ERROR * self.kd, decay_error)
@@ -61,17 +61,17 @@ def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: fl
     Parameters
     ----------
     decay, backscatter : array_like
-        Attenuation K along the path of the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi)
-        including multiple scattering [1/(m sr)]: the power at the surface, extrapolated with K, over
+        Attenuation K along the path in the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi) including
+        multiple scattering [1/(m sr)]. The backscatter is the power at the surface, extrapolated with K, over
         `LidarSystem.column_gain` and the fraction of the beam in view.
     excess, level : float
-        K less the absorption [1/m], and backscatter over bb/(2 pi), of `scattered_light.ScatteredLight`.
+        K minus the absorption [1/m], and backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Notes
     -----
-    Kd is that of Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on
-    forward scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw of sea water at 532 nm, for
-    particles of r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters of `water_types` have 0.0033
+    Kd follows Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on forward
+    scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw by sea water at 532 nm. It is given for
+    particles with r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters in `water_types` have 0.0033
     (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
     """
     fall, seen = np.broadcast_arrays(np.asarray(decay, dtype=np.float64), np.asarray(backscatter, dtype=np.float64))
@@ -98,17 +98,17 @@ def bottom_reflectance(
     cos_vertical: npt.ArrayLike,
     group_index: float,
 ) -> FloatArray:
-    """Return the reflectance of a Lambertian bottom from its echo over the column's signal at the same time.
+    """Return a Lambertian bottom's reflectance from its echo over the column's signal at the same time.
 
-    It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown, with the
-    energy of the bottom echo [J], the power of the column, extrapolated to the time of the echo [W], its
-    backscatter [1/(m sr)], and the angle of the light from the vertical in the water, alpha.
+    It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown. It needs the
+    bottom echo's energy [J], the column's power [W], extrapolated to the echo's time, and its backscatter [1/(m sr)].
+    The angle alpha is the light's angle from the vertical in the water.
 
     Notes
     -----
-    The ratio is independent of pulse energy, atmosphere, transmittance, slope and focusing of the surface, and
-    attenuation, and thus corrects a shot for the sea surface. Assumptions: the same water in all shots, homogeneous
-    down to the bottom. An absolute reflectance is as accurate as the backscatter.
+    The ratio is independent of pulse energy, atmosphere, attenuation, and the surface's transmittance, slope and
+    focusing, and thus corrects a shot for the sea surface. Assumptions: the same water in all shots, homogeneous down
+    to the bottom. An absolute reflectance is as accurate as the backscatter.
     """
     power = np.asarray(column_power, dtype=np.float64)
     known = power > 0

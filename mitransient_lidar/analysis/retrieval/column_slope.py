@@ -1,4 +1,4 @@
-"""Decay of the column signal with depth."""
+"""Column signal decay with depth."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from mitransient_lidar.core.validation import FloatArray, non_negative, positive
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
-_FEWEST_BINS = 3  # of a fit
-_LARGEST_ERROR = 0.5  # relative standard error of a bin: the logarithm of a noisier one is biased
+_FEWEST_BINS = 3  # in a fit
+_LARGEST_ERROR = 0.5  # relative standard error of a bin: a noisier one has a biased logarithm
 
-#: Edge of the beam in standard deviations.
+#: Beam edge in standard deviations.
 BEAM_EDGE = 3.0
 
 
 @dataclass(frozen=True)
 class ColumnBins:
-    """Bins of a record between two depths, shape (bins,) each.
+    """Record bins between two depths, shape (bins,) each.
 
     Indices, one-way paths in the water to their centres [m], and solid angles of the aperture per area [sr/m^2].
 
     Notes
     -----
     The one-way path in the water at the time t is s = c0 (t - t_surface)/(2 n_g), along the refracted axis, to the
-    depth s cos(phi). The impulse response is divided by the solid angle of the aperture in the water
+    depth s cos(phi). The impulse response is divided by the aperture's solid angle in the water
     (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
-    singly scattered light, even in a wide beam off nadir, since a mean over depths has the slope of the exponential.
+    singly scattered light, even in a wide beam off nadir, since a mean over depths has the exponential's slope.
 
-    K depends on the sea. Ripples scatter light out of a narrow field of view, and waves that focus both beam and view
-    increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
+    K depends on the sea. Ripples scatter light out of a narrow field of view. Waves that focus both beam and view
+    increase the signal from some metres below. Single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
     0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
     """
 
@@ -45,14 +45,14 @@ class ColumnBins:
     def between(
         cls, geometry: LidarGeometry, edge: float, time: TimeAxis, min_depth: float, max_depth: float
     ) -> ColumnBins:
-        """Return the bins of a record between two depths [m], 0 <= `min_depth` < `max_depth`.
+        """Return the record bins between two depths [m], 0 <= `min_depth` < `max_depth`.
 
         `edge` is the largest angle from the axis of light that the receiver detects [rad].
 
         Raises
         ------
         UserError
-            If the depths are out of order, the surface echo of the beam's edge reaches below the first, or the record
+            If the depths are out of order, the surface echo at the beam's edge reaches below the first, or the record
             does not include them and at least 3 bins between them.
         """
         top, bottom = non_negative("min_depth", min_depth), positive("max_depth", max_depth)
@@ -81,11 +81,11 @@ class ColumnBins:
         return cls(inside, path, geometry.solid_angle_per_area(path))
 
     def weights(self, energy: FloatArray, stderr: FloatArray) -> tuple[FloatArray, float]:
-        """Return the weights of the logarithms of the bins in K [1/m], shape (bins,), and its standard error [1/m].
+        """Return the weights of the bins' logarithms in K [1/m], shape (bins,), and its standard error [1/m].
 
-        Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential of s, since a bin without
-        rare paths has too low a signal and too small an error. The standard error takes bins as independent. Bins of
-        one pass share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
+        Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential in s. A bin without rare
+        paths has too low a signal and too small an error. The standard error assumes independent bins. Bins in one pass
+        share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
 
         Raises
         ------

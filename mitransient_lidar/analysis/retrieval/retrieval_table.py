@@ -1,4 +1,4 @@
-"""Lines that show what `retrieve` has found: of a single shot, and of a series beside the truth."""
+"""Lines that show the results of `retrieve`: for a single shot, and for a series beside the truth."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RA
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 
-_MOST_SHOTS = 200  # of a table
+_MOST_SHOTS = 200  # in a table
 _WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd"}
 
 
 def describe_retrieval(found: xr.Dataset) -> list[str]:
-    """Return the lines of a result of `analysis.retrieval.retrieve.retrieve`."""
+    """Return lines for a result of `analysis.retrieval.retrieve.retrieve`."""
     return _table(found) if "shot" in found.dims else _lines(found)
 
 
@@ -33,10 +33,10 @@ class Estimate(NamedTuple):
 
 
 def estimates(found: xr.Dataset) -> list[Estimate]:
-    """Return slopes, heights, depths and reflectances of a result of `analysis.retrieval.retrieve.retrieve`.
+    """Return slopes, heights, depths and reflectances from a result of `analysis.retrieval.retrieve.retrieve`.
 
-    The result is over ``shot``. Depths are those below the mean sea level through the slope of the shot, reflectances
-    those by the ratio to the column.
+    The result is over ``shot``. Depths are below the mean sea level through the shot's slope, reflectances by the ratio
+    to the column.
     """
     through_slope = found.sel(correction="slope")
     columns = {

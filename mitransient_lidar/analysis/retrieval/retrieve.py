@@ -1,4 +1,4 @@
-"""Slope of the sea, bottom and water, estimated from the echoes of results.
+"""Sea slope, bottom and water, estimated from result echoes.
 
 The functions take a dataset with ``waveform`` [W] over (pixel, time) or (shot, pixel, time), and keep the dimension
 ``shot``. Receiver and transmitter must be coaxial.
@@ -61,10 +61,10 @@ def surface_slopes(
     dataset : xarray.Dataset
         Waveforms of at least two pixels.
     wind_speed : float, optional
-        Wind speed [m/s], 1 to 30, whose sea gives the prior. By default, that of the scene if its sea has the spectrum
-        of Elfouhaily and the slopes of Cox and Munk.
+        Wind speed [m/s], 1 to 30, whose sea gives the prior. By default, the scene's if its sea has the Elfouhaily
+        spectrum and the Cox and Munk slopes.
     wind_direction_deg : float, optional
-        Direction that the wind blows towards, counter-clockwise from +x [degree]. By default, that of the scene, or +x.
+        Direction that the wind blows towards, counter-clockwise from +x [degree]. By default, the scene's, or +x.
     slope_deviation : (float, float), optional
         Prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and across,
         averaged over a footprint [1], above 0.
@@ -82,7 +82,7 @@ def surface_slopes(
         ``surface_height`` above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do
         not determine it. Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
         ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
-        Without a model of the sea, a slope beyond 5 standard deviations of its slopes (attribute
+        Without a sea model, a slope beyond 5 standard deviations of the sea's slopes (attribute
         ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
 
     Raises
@@ -92,13 +92,13 @@ def surface_slopes(
 
     Notes
     -----
-    With a known wind, the estimate is `surface_slope.slopes_on_sea`: of slopes averaged over the beam's footprint, with
+    With a known wind, the estimate is `surface_slope.slopes_on_sea`: slopes averaged over the beam's footprint, with
     errors that hold on this sea. It needs a Gaussian beam and 2 to 64 pixels with outlines. Strengths count if the
-    waveform is in W and the efficiency known. Otherwise a plane is fitted to the times; without a prior, its slopes
-    are much steeper than those of a sea.
+    waveform is in W and the efficiency known. Otherwise a plane is fitted to the times; without a prior, its slopes are
+    much steeper than a sea's.
 
-    Times are those of the ``gaussian`` estimator. The light of a pixel is that of a Gaussian beam inside its outline,
-    or without outlines a point at its centre.
+    Times come from the ``gaussian`` estimator. A pixel's light is a Gaussian beam inside its outline, or without
+    outlines a point at its centre.
     """
     lidar = lidar_geometry(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
@@ -182,12 +182,12 @@ def bottom(
     Parameters
     ----------
     dataset : xarray.Dataset
-        Waveforms; their pixels are summed. All shots must be of the same water.
+        Waveforms; their pixels are summed. All shots must be in the same water.
     slopes : xarray.Dataset
-        Output of `surface_slopes`. An unknown slope is replaced by 0, an unknown range by that of the mean sea.
+        Output of `surface_slopes`. An unknown slope is replaced by 0, an unknown range by the mean sea's.
     efficiency : float, optional
-        Efficiencies of transmitter and receiver times the two-way transmittance of the atmosphere, 0 to 1. By default,
-        from the attribute ``two_way_efficiency``.
+        Transmitter and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the
+        attribute ``two_way_efficiency``.
     classes : dict of str to float, optional
         As for `column_retrieval.bottom_class`.
 
@@ -195,13 +195,13 @@ def bottom(
     -------
     xarray.Dataset
         Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
-        (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
-        (``column``), with ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with
-        ``depth_m_stderr`` by noise, method, slope and height of the sea; ``reflectance_corrected`` and
-        ``depth_corrected``, whether the correction was applied: otherwise the value is the one before it. Also
-        ``bottom_energy`` [J], ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last
-        reflectance ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where
-        a flag is set, without a column with a warning. Depth and energy are NaN if the echo is that of a target.
+        (``level``), through the shot's plane (``slope``), and from the ratio of the echo to the column (``column``),
+        with ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr``
+        by noise, method, slope and height of the sea; ``reflectance_corrected`` and ``depth_corrected``, whether the
+        correction was applied: otherwise the value is the one before it. Also ``bottom_energy`` [J],
+        ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance
+        ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where a flag is
+        set, without a column with a warning. Depth and energy are NaN if the echo comes from a target.
 
     Raises
     ------
@@ -210,21 +210,20 @@ def bottom(
 
     Notes
     -----
-    Reflectances ``level`` and ``slope`` use the mean attenuation of all shots. The ratio needs a column of at least 8
-    bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
+    Reflectances ``level`` and ``slope`` use the mean attenuation over all shots. The ratio needs a column with at least
+    8 bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
-    Column and bottom decay by what `scattered_light` finds for homogeneous water with typical particles. The light is
-    that of the beam in the pixels (coordinate ``beam_share``) through the open part of the aperture. The errors of
-    reflectances include noise, 1 % of the energy of the echo, the unknown bb/b of particles, layers (differences from
-    homogeneous water, or 3 % of the optical depth of both ways in columns too short to be tested), waves that focus
-    light, slope and height of the sea, and the share of the beam that targets of a scene hide. A relative error above
-    0.5 leaves no value. Errors of efficiencies and of the pulse's energy are not included.
+    Column and bottom decay as `scattered_light` finds for homogeneous water with typical particles. The light is the
+    beam's light in the pixels (coordinate ``beam_share``) through the open part of the aperture. Reflectance errors
+    include noise, 1 % of the echo energy, the unknown particle bb/b, waves that focus light, slope and height of the
+    sea, and the beam share that targets hide. They also include layers: differences from homogeneous water, or 3 % of
+    the optical depth of both ways in columns too short to be tested. A relative error above 0.5 leaves no value. Errors
+    of efficiencies and of the pulse energy are not included.
 
-    A correction that is not expected to lower the variance is not applied: that for the slope where
-    `slope_corrections.variances` gives no lower one with it, that by the column where its noise exceeds the scatter of
-    the reflectances over the shots. With at least 8 shots, one after which the reflectances of the shots scatter more
-    is not applied to any, as focusing by waves may have the opposite effect; with fewer shots their scatter is not
-    known.
+    A correction that is not expected to lower the variance is not applied. The slope correction is left out where
+    `slope_corrections.variances` gives no lower variance with it, and the column correction where its noise exceeds the
+    reflectance scatter over the shots. With at least 8 shots, a correction that increases the reflectance scatter is
+    not applied to any, as focusing by waves may have the opposite effect. With fewer shots their scatter is not known.
     """
     lidar = lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
@@ -268,7 +267,7 @@ def bottom(
     received = system.energy * system.aperture_area * share
     reflectance = []
     more = 0.0 if scattered is None else scattered.bottom_loss(np.asarray(surfaces[0][1]))
-    # Waves focus the light of the bottom as they do that of the column.
+    # Waves focus the bottom's light as they do the column's.
     light = energy * np.exp(more) / bottom_errors.focusing_at(dataset, depth[0])
     for distance, path, one in surfaces:
         gain = bottom_gain(distance, np.nan_to_num(path), lidar.refractive_index, one)
@@ -293,7 +292,7 @@ def bottom(
     wavy = bottom_errors.focusing(dataset.attrs, lidar.slant_range) ** 2
     without, corrected = by_sea["reflectance"]
     of_sea = [wavy + without, wavy + np.where(slope_corrected, corrected, without)]
-    # The ratio to the column takes out what the sea does to a shot, but not to the mean of all.
+    # The ratio to the column removes the sea's effect on a shot, but not on the mean over all.
     of_ratio = relative**2 + of_sea[1] / _count(ratio)
     of_sea.append(np.where(column_corrected, of_ratio, of_sea[1]))
     deviation = np.sqrt(common[..., np.newaxis] + np.stack(np.broadcast_arrays(*of_sea), axis=-1))
@@ -340,8 +339,8 @@ def water(
     efficiency : float, optional
         As for `bottom`.
     phase_factor : float, optional
-        2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for those of Fournier and Forand. By default,
-        that of sea water with typical particles.
+        2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for Fournier-Forand functions. By default, for
+        sea water with typical particles.
     deepest_path : float
         Largest path in the water at which the column is used [m], above 0.
 
@@ -396,38 +395,35 @@ def retrieve(
     slope_deviation: Annotated[
         tuple[float, float] | None,
         Option(
-            "Standard deviations of the slopes of an unknown sea, by default those of a series",
+            "Standard deviations of an unknown sea's slopes, by default from a series",
             0,
             above=True,
             form="ALONG,ACROSS",
         ),
     ] = None,
-    wind_speed: Annotated[
-        float | None, Option("Wind speed over the sea, by default that of the scene", 1, 30, "m/s")
-    ] = None,
+    wind_speed: Annotated[float | None, Option("Wind speed over the sea, by default the scene's", 1, 30, "m/s")] = None,
     wind_direction_deg: Annotated[
         float | None, Option("Direction that the wind blows towards, from +x [degrees], any angle")
     ] = None,
     efficiency: Annotated[
-        float | None, Option("Two-way efficiency of optics and air, by default that of the scene", 0, 1)
+        float | None, Option("Two-way efficiency of optics and air, by default the scene's", 0, 1)
     ] = None,
 ) -> xr.Dataset:
-    """Estimate surface, bottom and, if the view is wide enough, water from the waveforms of the pixels.
+    """Estimate surface, bottom and, if the view is wide enough, water from the pixels' waveforms.
 
     Parameters
     ----------
     dataset : xarray.Dataset or path
         Waveforms of one shot or of a series.
     wind_speed, wind_direction_deg, slope_deviation
-        Wind [m/s], its direction [degree], or standard deviations of the slopes [1] of the sea, as for
-        `surface_slopes`.
+        Wind [m/s], its direction [degree], or standard deviations of the sea slopes [1], as for `surface_slopes`.
     efficiency : float, optional
         Efficiency of optics and atmosphere, 0 to 1, as for `bottom`.
 
     Returns
     -------
     xarray.Dataset
-        The variables of `surface_slopes`, `bottom` and `water`; NaN where unknown.
+        The variables from `surface_slopes`, `bottom` and `water`; NaN where unknown.
 
     Raises
     ------
@@ -457,7 +453,7 @@ def retrieve(
 
 
 def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the table of `surface_slopes` of a single pixel, which shows the height of the surface alone."""
+    """Return the table of `surface_slopes` for a single pixel, which shows the surface height alone."""
     lidar = lidar_geometry(dataset.attrs)
     echoes = echo_table.extract(dataset, targets=1).isel(pixel=0)
     time, by_noise, by_method = (echoes[f"surface_time_ns{end}"].values for end in ("", "_stderr", "_method_error"))

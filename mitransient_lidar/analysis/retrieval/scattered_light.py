@@ -1,9 +1,9 @@
-"""Light that water scatters forwards, in the signal of a column and in the echo of a bottom.
+"""Light that water scatters forwards, in a column's signal and in a bottom's echo.
 
 Column and bottom do not decay alike. Light that forward scattering has turned from its ray meets more water per depth
-and returns by other angles than 180 degrees, so that the column gains on the bottom with depth; light leaves the field
-of view of both. `physics.lidar.echo_estimate` gives both signals of a water; here the water is found whose column has
-the level and the decay of a measured one.
+and returns by other angles than 180 degrees: the column gains on the bottom with depth. Light from both leaves the
+field of view. `physics.lidar.echo_estimate` gives both signals for a water; this module finds the water whose column
+has a measured level and decay.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function, water_scattering
 from mitransient_lidar.results.geometry import optional_number, required_number
 
-_PATHS = (512, 1024, 1024, 4096)  # of light, in the estimates of a water one after the other
+_PATHS = (512, 1024, 1024, 4096)  # light paths in the successive estimates of a water
 _FIRST_LEVEL = 1.2  # of the column's exponential over bb/(2 pi), before an estimate
 _STEPS = 32  # of depth
-_BIN, _BEHIND = 0.25, 6.0  # of the column along the path, and its end behind the bottom [m]
+_BIN, _BEHIND = 0.25, 6.0  # of the column along the path, and its end after the bottom [m]
 _BELOW = 3.0  # echo widths of water below a column without a bottom
-_LEAST_ABSORPTION = 0.02  # over the attenuation of the column
+_LEAST_ABSORPTION = 0.02  # over the column's attenuation
 _MOST_BACKSCATTERING = 0.2  # [1/m]
-_SHIFTS, _TURNS = 256, 32  # nodes of the share of a beam in view, and directions of shifts
-_MODE = 6  # iterations of the time of an echo
-_ALONG, _ACROSS = 2.0, 1.6  # longest path of light turned twice over its depth, and over the radius of the view
+_SHIFTS, _TURNS = 256, 32  # nodes for the share of a beam in view, and directions of shifts
+_MODE = 6  # iterations for an echo's time
+_ALONG, _ACROSS = 2.0, 1.6  # longest path of light turned twice over its depth, and over the view's radius
 
 
 @dataclass(frozen=True)
 class View:
-    """Lidar of an estimate of scattered light."""
+    """Lidar in an estimate of scattered light."""
 
     system: LidarSystem  #: The lidar, its energy and aperture without effect.
     radius: float  #: Half angle of the field of view [rad].
     centre: float  #: Angle of its middle from the beam's axis [rad].
-    beam: float  #: Standard deviation of the beam [rad].
+    beam: float  #: Beam standard deviation [rad].
     slope_variance: float  #: Total variance of the sea's slopes [1].
     echo_width: float  #: Full width at half maximum of an echo, as a path in the water [m].
 
     @classmethod
     def of(cls, dataset: xr.Dataset, system: LidarSystem, echo_width: float) -> View:
-        """Return the view of all pixels of a result as a circle, with the beam of its attributes."""
+        """Return the view of all pixels in a result as a circle, with the beam in its attributes."""
         radius, beam = (
             0.5e-3 * required_number(dataset.attrs, name) for name in ("field_of_view_mrad", "divergence_mrad")
         )
@@ -65,7 +65,7 @@ class View:
         return cls(system, radius, centre, beam, variance, echo_width)
 
     def share(self, shift: FloatArray) -> FloatArray:
-        """Return the share of a beam in the field of view, shifted in any direction [rad], over that without one."""
+        """Return the beam share in the field of view, shifted in any direction [rad], over the unshifted share."""
         from scipy.special import chndtr
 
         beam = max(self.beam, 1e-3 * self.radius)
@@ -79,21 +79,21 @@ class View:
 
 @dataclass(frozen=True)
 class ScatteredLight:
-    """Column and bottom of a water, over singly scattered light that absorption alone attenuates.
+    """Column and bottom in a water, over singly scattered light that absorption alone attenuates.
 
     Attributes
     ----------
     absorption, backscattering
-        Of the water [1/m].
+        Water coefficients [1/m].
     path, column
-        Paths [m], and signal of the column there over that of b p(pi) exp(-2 a s), with a bottom at the last depth.
+        Paths [m], and the column's signal there over b p(pi) exp(-2 a s), with a bottom at the last depth.
     bottom_path, bottom
-        Paths of the echoes of bottoms [m], and logarithm of their energy over that of exp(-2 a s).
+        Bottom echo paths [m], and logarithm of their energy over exp(-2 a s).
     fitted
-        Paths of the bins of the column's exponential [m].
+        Paths of the bins in the column's exponential [m].
     start, excess, level
-        Of the column's exponential: its level at the surface over b p(pi), its attenuation less the absorption [1/m],
-        and its level as a backscatter over bb/(2 pi).
+        The column's exponential: its level at the surface over b p(pi), its attenuation minus the absorption [1/m], and
+        its level as a backscatter over bb/(2 pi).
     """
 
     absorption: float
@@ -108,7 +108,7 @@ class ScatteredLight:
     level: float
 
     def bottom_loss(self, path: FloatArray) -> FloatArray:
-        """Return the optical depth of both ways of bottoms at paths [m], less that of the column's exponential."""
+        """Return the optical depth of both ways to bottoms at paths [m], minus the column exponential's."""
         inside = np.polyfit(self.bottom_path, self.bottom, 3)
         return np.asarray(-np.polyval(inside, path) - 2 * self.excess * path)
 
@@ -118,11 +118,11 @@ class ScatteredLight:
         return np.asarray(np.interp(path, self.path, self.column / fitted))
 
     def gain_of_column(self, path: FloatArray) -> FloatArray:
-        """Return the logarithm of the signal of the column over that of bottoms at paths [m], 0 at the surface."""
+        """Return the logarithm of the column's signal over the bottoms' at paths [m], 0 at the surface."""
         return np.asarray(self.bottom_loss(path) + math.log(self.start))
 
     def slopes(self, path: float) -> tuple[float, float]:
-        """Return the attenuation of the column above and below a path, less that of its exponential [1/m]."""
+        """Return the column attenuation above and below a path, minus its exponential's [1/m]."""
         log_ratio = np.log(self.column_ratio(self.fitted))
         parts = (self.fitted < path, self.fitted >= path)
         above, below = (
@@ -140,17 +140,17 @@ def of_columns(
     dataset: xr.Dataset,
     phase_factor: float | None = None,
 ) -> ScatteredLight | None:
-    """Return the light of the water that the mean column of waveforms shows; None where no column is known.
+    """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
     Parameters
     ----------
     waveforms, echoes
-        Waveforms of one pixel, and their table of `echo_table.extract` without the dimension pixel.
+        Waveforms of one pixel, and their table from `echo_table.extract` without the dimension pixel.
     system, share
         The lidar, and the share of the beam in view, shape () or (shots,).
     dataset
-        Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the variance of
-        slopes and the outlines of pixels.
+        Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the slope
+        variance and the pixel outlines.
     phase_factor
         As for `retrieve.water`.
     """
@@ -193,7 +193,7 @@ def light_of(
     ratio: float,
     phase_factor: float | None,
 ) -> ScatteredLight:
-    """Return the light of the water whose column has an exponential.
+    """Return the light in the water whose column has an exponential.
 
     Parameters
     ----------
@@ -204,9 +204,9 @@ def light_of(
     path, weights
         Paths in the bins of the exponential's fit [m], and weights of the column's logarithm there, shape (bins,).
     deepest
-        Path of the echo of the bottom, or of the deepest light [m].
+        Path of the bottom echo, or of the deepest light [m].
     ratio
-        bb/b of the particles.
+        Particle bb/b.
     phase_factor
         As for `retrieve.water`.
     """
@@ -229,7 +229,7 @@ def light_of(
 def _curves(
     view: View, a: float, bb: float, b: float, phase: PowerLawTable, depth: float, paths: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return path and signal of the column, and path and logarithm of bottoms, of `ScatteredLight`."""
+    """Return path and signal of the column, and path and logarithm of bottoms, for `ScatteredLight`."""
     from scipy.ndimage import gaussian_filter1d
 
     column = WaterColumn(*(np.array([one]) for one in (0.0, a + b, b, bb)))
@@ -245,12 +245,12 @@ def _curves(
     path, energy = seen(water)
     step = depth / _STEPS / geometry.cos_water
     edges = np.arange(0, path.min(axis=0).max() + _BEHIND, _BIN)
-    # Light of a step lies anywhere in it.
+    # A step's light lies anywhere in it.
     total, _ = np.histogram(path + step * (rng.random(path.shape) - 0.5), edges, weights=energy)
     middle = 0.5 * (edges[1:] + edges[:-1])
     single = geometry.water_gain(middle * geometry.cos_water, geometry.off_nadir) * b * float(phase.eval_s(1.0)) * _BIN
     sigma = view.echo_width / math.sqrt(8 * math.log(2))
-    # Light that large angles turn twice, which the estimate lacks: it travels about level from one to the other, no
+    # Light that large angles turn twice, which the estimate lacks. It travels about level from one to the other, no
     # farther than it can be late, and no farther than the view reaches.
     reach = geometry.slant_range * view.radius
     twice = 1 + bb / (1 / (_ALONG * middle) + 1 / (_ACROSS * reach))
@@ -265,7 +265,7 @@ def _curves(
 
 
 def _echo_path(path: FloatArray, energy: FloatArray, sigma: float) -> FloatArray:
-    """Return the paths at which echoes of a standard deviation [m] have the most light of arrivals, shape (depths,)."""
+    """Return the paths at which echoes with a standard deviation [m] have the most light, shape (depths,)."""
     at = np.average(path, axis=0, weights=energy)
     for _ in range(_MODE):
         near = energy * np.exp(-0.25 * ((path - at) / sigma) ** 2)
@@ -274,7 +274,7 @@ def _echo_path(path: FloatArray, energy: FloatArray, sigma: float) -> FloatArray
 
 
 def _scattering(bb: float, ratio: float) -> tuple[float, PowerLawTable]:
-    """Return scattering [1/m] and phase function of sea water with particles of a ratio bb/b."""
+    """Return scattering [1/m] and phase function of sea water with particles that have a ratio bb/b."""
     molecules = float(water_scattering(532.0))
     particles = (bb - 0.5 * molecules) / ratio
     tables = [

@@ -1,4 +1,4 @@
-"""Corrections of depth and strength of a bottom echo for the slope of the sea surface.
+"""Corrections of a bottom echo's depth and strength for the sea surface slope.
 
 Slopes are rises over runs, positive `along` the lidar's azimuth for a face towards the lidar; angles in rad.
 """
@@ -38,7 +38,7 @@ class SlopeRefraction:
         Parameters
         ----------
         along, across : array_like
-            Slopes of the facet [1]; they broadcast. NaN, and a ray that meets the facet from below, give NaN.
+            Facet slopes [1]; they broadcast. NaN, and a ray that meets the facet from below, give NaN.
         off_nadir : float
             Angle of the ray in air from the vertical [rad], 0 to below pi/2.
         n : float
@@ -55,32 +55,31 @@ class SlopeRefraction:
 def bottom_depth(
     surface_range: npt.ArrayLike, path: npt.ArrayLike, height: float, off_nadir: float, ray: SlopeRefraction
 ) -> FloatArray:
-    """Return the depth of a bottom point below the mean sea level [m], corrected for height and slope of the surface.
+    """Return a bottom point's depth below the mean sea level [m], corrected for the surface's height and slope.
 
-    It is D = R cos(theta) - H + s cos(alpha), with the paths along the ray in air, R, and in the water, s [m], the
-    height of the lidar above the mean sea level, H [m], and the angle of the ray from the vertical in air, theta [rad].
+    It is D = R cos(theta) - H + s cos(alpha), with the paths along the ray in air, R, and in the water, s [m]. H is the
+    lidar's height above the mean sea level [m], and theta the ray's angle from the vertical in air [rad].
 
     Notes
     -----
-    A face away from the lidar refracts the ray towards the vertical: the path to the bottom is shorter (Tulldahl 2006,
-    FOI-R-2074-SE, figure 12), and a depth for the angle of a level sea is too small. Assumptions: the beam follows the
-    axis through a plane, and scattering does not change the time of the echo.
+    A face away from the lidar refracts the ray towards the vertical. The path to the bottom is shorter (Tulldahl 2006,
+    FOI-R-2074-SE, figure 12), and a depth with a level sea's angle is too small. Assumptions: the beam follows the axis
+    through a plane, and scattering does not change the echo time.
     """
     distance, length = np.asarray(surface_range, dtype=np.float64), np.asarray(path, dtype=np.float64)
     return np.asarray(distance * np.cos(off_nadir) - height + length * ray.cos_vertical)
 
 
 def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray: SlopeRefraction) -> FloatArray:
-    """Return the gain of a Lambertian bottom under a sloping surface [1/m^2], without attenuation in the water.
+    """Return a Lambertian bottom's gain under a sloping surface [1/m^2], without attenuation in the water.
 
-    It is T^2 cos(alpha)/(S_s S_t), for an echo of the energy E A (rho/pi) gain exp(-2 K s); for a level sea it equals
-    that of `lidar_geometry`. Paths are as for `bottom_depth`, n is the refractive index of the water.
+    It is T^2 cos(alpha)/(S_s S_t), for an echo with the energy E A (rho/pi) gain exp(-2 K s); for a level sea it equals
+    `lidar_geometry`'s. Paths are as for `bottom_depth`, n is the water's refractive index.
 
     Notes
     -----
-    T is the Fresnel transmittance of the facet. A narrow pencil from the bottom point spreads through a plane with
-    S_s = n R + s and S_t = n R cos_water/cos_air + s cos_air/cos_water, by Snell's law across and in the plane of
-    incidence.
+    T is the facet's Fresnel transmittance. A narrow pencil from the bottom point spreads through a plane with S_s = n R
+    + s and S_t = n R cos_water/cos_air + s cos_air/cos_water, by Snell's law across and in the plane of incidence.
     """
     distance, length = np.asarray(surface_range, dtype=np.float64), np.asarray(path, dtype=np.float64)
     known = np.isfinite(ray.cos_air)
@@ -100,22 +99,23 @@ def variances(
     before: Sequence[npt.ArrayLike],
     after: Sequence[npt.ArrayLike],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the variances of a quantity without and with the correction for slope and range.
+    """Return a quantity's variances without and with the correction for slope and range.
 
     Parameters
     ----------
     quantity : callable
-        Corrected quantity as a function of the slopes along and across [1] and the range of the surface [m].
+        Corrected quantity as a function of the slopes along and across [1] and the surface range [m].
     surface_range : float
         Range of a level sea at its mean height [m].
     before, after : sequence of 3 array_like
         Standard deviations of slopes and range on the sea, infinite where unknown, and standard errors of their
-        estimates; they broadcast. An error of NaN, of a slope that is not estimated, counts in neither.
+        estimates; they broadcast. A NaN error, for a slope that is not estimated, counts in neither.
 
     Notes
     -----
-    Without the correction the variance is that of the true correction over the sea, with it that of its error: both to
-    first order about the level sea, for independent slopes and range. NaN quantities are not corrected.
+    Without the correction the variance is the true correction's variance over the sea, with it the variance of its
+    error. Both are to first order about the level sea, for independent slopes and range. NaN quantities are not
+    corrected.
     """
     level = np.array([0.0, 0.0, surface_range])
     without, corrected = np.zeros(1), np.zeros(1)

@@ -27,13 +27,13 @@ LEAST_WIND_SPEED = 1.0
 
 _SEAS, _SHOTS = 4, 150  # realisations, and shots on each
 _CELLS = 512  # per side of a realisation
-_CELLS_PER_SPREAD, _LARGEST_CELL = 4.0, 0.5  # resolution, as of `sea_surface` [1, m]
-_POINTS = 2  # of light per side of a cell
-_BEAM_EDGE = 3.5  # radius of the beam in standard deviations
+_CELLS_PER_SPREAD, _LARGEST_CELL = 4.0, 0.5  # resolution, as for `sea_surface` [1, m]
+_POINTS = 2  # of light per cell side
+_BEAM_EDGE = 3.5  # beam radius in standard deviations
 _CHUNK, _CHUNK_POINTS = 32, 2**22  # shots, and points of light, in memory at a time
-_MOST_POINTS = 2**20  # of light of a shot, which take three minutes
+_MOST_POINTS = 2**20  # of light in a shot, which take three minutes
 _SMALLEST_RIPPLE_VARIANCE = 1e-5
-_PIXEL_CELLS = 128  # per side of the map of the pixels
+_PIXEL_CELLS = 128  # per side of the pixel map
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PixelMap:
 
     @classmethod
     def of_outlines(cls, outlines: list[list[FloatArray]]) -> PixelMap:
-        """Return the map of pixels of given outlines: closed lines of points [rad]; a line in another one is a hole."""
+        """Return the pixel map from outlines: closed lines of points [rad]; a line in another one is a hole."""
         reach = max(float(np.abs(line).max()) for lines in outlines for line in lines)
         centres = reach * ((2 * np.arange(_PIXEL_CELLS) + 1) / _PIXEL_CELLS - 1)
         x, y = np.meshgrid(centres, centres)
@@ -78,7 +78,7 @@ class PixelMap:
 
 
 def inside_outline(lines: list[FloatArray], x: FloatArray, y: FloatArray) -> BoolArray:
-    """Return whether an odd number of closed lines, of points (x, y) each, surround each point."""
+    """Return whether an odd number of closed lines, with points (x, y) each, surround each point."""
     return np.asarray(reduce(np.logical_xor, (inside_polygon(line, x, y) for line in lines)))
 
 
@@ -87,7 +87,7 @@ class SeaLidar(LidarGeometry):
     """Lidar above a sea, with receiver and transmitter at one place and on one axis."""
 
     beam: float  #: Standard deviation of the Gaussian beam [rad], positive.
-    pixels: PixelMap  #: Pixels of the receiver.
+    pixels: PixelMap  #: Receiver pixels.
 
     @property
     def half_angle(self) -> float:
@@ -106,9 +106,9 @@ class SeaLidar(LidarGeometry):
     ) -> tuple[FloatArray, FloatArray]:
         """Return energy and mean time of the pixels' surface echoes, shape (shots, pixels); see `SeaShots`.
 
-        Points of the surface, shape (shots, points) each, have a position from the point where the axis meets the mean
-        sea level, x along the azimuth [m], slopes in x and y [1], and a horizontal `area` [m^2]. The ripples' slope
-        variances are along and across the wind [1].
+        Surface points, shape (shots, points) each, have a position x, y, z [m] from the point where the axis meets the
+        mean sea level, x along the azimuth. Slopes are in x and y [1], and a point has a horizontal `area` [m^2]. The
+        ripples' slope variances are along and across the wind [1].
         """
         sin, cos = math.sin(self.off_nadir), math.cos(self.off_nadir)
         away_x, away_z = x + self.height * sin / cos, z - self.height
@@ -139,7 +139,7 @@ class SeaLidar(LidarGeometry):
 
 @dataclass(frozen=True)
 class SeaShots:
-    """Surface echoes of shots at random places of seas, without noise.
+    """Surface echoes of shots at random sea locations, without noise.
 
     Attributes
     ----------
@@ -148,8 +148,8 @@ class SeaShots:
     time_ns
         Mean two-way time of the echo's energy [ns], NaN without energy, shape (shots, pixels).
     along, across, height
-        Mean slopes of the sea over the beam's footprint, positive along for a face towards the lidar and across for a
-        rise to its left [1], and mean height above the mean sea level [m], shape (shots,).
+        Mean sea slopes over the beam's footprint [1] and mean height above the mean sea level [m], shape (shots,).
+        Slopes are positive along for a face towards the lidar and across for a rise to its left.
     """
 
     energy: FloatArray
@@ -160,7 +160,7 @@ class SeaShots:
 
 
 def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed: int = 2**40) -> SeaShots:
-    """Return the surface echoes of 600 shots at random places of four seas.
+    """Return the surface echoes of 600 shots at random locations on four seas.
 
     Parameters
     ----------
@@ -171,25 +171,25 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
     wind_direction : float
         Direction that the wind blows towards, counter-clockwise from the lidar's azimuth [rad].
     seed : int
-        Seed of seas and places, at least 0.
+        Seed of seas and locations, at least 0.
 
     Raises
     ------
     UserError
-        If the wind speed is out of range, or waves move the light by too many of the beam's widths.
+        If the wind speed is out of range, or waves move the light by too many beam widths.
 
     Notes
     -----
     Seas have the spectrum of Elfouhaily et al. (1997), doi:10.1029/97JC00467, with its short waves scaled to the slope
-    variances of Cox and Munk (1954), doi:10.1364/JOSA.44.000838. The side of a cell is a quarter of the beam's standard
+    variances of Cox and Munk (1954), doi:10.1364/JOSA.44.000838. A cell side is a quarter of the beam's standard
     deviation on the sea, at most 0.5 m. Ripples have the slope variance that cells do not resolve; waves longer than
-    the 512 cells of a realisation add planes of random height and slopes.
+    the 512 cells of a realisation add planes with random height and slopes.
 
-    A horizontal area dA sends the energy Q A p F(0) D dA/(4 n_z R^4) back to the aperture A, with the energy per solid
-    angle of the beam Q p, the distance R, the vertical component n_z of the facet's normal, the Fresnel reflectance F
-    and the distribution of the ripples' normals about that of the facet, D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) /
-    (2 pi sqrt(v_u v_c) cos^4), for slopes s of the ray against the facet and slope variances v of the ripples (Walter,
-    Marschner, Li and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking).
+    A horizontal area dA sends the energy Q A p F(0) D dA/(4 n_z R^4) back to the aperture A. Here Q p is the beam's
+    energy per solid angle, R the distance, n_z the vertical component of the facet normal, and F the Fresnel
+    reflectance. The ripple normals' distribution about the facet's is D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi
+    sqrt(v_u v_c) cos^4), for slopes s of the ray against the facet and ripple slope variances v. See Walter, Marschner,
+    Li and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
     """
     wind = in_range("wind_speed", wind_speed, LEAST_WIND_SPEED, MAX_WIND_SPEED)
     spectrum = MatchedSpectrum(ElfouhailySpectrum(wind, direction=wind_direction), *cox_munk(wind))
@@ -226,7 +226,7 @@ def _shots_of_one_sea(
     # Crests move light towards the lidar by height times tan(off_nadir).
     margin = 3 * math.sqrt(elevation + float(np.var(sea))) * math.tan(lidar.off_nadir)
     reach = (lidar.slant_range * lidar.half_angle / math.cos(lidar.off_nadir) + margin) / cell
-    # Waves move the light of a lidar close above them by many of its footprints.
+    # Waves move the light of a lidar close above them by many footprints.
     count = math.ceil(math.pi * (reach + 1) ** 2) * _POINTS**2
     if count > _MOST_POINTS:
         raise UserError(
@@ -258,14 +258,14 @@ def _shots_of_one_sea(
 
 
 def _cell_slopes(sea: FloatArray, cell: float) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
-    """Return the mean slopes in x and y of the cells of a periodic grid [1], and their covariance, shape (2, 2)."""
+    """Return the mean cell slopes in x and y on a periodic grid [1], and their covariance, shape (2, 2)."""
     right, up = (np.roll(sea, -1, axis) - sea for axis in (1, 0))
     right, up = (0.5 / cell * (one + np.roll(one, -1, axis)) for one, axis in ((right, 0), (up, 1)))
     return (right, up), np.cov(right.ravel(), up.ravel())
 
 
 def _cell_heights(sea: FloatArray, index: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]) -> FloatArray:
-    """Return the mean height of the four corners of cells [m]."""
+    """Return the mean height of the four cell corners [m]."""
     row, column = index
     below, right = (row + 1) % len(sea), (column + 1) % len(sea)
     return np.asarray(0.25 * (sea[row, column] + sea[below, column] + sea[row, right] + sea[below, right]))

@@ -1,4 +1,4 @@
-"""Quantities of a result from which the slope of the sea surface is estimated: wind, energies, pixels and echoes."""
+"""Result quantities that give the sea surface slope: wind, energies, pixels and echoes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estim
 
 
 def pixel_light(dataset: xr.Dataset) -> PixelLight:
-    """Return the distribution of the light in the pixels of a result."""
+    """Return the light distribution in a result's pixels."""
     lines = outlines(dataset)
     angle_x, angle_y = (1e-3 * dataset[name].values.astype(np.float64) for name in ("angle_x", "angle_y"))
     if len(lines) != angle_x.size or "divergence_mrad" not in dataset.attrs:
@@ -32,12 +32,12 @@ def pixel_light(dataset: xr.Dataset) -> PixelLight:
 
 
 def largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
-    """Return upper limits of the standard deviations of slopes along and across [1], and that of the range [m].
+    """Return upper limits of the slope standard deviations along and across [1], and of the range's [m].
 
-    Without any knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
-    slopes do, and its height as that of the fully developed sea with this slope variance: sigma = 0.21 U^2/(4 g)
-    (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
-    doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
+    With no knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
+    slopes do. Its height varies at most like the fully developed sea with this slope variance. Its deviation is sigma =
+    0.21 U^2/(4 g) (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), with the total 0.003 + 5.08e-3 U (Cox and
+    Munk 1954, doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
     """
     return deviations_of_sea(float(dataset.attrs.get("surface_slope_variance", math.inf)))
 
@@ -91,7 +91,7 @@ def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
 
 
 def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) -> PixelEchoes:
-    """Return the surface echoes of a table of `echo_table.extract` whose last dimension is pixel."""
+    """Return the surface echoes in a table from `echo_table.extract` whose last dimension is pixel."""
     pixels, width = echoes.sizes["pixel"], float(echoes.attrs["echo_fwhm_ns"])
     surface = echoes.sel(echo="surface")
     time, error, energy, energy_error = (
@@ -106,7 +106,7 @@ def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) ->
 
 
 def outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:
-    """Return the outlines of the pixels of a result [rad]; an empty list without them."""
+    """Return a result's pixel outlines [rad]; an empty list without them."""
     lines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
     return [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in lines]
 

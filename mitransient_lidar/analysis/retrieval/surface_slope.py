@@ -1,8 +1,8 @@
-"""Slope of the sea surface from times and strengths of its echo in the pixels of one shot.
+"""Sea surface slope from the times and strengths of its echo in one shot's pixels.
 
 Slopes are rises over runs, positive `along` the lidar's azimuth for a face towards the lidar, and `across` for a rise
-to the left (+angle_y). `slopes_on_sea` uses the statistics of a sea, `fit_plane` times alone, of any surface: its plane
-is at the distance rho along the receiver's axis, with 1/rho = A + B angle_x + C angle_y.
+to the left (+angle_y). `slopes_on_sea` uses a sea's statistics, `fit_plane` times alone, for any surface. Its plane is
+at the distance rho along the receiver's axis, with 1/rho = A + B angle_x + C angle_y.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ BoolArray = npt.NDArray[np.bool_]
 
 _NS = 1e-9 * C0 / 2  # metres of range per nanosecond
 _CELLS = 256  # cells per side of the grid for the light in a pixel
-_LEAST_ERROR_NS = 0.01  # smallest error of an echo's time
+_LEAST_ERROR_NS = 0.01  # smallest error of an echo time
 _LEAST_LEVER = 1e-4  # smallest standard deviation of the pixels' angles that determines a slope [rad]
-_CORRELATION = 0.4  # of the positions of the reflecting facets in two adjacent pixels
+_CORRELATION = 0.4  # between the positions of the reflecting facets in two adjacent pixels
 _LIKELY = 0.5  # expected fraction of an estimated slope that is not error
 
-# Errors of fitted surface echoes, from 1600 pixels of 200 rendered shots against the energies and times of the sea that
-# was rendered: of the energy, relative and in energies of the column; of the time, in widths of an echo, and of an echo
-# that is lost in the column, in spreads of the light over the pixel; and the energy of an echo that is half lost.
+# Errors of fitted surface echoes, from 1600 pixels in 200 rendered shots against the rendered sea's energies and times.
+# Energy: relative, and in column energies. Time: in echo widths, and for an echo that is lost in the column, in spreads
+# of the light over the pixel; and the energy of an echo that is half lost.
 _ENERGY_ERROR, _COLUMN_ERROR = 0.25, 0.25
 _TIME_ERROR, _LOST_TIME_ERROR, _HALF_LOST = 0.03, 1.5, 0.4
 
@@ -101,14 +101,14 @@ class SurfacePlane:
 def fit_plane(
     time_ns: npt.ArrayLike, light: PixelLight, off_nadir: float, *, stderr_ns: npt.ArrayLike = 0.0, facets: float = 1.0
 ) -> SurfacePlane:
-    """Fit a plane to the surface echoes of the pixels of each shot.
+    """Fit a plane to the surface echoes in each shot's pixels.
 
     Parameters
     ----------
     time_ns : array_like, shape (n, pixels)
-        Two-way times of the surface echoes [ns]; NaN for a pixel without an echo.
+        Two-way surface echo times [ns]; NaN for a pixel without an echo.
     light : PixelLight
-        Distribution of the light in the pixels.
+        Light distribution in the pixels.
     off_nadir : float
         Angle of the receiver's axis from the vertical [rad], 0 to below pi/2.
     stderr_ns : array_like, shape () or (n, pixels)
@@ -133,19 +133,19 @@ def fit_plane(
     hence along = tan(off_nadir + arctan(B/A)). The fit is least squares in 1/rho with weights from the errors of the
     times. Tulldahl (2006), FOI-R-2074-SE, section 3.1, states that times determine the slope, without a formula.
 
-    Assumptions: transmitter and receiver at one place; the echo of each pixel comes from the centroid of its light; the
+    Assumptions: transmitter and receiver at one location; each pixel's echo comes from the centroid of its light; the
     surface is plane within the footprint. Short waves violate the last two, since few facets anywhere in a pixel face
-    the lidar. This error dominates the noise. An error d of the centre changes the range by the relative amount
-    tan(off_nadir - tilt) d; the tilt of the face is taken as half the estimate, with the uncertainty of that. Hence
-    faces away from the lidar have larger errors. Errors of adjacent pixels, which the same crests cross, have a
-    correlation of 0.4 that falls with the distance in angle_x as exp(-dx^2/(2 spread^2)): it raises the error along and
-    lowers that across. One facet per pixel and 0.4 are from 600 rendered shots at 6 m/s along the wind, 20 degrees off
-    nadir, views of 15 and 30 mrad: centres of pixels had errors of 0.85 to 1.13 of the spread, with correlations of
-    0.30 to 0.43 between adjacent pixels and -0.24 to 0.18 otherwise. The root mean square of error over stated error is
-    1.04 to 1.28 along and 0.78 to 0.91 across, 0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
+    the lidar. This error dominates the noise. A centre error d changes the range by the relative amount tan(off_nadir -
+    tilt) d; the face's tilt is assumed to be half the estimate, with this uncertainty. Hence faces away from the lidar
+    have larger errors. Errors in adjacent pixels, which the same crests cross, have a correlation of 0.4 that falls
+    with the distance in angle_x as exp(-dx^2/(2 spread^2)). It raises the error along and lowers the error across. One
+    facet per pixel and 0.4 come from 600 rendered shots at 6 m/s along the wind, 20 degrees off nadir, views of 15 and
+    30 mrad. Pixel centres had errors of 0.85 to 1.13 spreads, with correlations of 0.30 to 0.43 between adjacent pixels
+    and -0.24 to 0.18 otherwise. The root mean square of error over stated error is 1.04 to 1.28 along and 0.78 to 0.91
+    across, 0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
 
-    Pixels narrow in angle_x are best, since it determines the time. The light of pixels that cut a wide beam is skewed,
-    and a fit of a symmetric echo too near to the axis: a level sea appears to face the lidar by up to 1.5 degrees.
+    Pixels narrow in angle_x are best, since it determines the time. Pixels that cut a wide beam have skewed light, and
+    a symmetric echo fit lies too near to the axis. A level sea then appears to face the lidar by up to 1.5 degrees.
     """
     x, y, spread = light.angle_x, light.angle_y, light.spread
     time = np.asarray(time_ns, dtype=np.float64)
@@ -164,7 +164,7 @@ def fit_plane(
 
 
 def _correlation(x: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return the correlation of the errors of the pixels' centroids."""
+    """Return the correlation between the errors of the pixels' centroids."""
     reach = float(np.mean(spread))
     apart = (x[:, np.newaxis] - x) / (reach if reach > 0 else 1.0)
     return np.asarray((1 - _CORRELATION) * np.eye(x.size) + _CORRELATION * np.exp(-0.5 * apart**2))
@@ -179,7 +179,7 @@ def _planes(
     correlation: FloatArray,
     angle: float,
 ) -> SurfacePlane:
-    """Return the planes of weighted fits of A, B and C in sequence, so that B and C may be undetermined.
+    """Return the planes by weighted fits of A, B and C in sequence, so that B and C may be undetermined.
 
     The errors of 1/rho, (n, pixels), are `alone` independent and `shared` correlated between pixels.
     """
@@ -214,7 +214,7 @@ def _planes(
     forward = np.cos(angle) + along * np.sin(angle)
     free = np.asarray(count - 1 - has_u - has_v)
     residual = np.where(known, inverse - a[:, np.newaxis] - b[:, np.newaxis] * x - c[:, np.newaxis] * y, 0.0)
-    # A deviation of 1/rho is one of time times t rho.
+    # A deviation in 1/rho equals a time deviation times t rho.
     misfit = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(free, 1)) / (_NS * a**2)
 
     return SurfacePlane(
@@ -230,20 +230,20 @@ def _planes(
 
 @dataclass(frozen=True)
 class PixelEchoes:
-    """Surface echoes of the pixels of shots; shape (n, pixels) each.
+    """Surface echoes in the pixels of shots; shape (n, pixels) each.
 
     Attributes
     ----------
     time_ns, time_stderr_ns
         Two-way times and their standard errors from noise [ns]; NaN for a pixel without an echo.
     energy, energy_stderr
-        Energy of the echo and its standard error from noise [J], or [V s] of a signal; NaN for a pixel without an echo.
+        Echo energy and its standard error from noise [J], or [V s] for a signal; NaN for a pixel without an echo.
     column_energy
-        Energy of the water column during an echo, which hides fainter ones, in the same unit, shape (pixels,).
+        Water column energy during an echo, which hides fainter ones, in the same unit, shape (pixels,).
     time_spread_ns
-        Standard deviation of the arrival of the light over the pixel from a level sea [ns], shape (pixels,).
+        Standard deviation of the light's arrival over the pixel from a level sea [ns], shape (pixels,).
     echo_fwhm_ns
-        Full width of an echo at half maximum [ns].
+        Full echo width at half maximum [ns].
     """
 
     time_ns: FloatArray
@@ -257,7 +257,7 @@ class PixelEchoes:
 
 @dataclass(frozen=True)
 class SeaEstimate:
-    """Slopes along and across [1] and height [m] of the sea under shots, averaged over the footprint of the beam.
+    """Sea slopes along and across [1] and height [m] under shots, averaged over the beam's footprint.
 
     Attributes
     ----------
@@ -273,42 +273,42 @@ class SeaEstimate:
 
 
 def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> SeaEstimate:
-    """Estimate slopes and height of the sea from times and strengths of the echoes, given the statistics of the sea.
+    """Estimate slopes and height of the sea from echo times and strengths, given the sea's statistics.
 
     Parameters
     ----------
     echoes : PixelEchoes
         Measured echoes.
     shots : SeaShots
-        Echoes of the same lidar at random places of a sea of the same statistics.
+        Echoes of the same lidar at random locations on a sea with the same statistics.
     scale : float or None
         Pulse energy times efficiencies and aperture area [J m^2], positive. If None, strengths are not used.
 
     Notes
     -----
     The estimate is linear in the observations y: E[a] + Cov(a, y) (Cov(y, y) + N)^-1 (y - E[y]), with the error
-    covariance Cov(a, a) - Cov(a, y) (Cov(y, y) + N)^-1 Cov(y, a). It has the least mean square error of all linear ones
-    and is the posterior mean of Gaussian a and y (Rodgers 2000, Inverse Methods for Atmospheric Sounding, eq. 2.44;
-    Kay 1993, Fundamentals of Statistical Signal Processing I, section 12.5). Means and covariances are those of
-    `shots`; thus the prior of a is the sea's, and errors include those that waves within the footprint cause: an
-    uneven echo has another centre than its pixel, and reflects the slopes of few facets. N is that of the measurement.
+    covariance Cov(a, a) - Cov(a, y) (Cov(y, y) + N)^-1 Cov(y, a). It has the least mean square error among linear
+    estimates and is the posterior mean for Gaussian a and y (Rodgers 2000, Inverse Methods for Atmospheric Sounding,
+    eq. 2.44; Kay 1993, Fundamentals of Statistical Signal Processing I, section 12.5). Means and covariances come from
+    `shots`; thus the prior of a is the sea's. Errors include the effects of waves within the footprint: an uneven echo
+    has another centre than its pixel, and reflects the slopes of few facets. N is the measurement covariance.
 
-    Observations are the time of each pixel, which measures the mean plane by its distance, and its strength as the
-    deviation u = sqrt(2 ln(E_0/(E + e))): the energy E of an echo is proportional to the density of specular slopes,
-    exp(-(tan(theta) - along)^2/(2 v)) for Gaussian slopes of the variance v within the footprint (Cox and Munk 1954,
-    doi:10.1364/JOSA.44.000838), so that u is linear in the slope along. E_0 is 2.7 times the largest of `shots`, and e
-    a quarter of the energy of the column, where fits of echoes become uncertain. A pixel without an echo has the
-    strength 0 +- e.
+    Observations are each pixel's time, which measures the mean plane by its distance, and its strength as the deviation
+    u = sqrt(2 ln(E_0/(E + e))). The echo energy E is proportional to the density of specular slopes. It is
+    exp(-(tan(theta) - along)^2/(2 v)) for Gaussian slopes with the variance v within the footprint (Cox and Munk 1954,
+    doi:10.1364/JOSA.44.000838), so that u is linear in the slope along. E_0 is 2.7 times the largest energy in `shots`,
+    and e a quarter of the column's energy, where echo fits become uncertain. A pixel without an echo has the strength 0
+    +- e.
 
-    The errors of the fits are 0.25 of the energy and e; in time 0.03 widths of an echo, and 1.5 spreads of the light
-    over the pixel for echoes far fainter than 0.4 energies of the column. These were measured at one sea (6 m/s, pulses
-    of 5 ns, column of c = 0.3 1/m); e scales with the column of other waters.
+    Fit errors are 0.25 of the energy and e. In time they are 0.03 echo widths, and 1.5 spreads of the light over the
+    pixel for echoes far fainter than 0.4 column energies. These were measured on one sea (6 m/s, pulses of 5 ns, column
+    of c = 0.3 1/m); e scales with the column in other waters.
 
-    Stated errors hold over all shots of a sea: in 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the root
+    Stated errors hold over all shots on a sea. In 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the root
     mean square of error over stated error was 0.88 to 1.06 along and 0.89 to 1.04 across. The correlation with the true
     slope along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels, and 0.71, 0.92 to 0.94 and 0.97 for 1x4. They do not
-    hold for each slope: at 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as
-    about 4 degrees, with errors of 1.6 to 1.9 times the stated ones.
+    hold for each slope. At 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as
+    about 4 degrees, with 1.6 to 1.9 times the stated errors.
     """
     truth = np.stack([shots.along, shots.across, shots.height], axis=1)
     energy = np.maximum(np.nan_to_num(echoes.energy), 0)
@@ -339,12 +339,12 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
 
 
 def _norm(*errors: FloatArray | float) -> FloatArray:
-    """Return the root of the sum of the squares of independent errors; NaN counts as 0."""
+    """Return the root of the summed squares of independent errors; NaN counts as 0."""
     return np.asarray(np.sqrt(sum(np.nan_to_num(error) ** 2 for error in errors)))
 
 
 def with_prior(slope: npt.ArrayLike, stderr: npt.ArrayLike, deviation: float) -> tuple[FloatArray, FloatArray]:
-    """Return mean and standard deviation of a slope [1] with a Gaussian prior for the slopes of the sea.
+    """Return a slope's mean and standard deviation [1] with a Gaussian prior for the sea's slopes.
 
     The prior has the mean 0 and the standard deviation of the slopes averaged over a footprint [1]. It is the result
     where `slope` or its standard error are NaN.
@@ -357,6 +357,6 @@ def with_prior(slope: npt.ArrayLike, stderr: npt.ArrayLike, deviation: float) ->
 
 
 def steepest(along: npt.ArrayLike, across: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the angle of a slope from the horizontal, and the direction of its rise from the azimuth [rad]."""
+    """Return a slope's angle from the horizontal, and the direction of its rise from the azimuth [rad]."""
     x, y = np.asarray(along, dtype=np.float64), np.asarray(across, dtype=np.float64)
     return np.asarray(np.arctan(np.hypot(x, y))), np.asarray(np.arctan2(y, x))

@@ -1,1 +1,1 @@
-"""Files of arrays, of JSON, XML and TOML: read within limits, and refused in one sentence."""
+"""Array, JSON, XML and TOML files: read within limits, and refused in one sentence."""

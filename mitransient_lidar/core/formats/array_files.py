@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
 LARGEST_ARRAY = 2**28
 
-EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
+EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: First four bytes in every OpenEXR file.
 
 Array = npt.NDArray[Any]
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
-    """Return the suffix of a file in lower case; `kind` is the kind of file, for the message.
+    """Return a file's suffix in lower case; `kind` is the file kind, for the message.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        raise UserError(f"cannot read {path}: the name of a {kind} must end in {', '.join(suffixes)}.")
+        raise UserError(f"cannot read {path}: the name of a {kind} must end in {', '.join(suffixes)}")
     open_file(path).close()
     return suffix
 
@@ -51,7 +51,7 @@ def read_npy(path: Path) -> Array:
 
 
 def read_npz(path: Path, names: Collection[str]) -> dict[str, Array]:
-    """Read those arrays of an archive in NumPy's format that have one of the names."""
+    """Read the arrays with some names from an archive in NumPy's format."""
     found = {}
     with (
         damaged_file(f"{path} is damaged, or is not an archive of arrays in NumPy's format."),
@@ -70,7 +70,7 @@ def _read_array(path: Path, file: IO[bytes]) -> Array:
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
     if any(size < 0 for size in shape):
-        raise ValueError(f"shape {shape}")  # some versions of NumPy read it
+        raise ValueError(f"shape {shape}")  # some NumPy versions read it
     check_size(path, math.prod(shape) * dtype.itemsize)
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -80,17 +80,17 @@ def check_size(path: str | os.PathLike[str], size: float, most: int = LARGEST_AR
     """Raise `UserError` if the arrays of a file have more bytes than allowed, which may be many times its own."""
     if size > most:
         sizes = f"{size / 2**20:.4g} MiB, and {most / 2**20:.4g} MiB are the most for a file of this kind"
-        raise UserError(f"{path} holds arrays of {sizes}.")
+        raise UserError(f"{path} holds arrays of {sizes}")
 
 
 def largest_result() -> int:
-    """Return the size of the largest arrays of a result that is read: half of the memory of this process [bytes]."""
+    """Return the size of the largest result arrays that are read: half this process's memory [bytes]."""
     return int(usable_memory())
 
 
 @contextlib.contextmanager
 def damaged_file(sentence: str) -> Iterator[None]:
-    """Convert the errors of a reader of foreign files to a `UserError` with a sentence.
+    """Convert errors by a reader of foreign files to a `UserError` with a sentence.
 
     Damaged headers make NumPy's parser raise almost any exception: SyntaxError, TokenError, OverflowError, ...
     """
@@ -103,7 +103,7 @@ def damaged_file(sentence: str) -> Iterator[None]:
 
 
 def read_exr(path: Path) -> dict[str, Array]:
-    """Read the channels of the first image of an OpenEXR file, each of shape (row, column) with the top row first."""
+    """Read the channels in an OpenEXR file's first image, each with the shape (row, column), top row first."""
     import OpenEXR
 
     damaged = f"{path} is damaged, or is not an OpenEXR file: its image cannot be read."
@@ -126,9 +126,9 @@ def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
 
 
 def check_hdf5(path: str | os.PathLike[str]) -> None:
-    """Raise `UserError` if an HDF5 file takes values or groups from other files, before any of them is read.
+    """Raise `UserError` if an HDF5 file takes values or groups from other files, before any is read.
 
-    A dataset may have its values in other files ("external storage", which may be a device), or in datasets of other
+    A dataset may have its values in other files ("external storage", which may be a device), or in datasets in other
     files ("virtual"), and a link may lead into another file.
     """
     import h5py
@@ -141,10 +141,10 @@ def check_hdf5(path: str | os.PathLike[str]) -> None:
             for name in group:
                 link = group.get(name, getlink=True)
                 if isinstance(link, h5py.ExternalLink):
-                    raise UserError(f"{path} holds a link {name!r} into another file: it must hold all that it needs.")
+                    raise UserError(f"{path} holds a link {name!r} into another file: it must hold all that it needs")
                 part = group[name] if isinstance(link, h5py.HardLink) else None
                 if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-                    raise UserError(f"{path} has {name!r} in other files: it must hold all values that it needs.")
+                    raise UserError(f"{path} has {name!r} in other files: it must hold all values that it needs")
                 # Links may lead back to a group above.
                 if isinstance(part, h5py.Group) and (at := h5py.h5o.get_info(part.id).addr) not in seen:
                     seen.add(at)

@@ -1,4 +1,4 @@
-"""Documents that others write, of XML and JSON: only what cannot do more than hold elements, numbers and texts."""
+"""XML and JSON documents by others: only those that contain nothing but elements, numbers and texts."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from xml.parsers import expat
 
 from mitransient_lidar.core.errors import UserError
 
-#: Deepest nesting of lists and tables in a document of JSON or TOML; functions that walk it are recursive.
+#: Deepest nesting of lists and tables in a JSON or TOML document; functions that walk it are recursive.
 _DEEPEST = 100
 _NESTED = (list, tuple, Mapping)
 
 
 def check_xml(text: str | bytes, name: object) -> None:
-    """Raise `UserError` if a document of XML is not well-formed, or holds more than elements, attributes and comments.
+    """Raise `UserError` if an XML document is not well-formed, or contains more than elements, attributes and comments.
 
-    A DOCTYPE, entities of its own and processing instructions are refused where they begin, before anything is
-    expanded: an entity may become any element, and grow without limit. `name` is that of the document in the message.
+    A DOCTYPE, its own entities and processing instructions are refused where they begin, before anything is expanded:
+    an entity may become any element, and grow without limit. `name` is the document's name in the message.
     """
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = _refusing(name, "a DOCTYPE")
@@ -27,20 +27,20 @@ def check_xml(text: str | bytes, name: object) -> None:
     try:
         parser.Parse(text, True)
     except (expat.ExpatError, UnicodeEncodeError) as error:
-        raise UserError(f"{name} is not well-formed XML: {error}.") from error
+        raise UserError(f"{name} is not well-formed XML: {error}") from error
 
 
 def _refusing(name: object, what: str) -> Callable[..., None]:
     """Return the handler that refuses a part of a document."""
 
     def refuse(*_: object) -> None:
-        raise UserError(f"{name} holds {what}: it must hold elements, attributes and comments only.")
+        raise UserError(f"{name} holds {what}: it must hold elements, attributes and comments only")
 
     return refuse
 
 
 def parse_json(text: Any, name: str) -> Any:
-    """Return the value of a text of JSON; raise `UserError` for another text, or one that is nested too deeply."""
+    """Return a JSON text's value; raise `UserError` for another text, or one that is nested too deeply."""
     try:
         value = json.loads(text)
     except RecursionError as error:

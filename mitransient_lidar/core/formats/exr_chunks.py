@@ -1,9 +1,9 @@
 """Headers and chunks of OpenEXR files, checked before OpenEXR reads them.
 
-OpenEXR prints messages of its own about damaged chunks, which only a change of the whole process could suppress. Format
-("OpenEXR File Layout", https://openexr.com/en/latest/OpenEXRFileLayout.html): signature and version; headers; tables of
-the places of all chunks; chunks. A chunk is its first line, the size of its data, and these; in files of several parts,
-the number of its part stands before.
+OpenEXR prints its own messages about damaged chunks, which only a change to the whole process could suppress. Format
+("OpenEXR File Layout", https://openexr.com/en/latest/OpenEXRFileLayout.html): signature and version; headers; tables
+with the positions of all chunks; chunks. A chunk is its first line, its data size, and the data; in files with several
+parts, the part number stands before.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import IO
 
 from mitransient_lidar.core.files import open_file
 
-#: Lines of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
+#: Lines per chunk, by compression number: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 
-#: Numbers of the compressions ZIPS, ZIP and PXR24, whose data are those of zlib.
+#: Numbers of the compressions ZIPS, ZIP and PXR24, whose data are zlib data.
 _ZIPS, _ZIP, _PXR24 = 2, 3, 5
 
-#: Bits of the version: a single part of tiles, parts of samples at several depths, several parts.
+#: Version bits: a single tiled part, parts with samples at several depths, several parts.
 _TILED, _DEEP, _SEVERAL = 0x200, 0x800, 0x1000
 
-#: Bytes of a sample of the types UINT, HALF and FLOAT, and within the data of PXR24.
+#: Bytes per sample for the types UINT, HALF and FLOAT, and within PXR24 data.
 _SAMPLE_BYTES, _PXR24_BYTES = (4, 2, 4), (4, 2, 3)
 
 #: Longest name of an attribute or a channel, and largest header [bytes].
@@ -34,13 +34,13 @@ _LONGEST_NAME, _LARGEST_HEADER = 255, 2**28
 
 @dataclass(frozen=True)
 class Part:
-    """One image of a file: its header."""
+    """One image in a file: its header."""
 
-    shape: tuple[int, int]  #: Lines, and pixels of a line.
+    shape: tuple[int, int]  #: Lines, and pixels per line.
     first_line: int
     channels: int
-    pixel_bytes: int  #: Bytes of all samples of a pixel.
-    inflated_bytes: int  #: Those within the data of zlib.
+    pixel_bytes: int  #: Bytes in all samples of a pixel.
+    inflated_bytes: int  #: Bytes within the zlib data.
     compression: int
     chunks: int  #: Number of chunks.
     is_plain: bool  #: Whether it has scan lines of a known compression, with samples in all pixels.
@@ -72,7 +72,7 @@ def read_headers(path: str | os.PathLike[str]) -> list[Part]:
 
 
 def check_chunks(path: str | os.PathLike[str]) -> None:
-    """Raise an error if chunks of scan lines are not where the file says, or do not decompress.
+    """Raise an error if scan line chunks are not where the file states, or do not decompress.
 
     Tiles are not checked, nor the data of other compressions than ZIP, ZIPS and PXR24.
 
@@ -95,7 +95,7 @@ def check_chunks(path: str | os.PathLike[str]) -> None:
 
 
 def _headers(file: IO[bytes]) -> tuple[list[Part], bool]:
-    """Return the parts of a file, which is then at its tables, and whether it is one of several."""
+    """Return a file's parts, with the file at its tables, and whether the file has several."""
     (version,) = struct.unpack("<4xI", file.read(8))
     several = bool(version & _SEVERAL)
     parts = [_part(_attributes(file), version)]
@@ -127,7 +127,7 @@ def _text(file: IO[bytes]) -> str:
 
 
 def _part(attributes: dict[str, bytes], version: int) -> Part:
-    """Return the part of a header."""
+    """Return a header's part."""
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     shape = bottom - top + 1, right - left + 1
     kinds, plain = _channels(attributes["channels"])
@@ -146,7 +146,7 @@ def _part(attributes: dict[str, bytes], version: int) -> Part:
 
 
 def _channels(data: bytes) -> tuple[list[int], bool]:
-    """Return the types of the samples of each channel of a list, and whether all of them have one in each pixel."""
+    """Return the sample types of each channel in a list, and whether all have one in each pixel."""
     found, plain, place = [], True, 0
     while data[place]:
         end = data.index(b"\0", place)

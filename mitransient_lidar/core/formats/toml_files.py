@@ -12,7 +12,7 @@ from mitransient_lidar.core.validation import shown
 
 
 def parse_toml(text: str, name: object) -> dict[str, Any]:
-    """Return the contents of a TOML file; raise `UserError`, with the name of the file, for another text."""
+    """Return the contents of a TOML file; raise `UserError`, with the file's name, for another text."""
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

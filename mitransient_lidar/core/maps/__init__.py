@@ -1,1 +1,1 @@
-"""Maps: grids of heights, and coordinate systems."""
+"""Maps: height grids, and coordinate systems."""

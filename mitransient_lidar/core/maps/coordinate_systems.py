@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-#: Largest difference of a projection's scale from 1. UTM zones and national grids have up to 0.003, Mercator's
-#: projection beyond 8 degrees of latitude has more.
+#: Largest difference between a projection's scale and 1. UTM zones and national grids have up to 0.003, Mercator's
+#: projection beyond 8 degrees latitude has more.
 LARGEST_DISTORTION = 0.01
 
 _METRES_PER_FOOT = 0.3048
@@ -40,10 +40,10 @@ os.register_at_fork(after_in_child=_thread.cache_clear)
 
 
 def _in_one_thread(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Run a function in a thread that lasts, and return what it does, which must hold no object of pyproj.
+    """Run a function in a lasting thread, and return its result, which must contain no pyproj object.
 
-    Mitsuba reads scenes in threads that end for Python after each plugin. pyproj then destroys what it keeps for the
-    thread, and takes it again for the next plugin: the process ended in a segmentation fault.
+    Mitsuba reads scenes in threads that end for Python after each plugin. pyproj then destroys its data for the thread,
+    and takes them again for the next plugin: the process ended in a segmentation fault.
     """
 
     @functools.wraps(function)
@@ -58,9 +58,9 @@ class MapSystem(NamedTuple):
 
     wkt: str | None  #: WKT of the horizontal part; None for an old .prj file, which names units only.
     name: str
-    unit: str  #: Unit of positions.
+    unit: str  #: Position unit.
     metres: float  #: Its length [m].
-    vertical_unit: str = ""  #: Unit of heights, "" if it is not stated.
+    vertical_unit: str = ""  #: Height unit, "" if it is not stated.
     vertical_metres: float = 1.0  #: Its length [m].
     is_down: bool | None = None  #: Whether the vertical axis points down; None without one.
     datum: str = ""  #: Name of the vertical part.
@@ -79,14 +79,14 @@ class MapSystem(NamedTuple):
         if not abs(scale - 1) < LARGEST_DISTORTION:
             raise UserError(
                 f"{path} has coordinates in {self.name}, whose lengths at ({x:.10g}, {y:.10g}) are {scale:.4g} times"
-                f" those on the ground: they must be within {LARGEST_DISTORTION:.0%}, as in UTM."
+                f" those on the ground: they must be within {LARGEST_DISTORTION:.0%}, as in UTM"
             )
 
     @_in_one_thread
     def distance_from(self, other: MapSystem, x: float, y: float) -> float:
-        """Return how far a point x, y [m] of this system is from that of the same numbers in another one [m].
+        """Return the distance between the point x, y [m] in this system and the same numbers in another one [m].
 
-        It is that of the farthest corner of a square of 1 km at the point.
+        It is the distance at the farthest corner of a 1 km square at the point.
         """
         if self.wkt is None or other.wkt is None:
             return 0.0
@@ -118,7 +118,7 @@ def is_east_north(system: Any) -> bool:
 
 @_in_one_thread
 def map_system(path: object, text: Any, name: object = None) -> MapSystem:
-    """Return the system of a map from a code, a WKT or attributes, which are those of `name` or of the map's own file.
+    """Return a map's system from a code, a WKT or attributes, which belong to `name` or to the map's own file.
 
     Raises
     ------
@@ -136,13 +136,13 @@ def map_system(path: object, text: Any, name: object = None) -> MapSystem:
         horizontal = horizontal.source_crs
     called = system.name
     if horizontal.is_geographic:
-        raise UserError(f"{path} has coordinates in degrees ({called}): they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in degrees ({called}): they must be projected, in metres or feet")
     if not horizontal.is_projected and not horizontal.is_engineering:
-        raise UserError(f"{path} has coordinates in {called}: they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in {called}: they must be projected, in metres or feet")
     axes = horizontal.axis_info[:2]
     if horizontal.is_projected and not is_east_north(horizontal):
         directions = " and ".join(str(axis.direction) for axis in axes)
-        raise UserError(f"{path} has coordinates in {called}, to {directions}: they must be to east and north.")
+        raise UserError(f"{path} has coordinates in {called}, to {directions}: they must be to east and north")
     unit, metres = (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else ("metre", 1.0)
     found = MapSystem(horizontal.to_wkt() if horizontal.is_projected else None, called, unit, metres)
     if vertical is None:
@@ -156,7 +156,7 @@ def map_system(path: object, text: Any, name: object = None) -> MapSystem:
 
 
 def read_prj(path: Path) -> MapSystem | None:
-    """Return the system of the file of a grid's name that ends in .prj, None if there is none.
+    """Return the system in the .prj file that shares a grid's name, None if there is none.
 
     Such files are WKT, or lines such as ``Projection UTM`` and ``Units METERS`` in an old format of ESRI.
     """
@@ -169,12 +169,12 @@ def read_prj(path: Path) -> MapSystem | None:
     words = [line.split() for line in text.upper().splitlines()]
     old = {line[0]: " ".join(line[1:]) for line in words if len(line) > 1}
     if old["PROJECTION"].startswith("GEO") or old.get("UNITS") in ("DD", "DS", "DMS"):
-        raise UserError(f"{path} has coordinates in degrees ({prj}): they must be projected, in metres or feet.")
+        raise UserError(f"{path} has coordinates in degrees ({prj}): they must be projected, in metres or feet")
     lengths = {"METERS": 1.0, "FEET": _METRES_PER_FOOT}
     unit, heights = old.get("UNITS", "METERS"), old.get("ZUNITS", "NO")
     for name, value, allowed in (("Units", unit, lengths), ("Zunits", heights, (*lengths, "NO"))):
         if value not in allowed:
-            raise UserError(f"{path} has {name} {value} in {prj}: allowed are {', '.join(allowed)}.")
+            raise UserError(f"{path} has {name} {value} in {prj}: allowed are {', '.join(allowed)}")
     stated = {} if heights == "NO" else {"vertical_unit": heights.lower(), "vertical_metres": lengths[heights]}
     return MapSystem(None, old["PROJECTION"], unit.lower(), lengths[unit], **stated)  # type: ignore[arg-type]
 

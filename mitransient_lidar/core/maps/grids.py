@@ -1,4 +1,4 @@
-"""Grids of heights in map coordinates: ESRI ASCII grids, GeoTIFF and Bathymetric Attributed Grids (BAG)."""
+"""Height grids in map coordinates: ESRI ASCII grids, GeoTIFF and Bathymetric Attributed Grids (BAG)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mitransient_lidar.core.formats.array_files import LARGEST_ARRAY, Array, che
 from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 
-#: Value of cells of an ASCII grid without a height, if the header does not name another, and of BAG cells.
+#: Value of ASCII grid cells without a height, if the header does not name another, and of empty BAG cells.
 _ASCII_EMPTY, _BAG_EMPTY = -9999.0, 1e6
 
-#: Relative difference of a cell from the value that stands for no height: six digits may be written of it.
+#: Relative difference between a cell and the no-height value: it may be written with six digits.
 _ROUNDED = 1e-5
 
 #: Largest distance of heights from the mean sea level [m]: deeper than any sea.
@@ -29,24 +29,24 @@ _HIGHEST = 12_000.0
 NO_DATA = (99.0, 999.0, 9999.0)
 _NEAR = 0.1
 
-#: Largest deviation of the corners of a BAG file from its cells, in cells.
+#: Largest deviation between a BAG file's corners and its cells, in cells.
 _CORNER_TOLERANCE = 0.1
 
 
 class Stated(NamedTuple):
-    """What a file states of its heights and positions."""
+    """Statements of a file about its heights and positions."""
 
-    unit: str = ""  #: Unit of heights, "" if it is not stated.
+    unit: str = ""  #: Height unit, "" if it is not stated.
     is_down: bool | None = None  #: Whether the values are depths; None if it is not stated.
-    position_unit: str = ""  #: Unit of positions, "" if it is not stated.
+    position_unit: str = ""  #: Position unit, "" if it is not stated.
     system: MapSystem | None = None
 
 
 class Grid(NamedTuple):
     """Heights on a grid, in the units of their file."""
 
-    values: Array  #: Shape (rows, columns) of increasing y and x; NaN where there is no value.
-    positions: dict[str, Array]  #: Those of the columns, ``x``, and of the rows, ``y``, as far as the file has them.
+    values: Array  #: Shape (rows, columns) with increasing y and x; NaN where there is no value.
+    positions: dict[str, Array]  #: Column positions ``x``, and row positions ``y``, as far as the file has them.
     stated: Stated = Stated()
     centre: tuple[float, float] | None = None  #: Point x, y from which the positions count; None for the origin.
 
@@ -54,7 +54,7 @@ class Grid(NamedTuple):
     def of_cells(
         cls, values: FloatArray, first: tuple[float, float], cell: tuple[float, float], stated: Stated
     ) -> Grid:
-        """Return a grid from the centre (x, y) of the cell in row 0 and column 0, and the sizes of cells along x and y.
+        """Return a grid from the centre (x, y) of the cell in row 0 and column 0, and the cell sizes along x and y.
 
         Map coordinates have up to eight digits: positions are exact about the centre.
         """
@@ -92,7 +92,7 @@ def undeclared_no_data(
 
 
 def read_ascii_grid(path: Path) -> Grid:
-    """Read an ESRI ASCII grid: a header of names and numbers, and rows of cells from the largest y down.
+    """Read an ESRI ASCII grid: a header with names and numbers, and cell rows from the largest y down.
 
     Header (ESRI, "ASCII raster format"): ncols, nrows, xllcorner or xllcenter, yllcorner or yllcenter, cellsize or dx
     and dy, and nodata_value, by default -9999. A file of the same name that ends in .prj may describe the coordinates.
@@ -104,10 +104,10 @@ def read_ascii_grid(path: Path) -> Grid:
         header = {words[i].lower(): float(words[i + 1]) for i in range(0, length, 2)}
         values = np.array(words[length:], dtype=np.float64)
     except ValueError as error:
-        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}.") from error
+        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}") from error
     columns, rows = (integer(f"{path}: {name}", _entry(path, header, name), 1, 10**6) for name in ("ncols", "nrows"))
     if values.size != columns * rows:
-        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
+        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}")
     cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
     positive(f"{path}: cellsize", min(cell))
     first = [
@@ -121,36 +121,36 @@ def read_ascii_grid(path: Path) -> Grid:
 
 
 def _entry(path: Path, header: dict[str, float], *names: str) -> float:
-    """Return the first of these entries of a header."""
+    """Return the first of these header entries."""
     for name in names:
         if np.isfinite(header.get(name, np.nan)):
             return header[name]
-    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}.")
+    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}")
 
 
 def stated_by(system: MapSystem | None, unit: str = "") -> Stated:
-    """Return what a coordinate system states; `unit` is that of heights, if the file has it elsewhere."""
+    """Return a coordinate system's statements; `unit` is the height unit, if the file has it elsewhere."""
     if system is None:
         return Stated(unit)
     return Stated(unit or system.vertical_unit, system.is_down, system.unit, system)
 
 
 def read_geotiff(path: Path) -> Grid:
-    """Read a GeoTIFF of one band."""
+    """Read a GeoTIFF with one band."""
     return _read_raster(path, "GTiff", "GeoTIFF")
 
 
 def read_bag(path: Path) -> Grid:
-    """Read the elevations of a Bathymetric Attributed Grid of one resolution, positive up [m].
+    """Read the elevations in a Bathymetric Attributed Grid with one resolution, positive up [m].
 
     The format (Open Navigation Surface, "Format Specification Document: Description of Bathymetric Attributed Grid
-    Object") is HDF5. Its corners are the centres of cells, but some programs write their edges.
+    Object") is HDF5. Its corners are cell centres, but some programs write their edges.
     """
     return _read_raster(path, "BAG", "Bathymetric Attributed Grid of one resolution")
 
 
 def _read_raster(path: Path, driver: str, kind: str) -> Grid:
-    """Read the first band of a raster by a driver of GDAL."""
+    """Read a raster's first band by a GDAL driver."""
     import rasterio
 
     if driver == "BAG":
@@ -172,11 +172,11 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
     """Return the first band of an open raster; refuse several bands, and rotated or missing map coordinates."""
     place = file.transform
     if file.count != 1 and not is_bag:
-        raise UserError(f"{path} has {file.count} bands: a height map must have one.")
+        raise UserError(f"{path} has {file.count} bands: a height map must have one")
     if place.is_identity:
-        raise UserError(f"{path} has no map coordinates: it must have them.")
+        raise UserError(f"{path} has no map coordinates: it must have them")
     if place.b != 0 or place.d != 0:
-        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
+        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x")
     system = map_system(path, file.crs.to_wkt()) if file.crs else None
     check_size(path, 8.0 * file.width * file.height)
     values = without_no_data(file.read(1), _BAG_EMPTY if is_bag else file.nodata)
@@ -201,7 +201,7 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
 def _corner_shift(
     path: Path, metadata: dict[str, str], count: tuple[int, int], cell: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the distances of the first cell of a BAG from its corner along x and y, in cells: 0, or 0.5 for edges."""
+    """Return the distances from a BAG's corner to its first cell along x and y, in cells: 0, or 0.5 for edges."""
     found = re.search(r"coordinates[^>]*>([^<]*)<", " ".join(metadata.values()))
     corners = [[float(one) for one in word.split(",")[:2]] for word in found[1].split()[:2]] if found else []
     shifts = []
@@ -210,7 +210,7 @@ def _corner_shift(
         inset = next((shift for shift in (0, 1) if abs(steps - number + 1 - shift) < _CORNER_TOLERANCE), None)
         if inset is None:
             raise UserError(
-                f"{path} has {number} cells along {'xy'[axis]}, but corners that are {steps:.6g} cells apart."
+                f"{path} has {number} cells along {'xy'[axis]}, but corners that are {steps:.6g} cells apart"
             )
         shifts.append(0.5 * inset)
     return shifts[0], shifts[1]

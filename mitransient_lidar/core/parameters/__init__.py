@@ -1,1 +1,1 @@
-"""What is declared: the parameters of all plugins."""
+"""Declarations: the parameters of all plugins."""

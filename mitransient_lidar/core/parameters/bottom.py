@@ -1,4 +1,4 @@
-"""Parameters of the bottom, of surfaces of targets, and of daylight."""
+"""Parameters of the bottom, of target surfaces, and of daylight."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ SEABED = plugin(
         "or ``fathom``", otherwise="``m``"),
     number("map_no_data", None, "", float("-inf"), float("inf"),
         "Value of cells without a height where the file does not declare it"),
-    text("map_holes", None, "``refuse`` or ``fill`` cells without a value, with that of the nearest cell",
+    text("map_holes", None, "``refuse`` cells without a value, or ``fill`` them from the nearest cell",
         otherwise="``refuse``"),
     number("map_cell", None, "m", 0, float("inf"), "Cell of the grid on which points are interpolated", above=True,
         otherwise="their own grid, or their mean spacing"),
     number("origin_x", None, "m", float("-inf"), float("inf"),
         "Point of the map, in its coordinates in metres, that lies at x = y = 0",
-        otherwise="of an .asc, .tif or .bag, or of points, the ``origin`` of a flight, else the centre; positions in "
-        "other files are those of the scene"),
+        otherwise="the ``origin`` of a flight, else the map centre, for .asc, .tif, .bag, points; positions in other "
+        "files are scene coordinates"),
     number("origin_y", None, "m", float("-inf"), float("inf"), "Its y, given together"),
     number("reflectance", 0.1, "1", 0, 1, "Lambertian reflectance"),
     text("patches", "",
@@ -50,8 +50,8 @@ SEABED = plugin(
     number("refined_size", AUTO, "m", 0, float("inf"),
         "Its side; ``auto``: 20 m, or the map's longer side, or more for the patches", above=True),
     number("cell_size", AUTO, "m", 0, 1e4,
-        "Side of its cells; ``auto``: an eighth of the ripples' length, an eighth of the smallest patch's radius, the "
-        "map's own or 0.25 m, the smallest of them", above=True),
+        "Its cell side; ``auto``: an eighth of the ripple length, an eighth of the smallest patch radius, the map's "
+        "own or 0.25 m, the smallest of them", above=True),
     number("size", 1000.0, "m", 1e-3, 1e6, "Side of the bottom: cells grow outside the square"),
     nested("(nested)", "bsdf", "Any BSDF instead of the Lambertian one"),
 )
@@ -60,13 +60,14 @@ SEDIMENT = plugin(
     "sediment",
     text("model", "lambertian", "Law of reflection", ("lambertian", "hapke")),
     text("reflectance", None,
-        "Share of the light that is reflected, at vertical incidence, or, to 700 nm, ``coral_sand``, ``green_algae``, "
-        "``brown_algae`` or ``red_algae``; to 1100 nm ``sand``, ``wet_sand``, ``asphalt``, ``concrete``, ``basalt``, "
-        "``limestone``, ``grass`` or ``rush`` (of salt marshes)", unit="1", low=0, high=1, otherwise="``0.1``"),
-    number("wavelength_nm", 532.0, "nm", 300, 1100, "Wavelength of a reflectance by name, 400 or more"),
-    number("single_scattering_albedo", None, "1", 0, 1, "hapke: albedo of the particles, instead of ``reflectance``"),
+        "Share of light reflected at vertical incidence, or a bottom by name: to 700 nm ``coral_sand``, "
+        "``green_algae``, ``brown_algae`` or ``red_algae``; to 1100 nm ``sand``, ``wet_sand``, ``asphalt``, "
+        "``concrete``, ``basalt``, ``limestone``, ``grass`` or ``rush`` (from salt marshes)",
+        unit="1", low=0, high=1, otherwise="``0.1``"),
+    number("wavelength_nm", 532.0, "nm", 300, 1100, "Wavelength for a reflectance by name, 400 or more"),
+    number("single_scattering_albedo", None, "1", 0, 1, "hapke: particle albedo, instead of ``reflectance``"),
     number("lobe_asymmetry", 0.0, "1", 0, 0.9,
-        "hapke: asymmetry *b* of the lobes of the particles' phase function; 0 of particles that scatter evenly"),
+        "hapke: asymmetry *b* of the lobes in the particles' phase function; 0 for particles that scatter evenly"),
     number("backward_share", 0.5, "1", 0, 1,
         "hapke: share *s* of the lobe towards the source; (1 + c)/2 with Hapke's c"),
     number("opposition_amplitude", 1.0, "1", 0, 3, "hapke: opposition effect :math:`B_0`"),
@@ -90,12 +91,12 @@ LEAF = plugin("leaf", _REFLECTANCE, _TRANSMITTANCE)
 
 CANOPY = plugin(
     "canopy",
-    number("leaf_area_index", 2.0, "1", 0, 20, "Area of leaves, of one side, per area of the bottom", above=True),
-    number("height", 0.5, "m", 0, 100, "Height of the plants above the bottom", above=True, by_id=True),
+    number("leaf_area_index", 2.0, "1", 0, 20, "One-sided leaf area per bottom area", above=True),
+    number("height", 0.5, "m", 0, 100, "Plant height above the bottom", above=True, by_id=True),
     text("form", "blades", "``blades`` that stand on the bottom, or ``leaves`` everywhere in the layer",
         ("blades", "leaves"), by_id=True),
     number("leaf_width", 0.01, "m", 0, 10, "Width of a blade, side of a square leaf", above=True),
-    number("bending_deg", 25.0, "degree", 0, 80, "Angle of blades with the vertical"),
+    number("bending_deg", 25.0, "degree", 0, 80, "Blade angle from the vertical"),
     number("bending_azimuth_deg", None, "degree", -3600, 3600,
         "Azimuth towards which they lean, from +x towards +y", otherwise="any, at random"),
     number("shoot_density", None, "1/m2", 0, 1e6, "Shoots, whose blades stand at one place", above=True,
@@ -111,7 +112,7 @@ CANOPY = plugin(
     nested("(nested)", "shape, bsdf", "A ``seabed`` on which they stand; any BSDF instead of ``leaf``"),
 )
 
-#: Shares of light that BSDFs of Mitsuba reflect or transmit.
+#: Light shares that Mitsuba's BSDFs reflect or transmit.
 OF_MITSUBA = tuple(
     number(f"{part}{share}", None, "1", 0, 1, "Share of the light")
     for part in ("", "diffuse_", "specular_") for share in ("reflectance", "transmittance")
@@ -132,9 +133,9 @@ GRAM_CHARLIER_DIELECTRIC = plugin(
 )
 
 _WAVELENGTH = number("wavelength_nm", 532.0, "nm", 300, 1100,
-    "Wavelength of the light; the irradiance of a clear sky is known from 510 to 540 nm")
+    "Wavelength of the light; the clear-sky irradiance is known from 510 to 540 nm")
 
-_OF_A_CLEAR_SKY = "that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)"
+_OF_A_CLEAR_SKY = "the clear-sky value at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)"
 
 SUN = plugin(
     "sun",
@@ -156,6 +157,6 @@ SKY = plugin(
     number("irradiance", None, "W m-2 nm-1", 0, 1e6, "Irradiance at the sea on a level plane",
         otherwise=f"for ``clear`` {_OF_A_CLEAR_SKY}; required for the others"),
     _WAVELENGTH,
-    number("sun_zenith_deg", 40.0, "degree", 0, 89, "``clear``: angle of the sun from the vertical"),
-    number("sun_azimuth_deg", 0.0, "degree", -3600, 3600, "``clear``: azimuth of the sun, from +x towards +y"),
+    number("sun_zenith_deg", 40.0, "degree", 0, 89, "``clear``: sun angle from the vertical"),
+    number("sun_azimuth_deg", 0.0, "degree", -3600, 3600, "``clear``: sun azimuth, from +x towards +y"),
 )

@@ -1,4 +1,4 @@
-"""All declared parameters, by plugin and by name: ranges, units and files of parameters of scenes."""
+"""All declared parameters, by plugin and by name: ranges, units and files of scene parameters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from mitransient_lidar.core.parameters import bottom, integrators, lidar, sea, water
 from mitransient_lidar.core.parameters.fields import Parameter, Plugin
 
-#: Declarations of the plugins by name.
+#: Plugin declarations by name.
 PLUGINS: dict[str, Plugin] = {
     each.name: each
     for module in (lidar, sea, water, bottom, integrators)
@@ -16,23 +16,23 @@ PLUGINS: dict[str, Plugin] = {
     if isinstance(each, Plugin)
 }
 
-#: Names of parameters whose value is the name of a file.
+#: Names of parameters whose value is a file name.
 FILE_PARAMETERS = tuple(dict.fromkeys(each.name for plugin in PLUGINS.values() for each in plugin if each.is_file))
 
-#: Units of parameters of scenes that no plugin declares, such as the places of shapes, by the ends of their names.
+#: Units of scene parameters that no plugin declares, such as shape positions, by name ending.
 _UNIT_OF_END = {
     **{"_deg": "degree", "_seed": "1", "_count": "1"},
     **{f"_{end}": "m" for end in ("x", "y", "height", "length", "width", "left", "middle", "right")},
 }
 
-#: Plugins whose parameters are no quantities that are measured: of the time axis and gates, and of estimators.
+#: Plugins whose parameters are no measured quantities: time axis, gates, and estimators.
 _NOT_MEASURED = (lidar.TIME_GATED_FILM, *filter(lambda each: isinstance(each, Plugin), vars(integrators).values()))
 
 
 def declared(name: str, plugin: str | None = None) -> list[Parameter]:
-    """Return the parameters of a name, of a plugin or of all of this package.
+    """Return the parameters with a name, in a plugin or in all of this package.
 
-    Where no parameter of all has it, those of the name behind an id: ``surface_time`` is ``time``.
+    If none has it, return the parameters with the name after an id: ``surface_time`` is ``time``.
     """
     if plugin is not None:
         return [each for each in PLUGINS.get(plugin, bottom.OF_MITSUBA) if each.name == name]
@@ -45,7 +45,7 @@ def declared(name: str, plugin: str | None = None) -> list[Parameter]:
 
 
 def limits(name: str, plugin: str | None = None) -> tuple[float, float] | None:
-    """Return lowest and highest value of a number, a parameter of a plugin or of all that have one of this name.
+    """Return a number's lowest and highest value, for a plugin parameter or for all with this name.
 
     None where there is no such parameter of a limited range, or it is an integer.
     """
@@ -55,13 +55,13 @@ def limits(name: str, plugin: str | None = None) -> tuple[float, float] | None:
 
 
 def unit_of(name: str) -> str | None:
-    """Return the unit of a parameter of a plugin or a shipped scene; None for texts and other names."""
+    """Return the unit of a parameter in a plugin or a shipped scene; None for texts and other names."""
     unit = next((each.unit for each in declared(name) if each.unit), None)
     return unit or next((unit for end, unit in _UNIT_OF_END.items() if name.endswith(end)), None)
 
 
 def is_quantity(name: str) -> bool:
-    """Return whether a parameter may be one of what is measured: not of bins, gates, estimators or random numbers."""
+    """Return whether a parameter may be a measured quantity: not for bins, gates, estimators or random numbers."""
     found = declared(name)
     return not found or any(
         each.kind != "integer" and not any(each in one.parameters for one in _NOT_MEASURED) for each in found

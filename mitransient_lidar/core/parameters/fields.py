@@ -33,7 +33,7 @@ def is_green(wavelength_nm: float | None) -> bool:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a plugin.
+    """A plugin parameter.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Parameter:
     unit
         Unit as in data files, ``1`` of a plain number; empty for texts.
     low, high
-        Range of a number, or of each number of a list.
+        Range of a number, or of each number in a list.
     above
         Whether `low`, which is then 0, is itself outside the range.
     choices
@@ -54,14 +54,14 @@ class Parameter:
     may_be_auto, may_be_empty
         Whether ``auto`` leaves the choice to the scene, and whether an empty text counts as not given.
     is_file
-        Whether the value is the name of a file.
+        Whether the value is a file name.
     by_id
-        Whether its name alone stands for a parameter of other plugins, so that only one with an id or the name of its
-        plugin reaches it.
+        Whether its name alone means a parameter in other plugins, so that only one with an id or its plugin's name
+        reaches it.
     of_green
         Whether `default` holds for green lasers alone (`is_green`).
     otherwise
-        What holds without a value where `default` does not say it.
+        Rule without a value where `default` does not state it.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Parameter:
         Raises
         ------
         UserError
-            If it is not allowed; the sentence names the parameter, the value and what is allowed.
+            If it is not allowed; the sentence names the parameter, the value and the allowed values.
         """
         if value is None or (self.may_be_auto and value == AUTO) or self.is_list:
             return value
@@ -108,7 +108,7 @@ class Parameter:
         return number_within(self.name, value, self.low, self.high, above=self.above)
 
     def per_layer(self, given: Any, layers: int) -> FloatArray:
-        """Return one number a layer of a list of one for all or one for each; else raise ``UserError``."""
+        """Return one number per layer from a list with one for all or one for each; else raise ``UserError``."""
         values = number_list(self.name, given)
         if values.size not in (1, layers):
             raise UserError(f"{self.name} has {values.size} values but must have 1 or {layers}, one a layer")
@@ -130,7 +130,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """What is allowed, for the manual."""
+        """Allowed values, for the manual."""
         if self.choices:
             return ", ".join(f"``{each}``" for each in self.choices)
         low, high = (_shown(float(limit)) for limit in (self.low, self.high))
@@ -145,10 +145,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Plugin:
-    """Name of a plugin, its parameters in the order of the manual, and those that describe one thing in several ways.
+    """A plugin's name, its parameters in manual order, and those that describe one thing in several ways.
 
-    Each of `alternatives` is a list of the ways, and each way the names of its parameters; ``a nested sensor`` stands
-    for an object of this kind.
+    Each entry in `alternatives` lists the ways, and each way the names of its parameters; ``a nested sensor`` means an
+    object of this kind.
     """
 
     name: str
@@ -164,7 +164,7 @@ class Plugin:
         return iter(self.parameters)
 
     def replaced(self, given: Collection[str]) -> set[str]:
-        """Return the names of the parameters in place of which given ones describe the same."""
+        """Return the parameter names that given ones replace, as they describe the same."""
         return {
             name
             for ways in self.alternatives
@@ -191,7 +191,7 @@ class Plugin:
         return Read(self, get)
 
     def table(self) -> str:
-        """Return the table of the manual in reStructuredText."""
+        """Return the manual's table in reStructuredText."""
         lines = [".. list-table::", "   :header-rows: 1", "   :widths: auto", ""]
         rows = [("Parameter", "Type", "Meaning")]
         for each in self.parameters:
@@ -204,7 +204,7 @@ class Plugin:
 
 
 def plugin(name: str, *parameters: Parameter, alternatives: tuple[tuple[tuple[str, ...], ...], ...] = ()) -> Plugin:
-    """Return the declaration of a plugin."""
+    """Return a plugin's declaration."""
     return Plugin(name, parameters, alternatives)
 
 
@@ -221,12 +221,12 @@ class Read:
         return parameter.checked(self.get(name, parameter.default if default is None else default))
 
     def given(self, *names: str) -> list[str]:
-        """Return those of some parameters that have a value."""
+        """Return those parameters that have a value."""
         return [name for name in names if self.get(name, None) not in (None, "")]
 
 
 def _shown(value: Any) -> str:
-    """Return the text of a value in the manual."""
+    """Return a value's text in the manual."""
     if isinstance(value, bool):
         return str(value).lower()
     return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}") if isinstance(value, float) else str(value)
@@ -261,7 +261,7 @@ def switch(name: str, default: bool | None, meaning: str, **more: Any) -> Parame
 
 
 def file(name: str, meaning: str, **more: Any) -> Parameter:
-    """Return the name of a file."""
+    """Return a file's name."""
     return Parameter(name, "string", meaning, is_file=True, **more)
 
 

@@ -1,4 +1,4 @@
-"""Parameters of the integrators."""
+"""Integrator parameters."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ LIDAR_MERGING = plugin(
     count("photons_per_pass", None, _FEWEST, _MOST, "Paths from the laser in one pass",
         otherwise="``32768``, or ``65536`` from 4096 pixels on"),
     number("cell_size", 0.0, "m", 0, 1e4,
-        "Horizontal width of the cells on the beam's axis at the surface, within 2e-6 to 2 standard deviations of the "
-        "beam there; 0: from footprint, facets of the sea, field of view and attenuation. Smaller cells have less bias "
-        "and more noise", by_id=True),
+        "Horizontal cell width on the beam's axis at the surface, within 2e-6 to 2 standard deviations of the beam "
+        "there; 0: from footprint, sea facets, field of view and attenuation. Smaller cells have less bias and more "
+        "noise", by_id=True),
     number("point_spacing", 0.0, "m", 0, 1e4,
         "Distance between points along a path; 0: a fourteenth of the distance to the bottom or to the depth that the "
         "time axis allows, a tenth from 4096 pixels on"),
@@ -48,12 +48,12 @@ LIDAR_VOLPATH = plugin(
         "Throughput below which Russian roulette begins. A path that was scattered back carries little throughput and "
         "much signal, so this is low"),
     _guiding("guiding_probability", 0.4,
-        "Probability, at scattering events and at hits of rough solids under water, that the direction is drawn from a "
-        "broad lobe towards the laser instead of the phase function or BSDF: every echo needs one large scattering "
+        "Probability, at scattering events and at hits on rough solids under water, that the direction is drawn from "
+        "a broad lobe towards the laser instead of the phase function or BSDF: every echo needs one large scattering "
         "angle, which is rare"),
     switch("complement_only", False,
-        "Whether to leave out the paths of ``lidar_merging``: echoes of one vertex in the air, all paths that scatter "
-        "in the water and meet no solid, and those whose first solid is under water and not a mirror"),
+        "Whether to leave out the paths of ``lidar_merging``: echoes with one vertex in the air, all paths that "
+        "scatter in the water and meet no solid, and those whose first solid is under water and not a mirror"),
 )
 
 PASSIVE_VOLPATH = plugin(
@@ -63,7 +63,7 @@ PASSIVE_VOLPATH = plugin(
         "Probability, at scattering events, that the direction is drawn from a lobe towards the sun. Large values give "
         "a few paths very large weights. Without a sun there is no lobe"),
     _guiding("solid_guiding_probability", 0.9,
-        "The same at hits of rough solids under water, with a narrower lobe, times the share of the sunlight that is "
+        "The same at hits on rough solids under water, with a narrower lobe, times the share of the sunlight that is "
         "scattered above the solid"),
     _roulette(0.1,
         "Expected contribution below which Russian roulette begins: throughput times radiance under water, relative to "

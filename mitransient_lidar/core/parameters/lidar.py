@@ -1,4 +1,4 @@
-"""Parameters of the transmitter, of receivers and of their film."""
+"""Parameters of the transmitter, receivers and their film."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ALTITUDE = number(
 _OFF_NADIR = number("off_nadir_deg", 20.0, "degree", 0, 180, f"Angle of the axis from nadir, towards +x, {_HORIZON}")
 _AIM = "where the axis meets the mean sea level; under water the point of the mean sea level above the lidar"
 
-#: Height, angle and aim of a lidar.
+#: A lidar's height, angle and aim.
 ANGLES = (
     _ALTITUDE,
     _OFF_NADIR,
@@ -33,12 +33,12 @@ POSE = (
 
 
 def divergences(default: float | None, **more: bool) -> tuple[Parameter, Parameter, Parameter]:
-    """Return the three ways to give the width of a beam; the default is that of the first."""
+    """Return the three ways to give a beam's width; the default belongs to the first."""
     more["may_be_empty"] = True
     return (
         number("divergence_mrad", default, "mrad", 1e-3, 2000,
-            "Full angle between the points where the irradiance of a Gaussian beam has fallen to e^-1/2 of its peak "
-            "(its sigma is half of it); the full angle of a top-hat beam", **more),
+            "Full angle between the points where a Gaussian beam's irradiance has fallen to e^-1/2 of its peak (its "
+            "sigma is half of it); for a top-hat beam its full angle", **more),
         number("divergence_fwhm_mrad", None, "mrad", 1e-3, 2000,
             "The same beam by its full width at half maximum; give one of the three. Each is the full angle of a "
             "top-hat beam, whose irradiance falls from its peak to 0 at the edge. An empty text counts as not given",
@@ -65,7 +65,7 @@ LIDAR_TRANSMITTER = plugin(
         "Makes the beam elliptic: ``divergence_mrad`` is then the full angle along angle_x, this the one along angle_y",
         otherwise="``divergence_mrad``"),
     number("ellipse_deg", 0.0, "degree", -3600, 3600,
-        "Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards +angle_y"),
+        "Azimuth of the ellipse axis with ``divergence_mrad``, from +angle_x (far) towards +angle_y"),
     file("profile_file",
         "``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr image about the axis. Row 0 "
         "is the far edge (+angle_x), column 0 the left one (+angle_y)"),
@@ -83,7 +83,7 @@ OPTICS = (
     number("blur_mrad", 0.0, "mrad", 0, 1000,
         "Optical blur: standard deviation along each axis of a Gaussian point-spread function, 0 for a sharp one"),
     file("blur_file",
-        "Instead: image file (as for ``pixel_map``) of a measured point-spread function in any unit, not negative, "
+        "Instead: image file (as for ``pixel_map``) with a measured point-spread function in any unit, not negative, "
         "about the focus of sharp optics. Values are constant in each cell, and normalised"),
     number("blur_file_mrad", None, "mrad", 0, 1000, "Width of that image along angle_y; its cells are squares",
         above=True),
@@ -97,7 +97,7 @@ OPTICS = (
 
 _FIELD_OF_VIEW = number(
     *("field_of_view_mrad", 30.0, "mrad", 1e-3, 3000),
-    "Full angle of the field of view: diameter, side, or diameter of the hexagons' circumscribed circle",
+    "Full angle of the field of view: diameter, side, or diameter of the circle around the hexagons",
 )
 
 MULTIPIXEL_RECEIVER = plugin(
@@ -108,20 +108,20 @@ MULTIPIXEL_RECEIVER = plugin(
         "same as ``4x1``. R times C is at most 2^22. ``hexN``, with N = 1, 7, 19, 37, ... up to 2^20: a hexagon and "
         "complete rings of hexagons around it, in rows along angle_y"),
     number("fill_factor", 1.0, "1", 0.01, 1,
-        "Share of each cell or hexagon of a layout that receives light; the gaps receive none"),
-    switch("imager", None, "Result of shape (row, column, time) instead of (pixel, time)",
+        "Share of each layout cell or hexagon that receives light; the gaps receive none"),
+    switch("imager", None, "Result with the shape (row, column, time) instead of (pixel, time)",
         otherwise="true above 16 pixels of ``RxC``"),
     file("pixel_map",
-        "Instead of layout: image file (.png, .npy or .exr, one channel) of labels over a square field of view, "
-        "integers from 0 to 2^24. Row 0 is the far edge, column 0 the left edge. Each label is a pixel, in increasing "
-        "order and named ``label1``, ...; 0 is no pixel"),
+        "Instead of layout: image file (.png, .npy or .exr, one channel) with labels over a square field of view, "
+        "integers from 0 to 2^24. Row 0 is the far edge, column 0 the left edge. Each label is a pixel, in "
+        "increasing order and named ``label1``, ...; 0 is no pixel"),
     _FIELD_OF_VIEW,
     text("field_of_view_shape", None, "Of ``RxC``", ("circle", "square"),
         otherwise="``circle``, or ``square`` with a focal length"),
     number("focal_length_mm", None, "mm", 1e-3, 1e6,
         "Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the lens. The field of view is then R by C "
         "times pitch over focal length, a rectangle (or, with ``circle`` and R = C, the inscribed circle)"),
-    number("pixel_pitch_um", None, "um", 1e-3, 1e6, "With it: distance of square pixels on the detector"),
+    number("pixel_pitch_um", None, "um", 1e-3, 1e6, "With it: spacing of square pixels on the detector"),
     nested("(nested)", "sensor", "``pixel_fov`` sensors instead of layout and field of view"),
     *OPTICS,
     *POSE,
@@ -177,11 +177,11 @@ TIME_GATED_FILM = plugin(
     number("gate_rise_ns", 0.0, "ns", 0, 1e9, "10-90 % time of a raised-cosine rising edge, 0 for a sharp one"),
     number("gate_fall_ns", 0.0, "ns", 0, 1e9, "10-90 % time of a raised-cosine falling edge, 0 for a sharp one"),
     file("gate_profile",
-        "Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in other units below a "
-        "heading that names them"),
+        "Instead of width and edges: file with two columns, time [ns] and transmission 0 to 1, or in other units "
+        "below a heading that names them"),
     number("gate_jitter_ns", 0.0, "ns", 0, 1e6,
         "Standard deviation of the gate's opening from pulse to pulse; each gate is the mean over a Gaussian"),
-    count("pulses", 1, 1, 10**9, "Number of pulses that each gate accumulates"),
+    count("pulses", 1, 1, 10**9, "Pulses that each gate accumulates"),
     alternatives=(
         (("gate_start_ns",), ("gate_start_depth",), ("gate_start_range",)),
         (("gate_width_ns", "gate_rise_ns", "gate_fall_ns"), ("gate_profile",)),

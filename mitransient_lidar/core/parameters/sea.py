@@ -1,4 +1,4 @@
-"""Parameters of the sea's surface."""
+"""Sea surface parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ OCEAN_SURFACE = plugin(
     _angle("swell_direction_deg", "Direction it travels towards"),
     text("slope_variance", "cox_munk",
         "Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea, 1954; waves below 1 m are "
-        "scaled to it), ``spectrum`` (the integral of the spectrum) or a number, the total of an isotropic sea",
+        "scaled to it), ``spectrum`` (the spectrum's integral) or a number, the total for an isotropic sea",
         unit="1"),
     text("slope_distribution", "gaussian",
         "``gram_charlier``: skewed and peaked slopes, as measured by Cox and Munk from 1 to 14 m/s, with "
@@ -47,21 +47,21 @@ OCEAN_SURFACE = plugin(
         "Share of the sea that foam covers: ``none``, a number, or by wind speed ``monahan_omuircheartaigh_1980``, "
         "``callaghan_2008`` or ``stramska_petelski_2003``", unit="1"),
     number("foam_reflectance", 0.22, "1", 0, 1,
-        "Lambertian reflectance of foam: 0.22 is the mean of whitecaps of all ages in visible light (Koepke 1984), 0.4 "
-        "of fresh ones"),
+        "Lambertian foam reflectance: 0.22 is the mean over whitecaps of all ages in visible light (Koepke 1984), "
+        "0.4 for fresh ones"),
     number("surf_foam", 0.0, "1", 0, 1,
-        "With ``foam``, the share that foam covers where the depth limits the height of the waves (``shoaling``); "
-        "something like 0.3 to 1 in surf, for which no law is published"),
+        "With ``foam``, the share that foam covers where the depth limits the wave height (``shoaling``); about 0.3 "
+        "to 1 in surf, for which no law is published"),
     switch("ripple_focusing", True,
         "Whether echoes from the water are enhanced by the mean focusing of ripples that light crosses twice"),
-    count("surface_seed", 1, 0, 2**53, "Seed of the waves: the same sea at any resolution and position of the patch"),
+    count("surface_seed", 1, 0, 2**53, "Wave seed: the same sea at any resolution and position of the patch"),
     number("time", 0.0, "s", -1e9, 1e9, "Time at which the waves are taken"),
     number("water_depth", 1e4, "m", 0, 1e5,
         "Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et al. 1985)", above=True,
         otherwise="deep"),
     text("shoaling", "auto",
-        "``bottom``: waves have the heights of the TMA spectrum of the local depth of the scene's bottom, at most half "
-        "of it, 0 at the water line, and ``water_depth`` is for dispersion; ``none``: waves do not know the bottom; "
+        "``bottom``: wave heights follow the TMA spectrum for the local depth of the scene's bottom, at most half of "
+        "it, 0 at the water line, and ``water_depth`` is for dispersion; ``none``: waves ignore the bottom; "
         "``auto``: ``bottom`` if the significant height would exceed half of the least depth, without ``water_depth``",
         ("auto", "bottom", "none")),
     number("current_speed", 0.0, "m s-1", 0, 10, "Current that carries the waves"),
@@ -76,17 +76,17 @@ OCEAN_SURFACE = plugin(
     number("slope_y_deg", 0.0, "degree", -15, 15, "Mean slope towards +y"),
     _length("refined_size", "Side of the finely resolved patch"),
     _length("cell_size", "Side of its cells"),
-    _length("shortest_wave", "Length of the shortest waves of the mesh, at least two cells; shorter waves are ripples"),
+    _length("shortest_wave", "Length of the shortest waves in the mesh, at least two cells; shorter waves are ripples"),
     number("centre_x", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE,
         "Centre of the patch; ``auto``: where the lidar's axis meets the sea, or the centre of a height map"),
     number("centre_y", AUTO, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
     number("size", AUTO, "m", 1e-3, LARGEST_SIDE,
         "Side of the surface; ``auto``: 1000 or more. Cells grow outside the patch"),
-    _length("period", "Period of the sea; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m"),
+    _length("period", "Sea period; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m"),
     _length("map_size", "Side of a height map that carries no positions"),
     file("filename", "File of a ``height_map``"),
     number("altitude", None, "m", 0.1, 1e6,
-        "Value for the choice of ``auto`` instead of that of ``lidar_transmitter`` and receiver in the scene",
+        "Value for the choice by ``auto`` instead of the value in the scene's ``lidar_transmitter`` and receiver",
         by_id=True),
     number("off_nadir_deg", None, "degree", 0, 89.9, "The same", by_id=True),
     number("field_of_view_mrad", None, "mrad", 1e-3, 3000, "The same", by_id=True),

@@ -1,4 +1,4 @@
-"""Parameters of water and of its phase functions."""
+"""Parameters of water and its phase functions."""
 
 from __future__ import annotations
 
@@ -41,9 +41,10 @@ LAYERED_WATER = plugin(
         "Or Petzold's ``clear``, ``coastal``, ``turbid``, or a station of the phase function ``petzold``"),
     _water("pure", "Or ``true``: sea water without particles, whose scattering is ``water_scattering``"),
     number("wavelength_nm", None, "nm", 300, 1100,
-        "Wavelength of these waters: 532, or 400 to 700 for ``chlorophyll`` and ``pure``, 514 to 533 for ``petzold``, "
-        "700 to 1100 for all but a profile; or of the columns of a profile that has several, as ``a488, a532``",
-        otherwise="``532``, or that of the only columns"),
+        "Wavelength of these waters: 532, or 400 to 700 for ``chlorophyll`` and ``pure``, 514 to 533 for "
+        "``petzold``, 700 to 1100 for all but a profile; or of the columns in a profile that has several, such as "
+        "``a488, a532``",
+        otherwise="``532``, or the wavelength of the only columns"),
     file("profile",
         "A file instead of the above, with ``depth`` or ``z``, two of ``a``, ``b``, ``c``, ``omega``, and ``bb`` or "
         "``bb_ratio``: a table with units in its heading (.csv, .txt, .dat, .tsv) or .nc (`physics.water.profiles`)",
@@ -53,39 +54,39 @@ LAYERED_WATER = plugin(
     text("phase_function", "fournier_forand", "``fournier_forand``: each layer's from its bb/b",
         ("fournier_forand", "petzold", "hg")),
     number("phase_g", 0.924, "1", -0.999, 0.999, "hg: mean cosine"),
-    _of_layers("water_scattering", None, "Scattering by water molecules, a part of b, of each layer or all",
+    _of_layers("water_scattering", None, "Scattering by water molecules, a part of b, in each layer or all",
         otherwise="``0``, for phase functions that include it; 0.00196 at 532 nm in a water by ``jerlov``, "
         "``chlorophyll``, ``kd`` or ``secchi`` whose particles have Fournier-Forand functions; all of b in ``pure``"),
     numbers("chi_p", None, "1", 0.1, 10,
-        "bb/(2 pi p(180 deg) b) of the particles, of each layer or all: less is a brighter echo of the water",
-        otherwise="that of the phase function, 0.94 to 1.09 of ``fournier_forand``, 0.90 of ``petzold``"),
+        "bb/(2 pi p(180 deg) b) of the particles, in each layer or all: less means a brighter water echo",
+        otherwise="the phase function's value, 0.94 to 1.09 for ``fournier_forand``, 0.90 for ``petzold``"),
     nested("(nested)", "phase",
-        "Any phase function, used in all layers instead; or one a layer, named ``phase_0``, ``phase_1``, ... from the "
-        "top; ``plume_phase`` is that of the bubbles"),
+        "Any phase function, used in all layers instead; or one per layer, named ``phase_0``, ``phase_1``, ... from "
+        "the top; ``plume_phase`` belongs to the bubbles"),
     numbers("refractive_index", 1.34, "1", 1.0001, 2, "Phase index of each layer or all", may_be_empty=False,
         of_green=True, otherwise=f"``1.34``; {_NOT_GREEN}"),
     numbers("group_index", 1.364, "1", 1, 2, "Group index of each layer or all", may_be_empty=False, of_green=True,
-        otherwise=f"``1.364``, that of sea water at 532 nm; {_NOT_GREEN}"),
+        otherwise=f"``1.364``, for sea water at 532 nm; {_NOT_GREEN}"),
     number("plume_scattering", 0.0, "1/m", 0, 1000,
         "Scattering of bubbles behind a ship, added to b; 0 for no bubbles"),
     number("plume_x", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Start of the bubbles, at the stern"),
     number("plume_y", 0.0, "m", -LARGEST_COORDINATE, LARGEST_COORDINATE, "Its y"),
-    number("plume_bearing_deg", 0.0, "degree", -3600, 3600, "Heading of the ship, from +x to +y"),
+    number("plume_bearing_deg", 0.0, "degree", -3600, 3600, "Ship heading, from +x to +y"),
     number("plume_length", 200.0, "m", 1e-3, 1e6, "Length of the plume"),
     number("plume_width", 8.0, "m", 1e-3, 1e6, "Width of the plume"),
-    number("plume_depth", 2.0, "m", 0.01, 100, "Depth of the plume below the mean sea level"),
+    number("plume_depth", 2.0, "m", 0.01, 100, "Plume depth below the mean sea level"),
     number("plume_backscatter_ratio", 0.02, "1", 1e-4, 0.4,
         "bb/b of bubbles for a Fournier-Forand function; the default lies between clean bubbles and coated ones "
         "(Zhang, Lewis and Johnson 1998, doi:10.1364/AO.37.006525)"),
     number("bubble_wind_speed", 0.0, "m s-1", 0, 20,
         "Wind speed 10 m above the sea whose bubbles lie below it; 0 for no bubbles"),
     number("bubble_void_fraction", None, "1", 0, 1e-3,
-        "Their void fraction at the surface, instead of that of the wind", may_be_empty=True),
-    number("bubble_depth", None, "m", 0.05, 20, "Depth at which it has fallen to 1/e, instead of that of the wind",
+        "Their void fraction at the surface, instead of the one by wind", may_be_empty=True),
+    number("bubble_depth", None, "m", 0.05, 20, "Depth at which it has fallen to 1/e, instead of the one by wind",
         may_be_empty=True),
     number("bubble_backscatter", 233.0, "m-1 sr-1", 100, 1445,
-        "Volume scattering at 180 degrees over void fraction: 233 of clean bubbles, 1445 of a thick coating (Churnside "
-        "2010, doi:10.1364/OE.18.008294)"),
+        "Volume scattering at 180 degrees over void fraction: 233 for clean bubbles, 1445 for a thick coating "
+        "(Churnside 2010, doi:10.1364/OE.18.008294)"),
     alternatives=(
         (COEFFICIENTS, *((each,) for each in WATER_KINDS), ("profile",)),
         (("layer_tops",), ("profile",)),
@@ -97,15 +98,15 @@ FOURNIER_FORAND = plugin(
     number("backscatter_ratio", 0.0183, "1", 3.4e-8, 0.4999, "Backscattered share of the scattering bb/b"),
     number("refractive_index", None, "1", 1.0001, 2,
         "Instead, with ``junge_slope``: index of the particles relative to water"),
-    number("junge_slope", None, "1", 3.0001, 4.9999, "With it: slope of the particles' size distribution"),
+    number("junge_slope", None, "1", 3.0001, 4.9999, "With it: slope of the particle size distribution"),
 )
 
 MEASURED_PHASE = plugin(
     "measured_phase",
     file("filename",
-        "Text file of two columns: scattering angle [deg], increasing, at least 10, the last 170 or more; and value in "
-        "any unit, as of a volume scattering function: the values are normalised, with a warning where their integral "
-        "is not 1 within 2 %"),
+        "Text file with two columns: scattering angle [deg], increasing, at least 10, the last 170 or more; and "
+        "value in any unit, such as a volume scattering function: the values are normalised, with a warning where "
+        "their integral is not 1 within 2 %"),
 )
 
 PETZOLD = plugin(
@@ -119,7 +120,7 @@ PETZOLD = plugin(
 SEA_WATER = plugin(
     "sea_water",
     number("depolarisation", 0.039, "1", 0, 0.2,
-        "Depolarisation ratio of light scattered at 90 degrees, 0 for Rayleigh's function; the default is that of "
+        "Depolarisation ratio of light scattered at 90 degrees, 0 for Rayleigh's function; the default is from "
         "Zhang, Hu and He 2009, doi:10.1364/OE.17.005698"),
 )
 

@@ -1,4 +1,4 @@
-"""Headings of measured tables: names of columns, with units and wavelengths."""
+"""Headings of measured tables: column names, with units and wavelengths."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ METRES = {
     **dict.fromkeys(("fathoms", "ftm", "fm"), 1.8288),
 }
 
-#: Units of coefficients, 1/m.
+#: Coefficient units, 1/m.
 PER_METRE = {
     **{f"1/{unit}": 1 / length for unit, length in _METRIC.items()},
     **{f"{unit}-1": 1 / length for unit, length in _METRIC.items()},
@@ -52,7 +52,7 @@ PER_METRE = {
     "perm": 1.0,
 }
 
-#: Units of ratios.
+#: Ratio units.
 UNITLESS = {"1": 1.0, "-": 1.0, "%": 1e-2}
 
 _NANOSECONDS = {"ns": 1.0, "ps": 1e-3, "us": 1e3, "ms": 1e6, "s": 1e9}
@@ -97,7 +97,7 @@ class Heading(NamedTuple):
 
 
 def parse_heading(text: str, columns: Sequence[Column]) -> Heading | None:
-    """Return the meaning of a heading, None if it names none of the columns."""
+    """Return a heading's meaning, None if it names no column."""
     words = _words(text)
     longest = max(len(name.split()) for column in columns for name in (column.name.replace("_", " "), *column.aliases))
     for count in range(min(len(words), longest), 0, -1):
@@ -123,7 +123,7 @@ def read_headings(
     ignored: Collection[str] = (),
     wavelength_nm: float | None = None,
 ) -> list[Heading | None]:
-    """Return the meaning of each heading of a file.
+    """Return the meaning of each heading in a file.
 
     None stands for those without a name, with one of `ignored`, or at another wavelength than the one given.
 
@@ -143,7 +143,7 @@ def read_headings(
     for column in columns:
         same = [name for name, heading in zip(names, used, strict=True) if heading and heading.column is column]
         if len(same) > 1:
-            raise UserError(f"{path} has {len(same)} columns {' and '.join(same)} for {column.name}: allowed is one.")
+            raise UserError(f"{path} has {len(same)} columns {' and '.join(same)} for {column.name}: allowed is one")
     others = [name for name, heading in zip(names, used, strict=True) if heading is None and name]
     if others:
         logger.info("%s: columns %s are not used", path, ", ".join(others))
@@ -153,7 +153,7 @@ def read_headings(
 def pick_columns(
     path: str | PathLike[str], names: Sequence[str], groups: Sequence[Sequence[Column]]
 ) -> list[tuple[int, Heading]]:
-    """Return the index and the meaning of the one heading of each group of columns; other headings do not matter.
+    """Return the index and meaning of the one heading for each column group; other headings do not matter.
 
     A name with words that are no unit, such as ``depth_uncertainty``, is another heading; in brackets they are a unit.
 
@@ -171,7 +171,7 @@ def pick_columns(
         wanted = " or ".join(column.name for column in group)
         if len(known) > 1:
             same = " and ".join(names[i] for i, _ in known)
-            raise UserError(f"{path} has {len(known)} columns {same} that may be {wanted}: allowed is one.")
+            raise UserError(f"{path} has {len(known)} columns {same} that may be {wanted}: allowed is one")
         for i, _ in named if not known else ():
             if re.search(r"[\[(/]", names[i]):
                 raise UserError(f"{path} has an unknown unit in column {names[i]!r} {_found_and_allowed(names, group)}")
@@ -202,11 +202,11 @@ def _at_wavelength(
     if wavelength_nm is None:
         if len(found) > 1:
             raise UserError(
-                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm."
+                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm"
             )
         wavelength_nm = found[0]
     elif not any(abs(value - wavelength_nm) < _SAME_WAVELENGTH for value in found):
-        raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}.")
+        raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}")
     logger.info("%s: coefficients at %g nm", path, wavelength_nm)
     return [
         heading
@@ -235,7 +235,7 @@ def _found_and_allowed(names: Sequence[str], columns: Sequence[Column]) -> str:
 
 
 def _named(name: str, rest: Sequence[str], columns: Sequence[Column]) -> Heading | None:
-    """Return the column of this name, with the wavelength and the unit of the remaining words."""
+    """Return the column with this name, with the wavelength and the unit in the remaining words."""
     for column in columns:
         names = (column.name.replace("_", " "), *column.aliases)
         if name in names:

@@ -1,4 +1,4 @@
-"""Reading of tables of up to ten million rows through pandas: points of surveys and trajectories."""
+"""Reading of tables with up to ten million rows through pandas: survey points and trajectories."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LARGEST, _MOST_ROWS = 2**29, 10**7
 #: Beginning of a table in which its heading and its separator are found [bytes].
 _HEAD = 2**16
 
-#: Chooses the columns of a table by the names of its heading, empty without one: their indices and meanings.
+#: Chooses table columns by the names in its heading, empty without one: their indices and meanings.
 Choice = Callable[[list[str]], list[tuple[int, Heading]]]
 
 
@@ -32,10 +32,10 @@ class LongTable(NamedTuple):
     values: FloatArray  #: As in the file, shape (rows, columns); NaN where one is missing.
     headings: list[Heading]
     path: Path
-    first_line: int  #: Number of the line of the first row, counted from 1.
+    first_line: int  #: Line number of the first row, counted from 1.
 
     def line(self, row: int) -> int:
-        """Return the number of the line of a row."""
+        """Return a row's line number."""
         with open_file(self.path) as file:
             numbered = itertools.islice(enumerate(file, 1), self.first_line - 1, None)
             return next(itertools.islice((n for n, line in numbered if line.partition(b"#")[0].strip()), row, None))
@@ -52,7 +52,7 @@ def read_head(path: Path) -> str:
     with open_file(path) as file:
         size, head = os.fstat(file.fileno()).st_size, file.read(_HEAD)
     if size > _LARGEST:
-        raise UserError(f"{path} has {size / 2**20:.4g} MiB: a table may have {_LARGEST / 2**20:g} MiB.")
+        raise UserError(f"{path} has {size / 2**20:.4g} MiB: a table may have {_LARGEST / 2**20:g} MiB")
     text = head.decode("utf-8-sig", "replace")
     return text if size <= _HEAD else text[: text.rfind("\n") + 1]
 
@@ -64,16 +64,16 @@ def read_long_table(
 
     Cells are separated by semicolons, tabs, commas or blanks. Numbers have a decimal point or, unless commas separate,
     a decimal comma; they may stand in quotation marks. Comments follow a #; above the rows, they may begin with %, //
-    or ! as well, and one of them may be the heading. Missing values are those of pandas, such as an empty cell or NA.
+    or ! as well, and one of them may be the heading. Missing values are pandas' own, such as an empty cell or NA.
 
     Parameters
     ----------
     path : Path
         Text file in UTF-8.
     columns, others : sequence of Column
-        The first columns of a table without a heading, and further ones that tell that a line is a heading.
+        The first columns in a table without a heading, and further ones that identify a line as a heading.
     choose : callable
-        Choice of columns by the names of the heading.
+        Column choice by the names in the heading.
     names : list of str
         Names that stand elsewhere; empty if they are in the heading.
 
@@ -87,13 +87,13 @@ def read_long_table(
 
     names, rows = find_rows(path, read_head(path), columns, others, names)
     if not rows:
-        raise UserError(f"{path} has no rows of numbers.")
+        raise UserError(f"{path} has no rows of numbers")
     chosen = choose(names)
     width, separator = len(rows[0].cells), rows[0].separator
     what = f"{path} is not a table of {', '.join(column.name for column in columns)}"
     named = width - (rows[0].cells[-1] == "" and width == len(names) + 1)  # a separator may end each row
     if width < 1 + max(i for i, _ in chosen) or (names and named != len(names)):
-        raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}.")
+        raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}")
     order = [i for i, _ in chosen]
     try:
         with open_file(path) as file:
@@ -109,14 +109,14 @@ def read_long_table(
                 skipinitialspace=True,
                 na_values=sorted({word.upper() for word in MISSING} | MISSING),
                 dtype=dict.fromkeys(order, np.float64),
-                low_memory=False,  # otherwise pandas warns of columns of numbers and words
+                low_memory=False,  # otherwise pandas warns about columns with numbers and words
                 encoding="utf-8-sig",
             )
     except (ValueError, OverflowError) as error:  # pandas' errors are ValueErrors
         where = _faulty_line(path, rows[0].number, order, width) or " ".join(str(error).split())[:200]
-        raise UserError(f"{what}: {where}.") from error
+        raise UserError(f"{what}: {where}") from error
     if len(frame) > _MOST_ROWS:
-        raise UserError(f"{path} has more than {_MOST_ROWS} rows, the most of a table.")
+        raise UserError(f"{path} has more than {_MOST_ROWS} rows, the most of a table")
     return LongTable(frame[order].to_numpy(), [one for _, one in chosen], path, rows[0].number)
 
 

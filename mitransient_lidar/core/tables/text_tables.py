@@ -28,13 +28,13 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-#: Words for a missing value, in small letters: those of pandas, and dashes.
+#: Words for a missing value, in small letters: pandas' own, and dashes.
 MISSING = frozenset({"", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#na", "null", "none", "-", "--", "---"})
 
 #: Values that instruments write for missing ones.
 _FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
 
-#: Most lines of a table.
+#: Most lines in a table.
 _MOST_LINES = 10**6
 
 #: Lines in which the number of columns shows.
@@ -55,18 +55,18 @@ _BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")
 
 
 class Table(NamedTuple):
-    """Columns of numbers from a text file."""
+    """Number columns from a text file."""
 
     columns: dict[str, FloatArray]  #: Values by the names of their columns, in their first units, shape (rows,).
-    lines: list[int]  #: Number of the line of each row, counted from 1.
+    lines: list[int]  #: Line number of each row, counted from 1.
     without_unit: frozenset[str]  #: Names of the columns whose unit is not given.
 
 
 class Line(NamedTuple):
-    """Line of a file that is not empty."""
+    """A file's line that is not empty."""
 
     number: int
-    text: str  #: Without the mark of a comment.
+    text: str  #: Without the comment mark.
     separator: str  #: Semicolon, tab, comma, or empty for blanks.
     cells: list[str]  #: Numbers with a decimal point.
     has_decimal_commas: bool
@@ -88,11 +88,11 @@ def read_table(
 ) -> Table:
     """Read a table from a text file as an instrument or a spreadsheet writes it.
 
-    Above the rows there may be lines of text. The first one that names two or more of the columns is the heading; it
-    may be a comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or
-    blanks; between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their
-    line with %, // or !. Rows with missing values (empty, nan, na, n/a, null, none, dashes) are left out with a warning
-    in the log.
+    Above the rows there may be text lines. The first one that names two or more columns is the heading; it may be a
+    comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or blanks;
+    between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their line with
+    %, // or !. Rows with missing values (empty, nan, na, n/a, null, none, dashes) are left out with a warning in the
+    log.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def read_table(
     columns : sequence of Column
         Columns that the file may have.
     ignored : collection of str
-        Names of other columns that it may have, in lower case; the log tells that they are not used.
+        Names of other columns that it may have, in lower case; the log reports that they are not used.
     wavelength_nm : float, optional
         Wavelength [nm] of the columns, if the file has several.
     positional : bool
@@ -111,11 +111,11 @@ def read_table(
     ------
     UserError
         If the file cannot be read or is not text; a name, unit or wavelength is unknown, or a column is there twice; or
-        a line does not hold one number for each column.
+        a line does not contain one number for each column.
     """
     text = read_text(path)
     if (count := text.count("\n")) > _MOST_LINES:
-        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}.")
+        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}")
     lines, comments = split_lines(text)
     width = _width(lines)
     start = next((i for i, line in enumerate(lines) if len(line.cells) == width and _is_row(line)), len(lines))
@@ -140,7 +140,7 @@ def read_table(
 def find_rows(
     path: str | PathLike[str], text: str, columns: Sequence[Column], others: Sequence[Column], names: list[str]
 ) -> tuple[list[str], list[Line]]:
-    """Return the names of the heading of the beginning of a table, and its rows.
+    """Return the names in the heading at the beginning of a table, and its rows.
 
     A heading, whose names are `names` if they are given elsewhere, has two or more of `columns` and `others`, and any
     further ones. Without one, the names are empty, and the first columns are `columns`.
@@ -175,13 +175,13 @@ def read_time_samples(path: str | PathLike[str], quantity: Column) -> tuple[Floa
     if times.size > 1 and "time" in table.without_unit and np.ptp(times) < _SHORTEST_RECORD:
         raise UserError(
             f"{path} has times from {times.min():g} to {times.max():g} without a unit, too short for ns: the heading"
-            " must name it, such as time_s."
+            " must name it, such as time_s"
         )
     return times, values
 
 
 def complete_rows(path: str | PathLike[str], columns: Mapping[str, FloatArray], places: Sequence[str]) -> IntArray:
-    """Return the indices of the rows without NaN; warn of the others, with the place of the first one."""
+    """Return the indices of the rows without NaN; warn about the others, with the first one's position."""
     missing = np.zeros(len(places), dtype=bool)
     for values in columns.values():
         missing |= np.isnan(values)
@@ -235,7 +235,7 @@ def _width(lines: Sequence[Line]) -> int:
 
 
 def _is_mostly_numbers(line: Line) -> bool:
-    """Return whether more than half of the cells are numbers or missing values, and not all of them missing."""
+    """Return whether more than half the cells are numbers or missing values, and not all of them missing."""
     numbers = sum(_number(cell) is not None for cell in line.cells)
     missing = sum(cell.lower() in MISSING for cell in line.cells) if numbers < len(line.cells) else 0
     return numbers > 0 and 2 * (numbers + missing) > len(line.cells)
@@ -249,7 +249,7 @@ def _is_row(line: Line) -> bool:
 def _find_heading(
     lines: Sequence[Line], comments: Sequence[Line], start: int, width: int, columns: Sequence[Column]
 ) -> tuple[list[str], int]:
-    """Return the names of the heading and the index of the line below it; no names and `start` if there is none."""
+    """Return the names in the heading and the index of the line below it; no names and `start` if there is none."""
     searched = 0
     for i, line in enumerate(lines[:start]):
         if (searched := searched + len(line.text)) > _LONGEST_HEAD:
@@ -274,7 +274,7 @@ def _find_heading(
 def _with_units(
     names: list[str], lines: Sequence[Line], start: int, columns: Sequence[Column]
 ) -> tuple[list[str], int]:
-    """Return the names with the units of the line below them, and the index of the first row."""
+    """Return the names with the units in the line below them, and the first row's index."""
     cells = lines[start].cells if start < len(lines) else []
     if len(cells) != len(names) or all(map(is_number_or_missing, cells)):
         return names, start
@@ -293,7 +293,7 @@ def _without_heading(
     columns: Sequence[Column],
     positional: bool,
 ) -> int:
-    """Return the index of the first row of a file without heading; refuse unknown headings."""
+    """Return the index of the first row in a file without heading; refuse unknown headings."""
     row = lines[start] if start < len(lines) else None
     for i, line in enumerate(lines[:start]):
         if _number(line.cells[0]) is not None and len(line.cells) == width:
@@ -349,8 +349,8 @@ def _invalid_line(
         wanted = " and ".join(_with_first_unit(heading.column) for heading in headings if heading)
         return UserError(f"{where}: {' '.join(line.cells)!r} must be two numbers, {wanted}")
     if column is None:
-        return UserError(f"{where} has {len(line.cells)} values but must have {len(names)}, one for each column.")
-    return UserError(f"{where}: {names[column]} = {line.cells[column]!r} must be a number.")
+        return UserError(f"{where} has {len(line.cells)} values but must have {len(names)}, one for each column")
+    return UserError(f"{where}: {names[column]} = {line.cells[column]!r} must be a number")
 
 
 def _with_first_unit(column: Column) -> str:

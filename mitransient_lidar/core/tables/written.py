@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 def table_lines(columns: Sequence[tuple[str, str]], rows: Iterable[Iterable[Any]]) -> list[str]:
-    """Return the heading and the rows of a table as lines.
+    """Return a table's heading and rows as lines.
 
     Parameters
     ----------
     columns
         Heading and format of each, such as ``>10.2f``: side, width with the blanks before it, and digits.
     rows
-        Numbers, or texts in their places; the cells of a row may end before those of the heading.
+        Numbers, or texts in their places; a row's cells may end before the heading's.
     """
     places = [re.sub(r"(?<=\d)[,.a-z%].*", "", form) for _, form in columns]
 
@@ -35,7 +35,7 @@ def table_lines(columns: Sequence[tuple[str, str]], rows: Iterable[Iterable[Any]
 
 
 def aligned_lines(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> list[str]:
-    """Return rows of texts as lines, two blanks between the columns, those of the numbers `right` on their right."""
+    """Return text rows as lines, two blanks between the columns; the columns number `right` are right-aligned."""
     rows = [*rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = [">" if number in right else "<" for number in range(len(widths))]

@@ -1,4 +1,4 @@
-"""Times of the first and the last light of a lidar: the limits of a time axis that are not given."""
+"""First and last arrival times in a lidar: the limits of a time axis that are not given."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 #: Level to which light falls in the column before the time axis ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 
-#: Time for light that is scattered several times after the last echo: the lesser of a multiple of the time that this
-#: echo spends in the water, for shallow water, and of a time [ns] and a share of it. Chosen with renders of longer
-#: time axes: less than 1e-4 of the energy arrives later.
+#: Time for multiply scattered light after the last echo: a multiple of this echo's time in the water, for shallow
+#: water, or if less a time [ns] plus a share of it. Chosen with renders over longer time axes: less than 1e-4 of the
+#: energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
 #: Largest distance from the beam at which the time of the way from it is added for the view [m].
@@ -28,16 +28,16 @@ _FARTHEST = 10.0
 #: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
 _REACH_PER_DEPTH = 0.3
 
-#: Largest number of times that the heights of a solid in view are narrowed.
+#: Largest number of times that the height range of a solid in view is narrowed.
 _NARROWINGS = 6
 
-#: Directions at the edge of a cone, and circles of such directions within it.
+#: Directions at a cone's edge, and circles of such directions within it.
 _EDGE, _CIRCLES = 128, 8
 
-#: Share of its lines of sight that a bottom must end, for the water below it not to count.
+#: A bottom that ends this share of its lines of sight makes the water below it count no more.
 _COVERED = 0.98
 
-#: Largest height of the plane of the earliest light, relative to the altitude of the lower instrument.
+#: Greatest height of the plane of the earliest light, relative to the lower instrument's altitude.
 _HIGHEST = 0.9
 
 _NS_PER_M = 1e9 / C0
@@ -45,7 +45,7 @@ _NS_PER_M = 1e9 / C0
 
 @dataclass(frozen=True, eq=False)
 class Cone:
-    """Directions of a laser beam or of a field of view in the air.
+    """Directions in the air within a laser beam or a field of view.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Cone:
     half_angles
         Half angles along the two tangent-plane angles [rad].
     is_round
-        Whether the cross-section is an ellipse, or a rectangle.
+        Whether the cross-section is an ellipse instead of a rectangle.
     """
 
     pose: Pose
@@ -94,17 +94,17 @@ class Solid:
 
     @cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates of each triangle."""
+        """Lowest and highest coordinates per triangle."""
         return self.triangles.min(axis=1), self.triangles.max(axis=1)
 
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """Corners of the bounding box [m]."""
+        """Bounding box corners [m]."""
         low, high = self._corners
         return low.min(axis=0), high.max(axis=0)
 
     def heights_in(self, low: FloatArray, high: FloatArray) -> tuple[float, float] | None:
-        """Return limits of the heights [m] between places (x, y) [m], None where there is no part of the solid."""
+        """Return the height limits [m] between locations (x, y) [m], None where the solid has no part there."""
         lows, highs = self._corners
         here = np.all(lows[:, :2] <= high, axis=1) & np.all(highs[:, :2] >= low, axis=1)
         if not here.any():
@@ -129,12 +129,12 @@ class AxisLimits:
     first_ns: float
     last_ns: float
     surface_ns: tuple[float, float]  #: First and last arrival from the sea surface.
-    end: str  #: What the last light comes from.
+    end: str  #: Source of the last light.
 
 
 @dataclass(frozen=True, eq=False)
 class LidarView:
-    """Geometry of a lidar over a sea.
+    """Lidar geometry over a sea.
 
     Parameters
     ----------
@@ -143,11 +143,11 @@ class LidarView:
     sea, decay
         Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
     heights
-        Lowest and highest point of the sea [m].
+        Lowest and highest sea height [m].
     reach
         Horizontal distance to the end of the scene [m], where light towards the horizon ends.
     column
-        Least depth of the last light of water without a bottom [m], such as that of bubbles; None without water.
+        Least depth of the last light from water without a bottom [m], such as light from bubbles; None without water.
     """
 
     view: Cone
@@ -159,19 +159,19 @@ class LidarView:
     column: float | None
 
     def limits(self, solids: Sequence[Solid], direct: bool = False, dry: bool = False) -> AxisLimits:
-        """Find the first and the last arrival of light; of the last, `direct` echoes of surface and solids only.
+        """Find the first and the last arrival of light; with `direct`, the last one by surface and solid echoes only.
 
-        Of a `dry` view or beam, all of which meets land, the sea returns no light.
+        The sea returns no light in a `dry` view or beam, which meets land alone.
 
         Notes
         -----
-        Light is that of directions in both view and beam. The first light is reflected at the height of the highest
-        crest, or of a solid above it. The last light is reflected by the deepest part of a solid in these directions,
-        or within 0.3 of its depth of them, below a level sea at the height of the lowest trough. Light that is
-        scattered several times follows it: for up to four times its time in the water or 40 ns and a quarter of it,
-        and the time of the way from the beam to the edge of the view, up to 10 m. Where no solids end these directions,
-        the last light is that from the depth at which the column signal, exp(-2 K s) by Gordon's system attenuation K
-        (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
+        Light follows directions in both view and beam. The first light is reflected at the height of the highest crest,
+        or of a solid above it. The last light comes from the deepest part of a solid in these directions, or within 0.3
+        of its depth of them, below a level sea at the height of the lowest trough. Multiply scattered light follows it:
+        for up to four times its time in the water or 40 ns and a quarter of it, plus the time from the beam to the edge
+        of the view, up to 10 m. Where no solids end these directions, the last light comes from the depth at which the
+        column signal has fallen to 1e-6. This signal is exp(-2 K s) by Gordon's system attenuation K
+        (`system_attenuation`). Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
         seen = self._at_sea[1]
@@ -199,7 +199,7 @@ class LidarView:
             lasts.append((surface[1], "after the surface echo"))
         if self.column is not None and not direct and not dry and np.mean(covered) < _COVERED:
             depth = max(self.decay.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
-            text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
+            text = f"at a depth of {depth:.3g} m, where the water's signal has fallen to {COLUMN_LEVEL:g}"
             lasts.append((sum(self._latest(-depth)), text))
         last, end = max(lasts)
         return AxisLimits(min(firsts), last, surface, end)
@@ -211,7 +211,7 @@ class LidarView:
 
     @cached_property
     def _crossing_ns(self) -> float:
-        """Time of the way in the water from the beam to the edge of the view [ns]."""
+        """Time in the water from the beam to the edge of the view [ns]."""
         view, beam = (cone.places(0.0, self.reach)[-_EDGE:] for cone in (self.view, self.beam))
         outside = view[~self.beam.holds(view, 0.0)]
         if len(outside) == 0:
@@ -250,7 +250,7 @@ class LidarView:
         return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
 
     def _heights_of(self, solid: Solid) -> tuple[float, float] | None:
-        """Return limits of the heights of the parts of a solid that may be lit and seen [m], None without such."""
+        """Return the height limits [m] of a solid's parts that may be lit and seen, None without such parts."""
         heights = float(solid.box[0][2]), float(solid.box[1][2])
         # Limits of the heights limit the places, and these the heights.
         for _ in range(_NARROWINGS):
@@ -270,5 +270,5 @@ class LidarView:
 
 
 def _sine(rays: FloatArray) -> FloatArray:
-    """Return the sines of the angles of rays from the vertical, shape (n,)."""
+    """Return the sines of ray angles from the vertical, shape (n,)."""
     return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) / np.linalg.norm(rays, axis=1))

@@ -1,4 +1,4 @@
-"""Daylight at the sea at 532 nm: irradiance of sun and sky under a clear sky, and background power of a pixel.
+"""Daylight at the sea at 532 nm: irradiance by sun and sky under a clear sky, and background power per pixel.
 
 Irradiances and radiances are spectral, per nanometre; zenith angles are degrees from the vertical.
 """
@@ -14,32 +14,32 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
 
-#: Angular radius of the sun [deg].
+#: Sun's angular radius [deg].
 SUN_RADIUS_DEG = 0.2666
 
-#: Largest zenith angle of the sun [deg].
+#: Largest sun zenith angle [deg].
 LARGEST_SUN_ZENITH_DEG = 89.0
 
-#: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm of the table of Gregg and Carder. Fraunhofer
-#: lines make it 4 % more or less within a nanometre.
+#: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm in Gregg and Carder's table. Fraunhofer lines
+#: change it by up to 4 % within a nanometre.
 _SOLAR_CONSTANT = 1.90
 
-#: Absorption of ozone [1/cm], same table, at 532 nm.
+#: Ozone absorption [1/cm], same table, at 532 nm.
 _OZONE_ABSORPTION = 0.0662
 
-#: Single-scattering albedo of maritime aerosol at a relative humidity of 80 % (equation 36, air mass type 1).
+#: Single-scattering albedo of maritime aerosol at 80 % relative humidity (equation 36, air mass type 1).
 _AEROSOL_ALBEDO = 0.993
 
-#: Pressure [hPa] of the Rayleigh optical depth.
+#: Pressure [hPa] for the Rayleigh optical depth.
 _SEA_LEVEL_PRESSURE = 1013.25
 
 
 class ClearSkyIrradiance(NamedTuple):
     """Irradiance at the sea under a clear sky [W m^-2 nm^-1]."""
 
-    direct_normal: float  #: Of the sun, on a plane normal to its rays.
-    direct: float  #: Of the sun, on a horizontal plane.
-    diffuse: float  #: Of the sky, on a horizontal plane.
+    direct_normal: float  #: Sun, on a plane normal to its rays.
+    direct: float  #: Sun, on a horizontal plane.
+    diffuse: float  #: Sky, on a horizontal plane.
 
 
 def clear_sky_irradiance(
@@ -51,32 +51,32 @@ def clear_sky_irradiance(
     pressure_hpa: float = _SEA_LEVEL_PRESSURE,
     wavelength_nm: float = 532.0,
 ) -> ClearSkyIrradiance:
-    """Irradiance of sun and sky at 532 nm on the sea under a clear sky.
+    """Irradiance by sun and sky at 532 nm on the sea under a clear sky.
 
     Parameters
     ----------
     zenith_deg : float
-        Zenith angle of the sun [deg], 0 to 89.
+        Sun zenith angle [deg], 0 to 89.
     aerosol_optical_depth : float
-        Optical depth of the aerosol at 550 nm, 0 to 5.
+        Aerosol optical depth at 550 nm, 0 to 5.
     angstrom_exponent : float
-        Exponent of its decrease with the wavelength, -1 to 3; it also sets the asymmetry of aerosol scattering.
+        Exponent of its decrease with wavelength, -1 to 3; it also sets the aerosol's scattering asymmetry.
     ozone_cm : float
         Ozone column [atm cm], 0 to 1.
     pressure_hpa : float
         Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
     wavelength_nm : float
-        Wavelength [nm] for which the irradiance is to stand, 510 to 540.
+        Wavelength [nm] that the irradiance must represent, 510 to 540.
 
     Notes
     -----
-    Model of Gregg and Carder (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
-    wavelength and with the aerosol given by its optical depth instead of visibility and winds. Its rms error against
-    measured spectra is 6.6 %. Air mass of Kasten and Young (1989, doi:10.1364/AO.28.004735). Light reflected by the sea
-    and scattered back by the sky is left out, as in the original model; the sun is at its mean distance.
+    Gregg and Carder's model (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
+    wavelength; the aerosol is given by its optical depth instead of visibility and winds. Its rms error against
+    measured spectra is 6.6 %. Air mass: Kasten and Young (1989, doi:10.1364/AO.28.004735). As in the original model,
+    light that the sea reflects and the sky scatters back is left out. The sun is at its mean distance.
     """
     if not is_green(wavelength_nm):
-        raise UserError(f"wavelength_nm = {wavelength_nm:g} needs irradiance: that of a clear sky is known at 532 nm")
+        raise UserError(f"wavelength_nm = {wavelength_nm:g} needs irradiance: the clear-sky model covers 532 nm alone")
     zenith = in_range("zenith_deg", zenith_deg, 0.0, LARGEST_SUN_ZENITH_DEG)
     depth = in_range("aerosol_optical_depth", aerosol_optical_depth, 0.0, 5.0)
     exponent = in_range("angstrom_exponent", angstrom_exponent, -1.0, 3.0)
@@ -107,16 +107,16 @@ def _forward_fraction(cosine: float, exponent: float) -> float:
 
 
 def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_width_nm: float) -> FloatArray:
-    """Power [W] of daylight on a detector, the product of the arguments.
+    """Daylight power on a detector [W], the product of the arguments.
 
     Parameters
     ----------
     radiance : array_like
         Radiance [W m^-2 sr^-1 nm^-1].
     etendue : array_like
-        Open area of the aperture times solid angle of the pixel times transmittance of optics and air [m^2 sr].
+        Open aperture area times pixel solid angle times transmittance of optics and air [m^2 sr].
     filter_width_nm : float
-        Width of the filter [nm], positive: its integral over its peak, which is part of the transmittance.
+        Filter width [nm], positive: its integral over its peak, which is part of the transmittance.
     """
     width = positive("filter_width_nm", filter_width_nm)
     return np.asarray(finite_array("radiance", radiance) * finite_array("etendue", etendue) * width)

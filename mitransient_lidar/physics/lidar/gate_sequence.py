@@ -1,4 +1,4 @@
-"""Times and places of the pulses of a gated camera: which pulse belongs to which gate of which frame."""
+"""Times and locations of a gated camera's pulses: which pulse belongs to which gate in which frame."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ ORDERS = ("in_order", "interleaved", "random")
 
 @dataclass(frozen=True)
 class GateSequence(Checked):
-    """Pulses of the gates of several frames, by a laser of a constant pulse rate.
+    """Pulses of several frames' gates, from a laser with a constant pulse rate.
 
-    An image is what the camera reads out for one gate of one frame: the sum of `pulses` pulses. In the order
-    ``in_order``, all pulses of a gate come before those of the next one; in ``random``, too, with the gates of each
-    frame in an order of its own; in ``interleaved``, each pulse belongs to the gate after that of the last pulse, and
-    the images of a frame are read out together.
+    An image is the camera's read-out for one gate in one frame: the sum of `pulses` pulses. The order ``in_order`` puts
+    all pulses of a gate before the next gate's pulses. The order ``random`` does the same, with each frame's gates in
+    an order of their own. In ``interleaved``, successive pulses belong to successive gates, and a frame's images are
+    read out together.
     """
 
-    gates: int = checked(integer, 1, 100_000)  #: Gates of a frame.
-    pulses: int = checked(integer, 1, 10**9)  #: Pulses of an image.
+    gates: int = checked(integer, 1, 100_000)  #: Gates per frame.
+    pulses: int = checked(integer, 1, 10**9)  #: Pulses per image.
     frames: int = checked(integer, 1, 100_000)  #: Frames.
     pulse_rate_hz: float = checked(positive)  #: Pulses a second, greater than 0.
-    gate_order: str = "in_order"  #: One of `ORDERS`.
+    gate_order: str = "in_order"  #: An entry of `ORDERS`.
     readout_s: float = checked(least_zero, default=0.0)  #: Time without pulses for each read-out [s].
-    speed: float = checked(least_zero, default=0.0)  #: Speed of the platform [m/s].
+    speed: float = checked(least_zero, default=0.0)  #: Platform speed [m/s].
     heading_deg: float = checked(finite, default=0.0)  #: Its direction, from +y (north) clockwise towards +x.
-    seed: int = checked(integer, 0, 2**53, default=0)  #: Seed of random orders.
+    seed: int = checked(integer, 0, 2**53, default=0)  #: Random seed for orders.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -49,7 +49,7 @@ class GateSequence(Checked):
         return np.random.default_rng(self.seed).permuted(in_order, axis=1) if self.gate_order == "random" else in_order
 
     def times(self, frame: IntArray, gate: IntArray, pulse: IntArray | int = 0) -> FloatArray:
-        """Return the times of pulses [s] of an image since the first pulse of all, by their numbers in it."""
+        """Return the times [s] of an image's pulses since the first pulse of all, given their numbers in the image."""
         readouts = frame * self.gates + self.places[frame, gate]
         number = readouts * self.pulses + pulse
         if self.gate_order == "interleaved":
@@ -63,10 +63,10 @@ class GateSequence(Checked):
         return np.asarray(self.speed * np.asarray(times_s)[..., None] * direction)
 
     def sampled_pulse(self, number: int, passes: int, uniform: FloatArray) -> IntArray:
-        """Return the pulse of an image that pass `number` of `passes` renders, from uniform numbers in [0, 1).
+        """Return the image pulse that pass `number` of `passes` renders, from uniform numbers in [0, 1).
 
-        Each pass draws from its own part of the pulses, all parts of equal length, so that the mean over the passes has
-        the mean over all pulses as its expected value.
+        Each pass draws from its own part of the pulses. All parts are equally long: the expected mean over passes is
+        the mean over all pulses.
         """
         part = (number + np.asarray(uniform)) / passes * self.pulses
         return np.minimum(part.astype(np.int64), self.pulses - 1)

@@ -1,7 +1,7 @@
-"""Gates of a gated receiver: the transmission of one against time, and trains with the weight of an echo in each gate.
+"""Gates of a gated receiver: one gate's transmission against time, and trains with an echo's weight in each gate.
 
 A gated receiver takes one image per gate and shifts the gate by one step from image to image. Gate k collects the
-energy int P(t) G_k(t) dt of the received power P of every pulse, where G_k(t) = G_0(t - k step).
+energy int P(t) G_k(t) dt from the received power P of every pulse, where G_k(t) = G_0(t - k step).
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
 
-#: Points of a table of weights per shortest time scale, and largest number of points.
+#: Points in a weight table per shortest time scale, and largest number of points.
 _POINTS, _MOST_POINTS = 128, 2**17
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
 
-#: Cells of a bin in which the error of cut gates is computed.
+#: Cells per bin that give the error of cut gates.
 _CELLS_OF_BIN = 33
 
-#: Samples of a jittered edge in a standard deviation, and standard deviations on each side of it.
+#: Samples per standard deviation in a jittered edge, and standard deviations on each side.
 _JITTER_POINTS, _JITTER_REACH = 32, 6.0
 
-#: Relative tolerance of the sum of half edges against the width, for rounded decimals.
+#: Relative tolerance for half edges against the width, for rounded decimals.
 _ROUNDING = 1e-9
 
 _TRANSMISSION = Column("transmission", ("transmittance", "gate", "gain", "value"), UNITLESS)
@@ -62,7 +62,7 @@ class GateShape:
     width_ns : float
         Time between the half heights of the two edges [ns].
     rise_ns, fall_ns : float
-        Times from 10 to 90 % of the rising edge and from 90 to 10 % of the falling one [ns].
+        Rising edge time from 10 to 90 %, and falling edge time from 90 to 10 % [ns].
     times_ns, values : ndarray, shape (S,)
         Samples of a measured gate, linear between them and 0 outside; empty for a gate with raised-cosine edges.
     jitter_ns : float
@@ -70,10 +70,10 @@ class GateShape:
 
     Notes
     -----
-    An edge of full length L is sin^2(pi u / (2 L)) for 0 <= u <= L, half open in its middle: smooth, of finite length,
-    and with an integral in closed form, R(t) = (u - L/pi sin(pi u/L)) / 2 for u = t + L/2. A gate is the difference of
-    two such edges, its integral the difference of theirs. Edges of 0 ns are sharp; the gate is then half open as bins
-    are, [0, width).
+    An edge with full length L is sin^2(pi u / (2 L)) for 0 <= u <= L, half open in its middle. It is smooth and finite,
+    with an integral in closed form, R(t) = (u - L/pi sin(pi u/L)) / 2 for u = t + L/2. A gate is the difference between
+    two such edges, its integral the difference between theirs. Edges of 0 ns are sharp; the gate is then half open as
+    bins are, [0, width).
     """
 
     width_ns: float
@@ -132,19 +132,19 @@ class GateShape:
     def from_file(cls, path: str | PathLike[str]) -> GateShape:
         """Read a measured gate, times and transmissions as for `sampled`, from a text file.
 
-        The columns are those of `core.tables.text_tables.read_time_samples`; a transmission may be in %.
+        Columns as in `core.tables.text_tables.read_time_samples`; a transmission may be in %.
         """
         return cls.sampled(*read_time_samples(path, _TRANSMISSION))
 
     def jittered(self, jitter_ns: float) -> GateShape:
-        """Return the mean gate of pulses at whose times the gate opens early or late, the shape over a Gaussian.
+        """Return the mean gate for pulses at which the gate opens early or late, the shape over a Gaussian.
 
-        Its width and edges remain those of one pulse, and its time 0 the mean of their openings.
+        Its width and edges remain those for one pulse, and its time 0 is the mean opening time.
 
         Parameters
         ----------
         jitter_ns : float
-            Standard deviation of the opening [ns], at least 0.
+            Standard deviation of the opening time [ns], at least 0.
         """
         if non_negative("jitter_ns", jitter_ns) == 0:
             return self
@@ -167,7 +167,7 @@ class GateShape:
         return -0.5 * _EDGE_PER_RISE * self.rise_ns, self.width_ns + 0.5 * _EDGE_PER_RISE * self.fall_ns
 
     def open_time(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Integral of the transmission [ns] up to the times `t_ns` [ns] after the half height of the rising edge."""
+        """Integrated transmission [ns] up to the times `t_ns` [ns] after the rising edge's half height."""
         t = np.asarray(t_ns, dtype=np.float64)
         if self.times_ns.size:
             return integral(self.times_ns, self.values, t)
@@ -193,15 +193,15 @@ class ResponseTable(NamedTuple):
 
 @dataclass(frozen=True)
 class GateTrain(Checked):
-    """Gates of one shape at equal time steps.
+    """Gates with one shape at equal time steps.
 
-    Times count from the moment when the pulse's peak leaves the transmitter. Build a train of a measured gate with
-    `measured`.
+    Times count from the moment when the pulse peak leaves the transmitter. `measured` builds a train from a measured
+    gate.
 
     Parameters
     ----------
     start_ns : float
-        Time of the half height of the first gate's rising edge [ns].
+        Half-height time of the first gate's rising edge [ns].
     width_ns : float
         Time between the half heights of a gate's edges [ns], greater than 0.
     step_ns : float
@@ -236,7 +236,7 @@ class GateTrain(Checked):
 
     @classmethod
     def measured(cls, profile: GateShape, start_ns: float, step_ns: float, count: int, pulses: int = 1) -> GateTrain:
-        """Train of gates of a shape, such as `GateShape.from_file`; other parameters as in the class."""
+        """Gate train with a shape, such as `GateShape.from_file`; other parameters as in the class."""
         width, rise, fall = profile.width_ns, profile.rise_ns, profile.fall_ns
         return cls(start_ns, width, step_ns, count, rise, fall, pulses, profile if profile.times_ns.size else None)
 
@@ -247,7 +247,7 @@ class GateTrain(Checked):
 
     @property
     def starts_ns(self) -> FloatArray:
-        """Times of the half heights of the rising edges [ns], shape (count,)."""
+        """Half-height times of the rising edges [ns], shape (count,)."""
         return np.asarray(self.start_ns + self.step_ns * np.arange(self.count))
 
     @property
@@ -261,14 +261,14 @@ class GateTrain(Checked):
         return np.asarray(self.starts_ns[:, None] + np.array(self.shape.span_ns))
 
     def gate_bins(self, gate: int, time_start_ns: float, bin_width_ns: float, bin_count: int) -> tuple[int, FloatArray]:
-        """Mean transmission of a gate in the bins of a time axis that it overlaps.
+        """Mean gate transmission in the time bins that the gate overlaps.
 
         Parameters
         ----------
         gate : int
-            Index of the gate, 0 to count - 1.
+            Gate index, 0 to count - 1.
         time_start_ns, bin_width_ns : float
-            Start of the first bin and width of the bins [ns].
+            Start of the first bin, and bin width [ns].
         bin_count : int
             Number of bins, 1 to 10^9.
 
@@ -288,12 +288,12 @@ class GateTrain(Checked):
         return low, np.asarray(np.clip(np.diff(self.shape.open_time(edges)) / width, 0, 1))
 
     def response_weights(self, pulse: Pulse, response_time_ns: float = 0.0) -> ResponseTable:
-        """Weight of an ideal echo in the first gate against its arrival time.
+        """Return an ideal echo's weight in the first gate against its arrival time.
 
-        Pulse and receiver response spread an echo at t with the unit-area kernel h(tau). The first gate transmits
-        W(t) = int h(tau) G_0(t + tau) dtau of it, gate k W(t - k step_ns), for one pulse. Values are 1/128 of the
-        shortest of pulse, edges and width apart, with which linear interpolation is accurate to 1e-5, or more where
-        they would be more than 2^17.
+        Pulse and receiver response spread an echo at t with the unit-area kernel h(tau). The first gate transmits W(t)
+        = int h(tau) G_0(t + tau) dtau of it, and gate k transmits W(t - k step_ns), for one pulse. Values are 1/128 of
+        the shortest of pulse, edges and width apart, with which linear interpolation is accurate to 1e-5. They are
+        farther apart where there would be more than 2^17.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class GateTrain(Checked):
         step = max(min(times) / _POINTS, longest / _MOST_POINTS)
         lag, kernel = pulse.kernel(step, response_time_ns)
         cells = int(np.ceil((closes - opens) / step)) + 3
-        # Mean transmission over cells of one step, with one cell of margin at each end.
+        # Mean transmission over one-step cells, with one cell of margin at each end.
         edges = opens + step * (np.arange(cells + 1) - 1.5)
         gate = np.diff(self.shape.open_time(edges)) / step
         values = np.clip(fftconvolve(gate, kernel[::-1]), 0, 1)
@@ -323,7 +323,7 @@ class GateTrain(Checked):
         return ResponseTable(start, step, values)
 
     def bin_weights(self, pulse: Pulse, response_time_ns: float, axis: TimeAxis) -> FloatArray:
-        """Return the weight in each gate of light that arrives in each bin, of all pulses together, shape (bin, gate).
+        """Return each gate's weight for light that arrives in each bin, all pulses together, shape (bin, gate).
 
         Light is spread evenly over its bin; pulse and response time [ns] are as for `response_weights`.
         """
@@ -369,8 +369,8 @@ class GatePlan:
     """Gates of a scene: a train whose start is replaced by one given in time, in depth or in range."""
 
     train: GateTrain
-    #: Name of the parameter of the film: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
+    #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
     given: str
-    #: Its value: time of the half height of the first gate's rising edge [ns]; or depth below the mean sea level or
-    #: range from the lidar [m], on the receiver's axis, of the echoes that arrive at that time.
+    #: Its value: half-height time of the first gate's rising edge [ns]; or the depth below the mean sea level, or range
+    #: from the lidar [m], from which echoes on the receiver's axis arrive then.
     start: float

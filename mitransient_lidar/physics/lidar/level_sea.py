@@ -56,9 +56,9 @@ class LevelSea:
         origin
             Point in the air, x, y, z [m], or one for each ray, shape (..., 3).
         directions
-            Directions of the rays in the air, of any length, shape (..., 3).
+            Ray directions in the air, of any length, shape (..., 3).
         z
-            Heights [m], below that of the origin, shape (...).
+            Heights [m], below the origin, shape (...).
 
         Returns
         -------
@@ -99,9 +99,9 @@ class LevelSea:
         return np.asarray(origin[:2] + offset * share[..., None])
 
     def _tangents(self, distance: FloatArray, height: float, depth: FloatArray) -> FloatArray:
-        """Return the tangents of the angles from the vertical in air of rays between points in air and in the water.
+        """Return the tangents of ray angles from the vertical in air, between points in air and in the water.
 
-        They are apart by horizontal distances [m]; a height is that above the sea level, positive [m].
+        The points are a horizontal distance [m] apart; the height is above the sea level, positive [m].
         """
         # The distance is a concave, increasing function of the tangent: Newton's method from 0 cannot overshoot.
         t, layers = np.zeros_like(distance), list(zip(self.refractive_index, self._thickness(depth), strict=True))
@@ -117,6 +117,6 @@ class LevelSea:
         return np.asarray(t)
 
     def _thickness(self, depth: FloatArray) -> list[FloatArray]:
-        """Return the thickness of each layer above depths [m]."""
+        """Return each layer's thickness above depths [m]."""
         edges = [0.0, *self.boundaries, np.inf]
         return [np.clip(depth - top, 0, bottom - top) for top, bottom in itertools.pairwise(edges)]

@@ -36,7 +36,7 @@ class LidarGeometry(Checked):
     refractive_index: float = checked(in_range, 1, np.inf)
     #: Group index of the water, at least 1, which determines travel times.
     group_index: float = checked(in_range, 1, np.inf)
-    #: Arrival of the surface echo [ns], the zero of depths; by default (NaN) from the mean sea level along the axis.
+    #: Surface echo arrival [ns], the zero of depths; by default (NaN) from the mean sea level along the axis.
     surface_time_ns: float = field(default=math.nan, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class LidarGeometry(Checked):
 
     @classmethod
     def of_pose(cls, pose: Pose, refractive_index: float, group_index: float) -> LidarGeometry:
-        """Return the geometry of a lidar with a pose above water of these indices."""
+        """Return a lidar's geometry from its pose above water with these indices."""
         pose.require_above_sea()
         return LidarGeometry(float(pose.origin[2]), math.radians(pose.off_nadir_deg), refractive_index, group_index)
 
@@ -86,7 +86,7 @@ class LidarGeometry(Checked):
         return np.asarray(self.metres_per_ns * (finite_array("time_ns", time_ns) - self.surface_time_ns))
 
     def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Return the depth [m] of echoes at times [ns]."""
+        """Return the echo depth [m] for times [ns]."""
         return np.asarray((finite_array("time_ns", time_ns) - self.surface_time_ns) * self.depth_per_ns)
 
     def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:

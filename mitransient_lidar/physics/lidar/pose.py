@@ -26,10 +26,10 @@ _SMALLEST_AZIMUTH = 1e-9
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and axis of a transmitter or receiver, or those of each of several shots.
+    """Position and axis of a transmitter or receiver, for one shot or several.
 
-    A point of the tangent plane about the axis is (angle_x, angle_y), in radians: its direction is the unit vector
-    along ``axis + angle_x * far + angle_y * left``. +angle_x points away from nadir, and +angle_y along +y for the
+    A tangent-plane point about the axis is (angle_x, angle_y), in radians. Its direction is the unit vector along
+    ``axis + angle_x * far + angle_y * left``. The angle_x axis points away from nadir, and angle_y along +y for the
     default pose.
 
     Parameters
@@ -37,7 +37,7 @@ class Pose:
     origin
         Position [m], shape (3,) or (shots, 3).
     axis, far, left
-        Orthonormal directions: the optical axis, the direction of +angle_x and the direction of +angle_y.
+        Orthonormal directions: the optical axis, the +angle_x direction and the +angle_y direction.
     """
 
     origin: FloatArray
@@ -54,7 +54,7 @@ class Pose:
         altitude
             Height above the mean sea level [m], 0.1 to 1e6, or -1000 to -0.1 under water.
         off_nadir_deg
-            Angle of the axis from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water.
+            Axis angle from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water.
         aim_x, aim_y
             Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the point above the pose.
 
@@ -76,7 +76,7 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, name: str, matrix: FloatArray) -> Self:
-        """Return the pose of a transformation, shape (4, 4), a parameter of this name.
+        """Return the pose by a transformation, shape (4, 4), a parameter with this name.
 
         It maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does: z is the optical axis, y is
         +angle_x (away from nadir) and x is +angle_y. A matrix that is not a rotation, a scale and a translation raises
@@ -101,11 +101,11 @@ class Pose:
         return replace(self, origin=origin + shift, axis=axis, far=far, left=left)
 
     def part(self, rows: slice | IntArray) -> Self:
-        """Return the poses of some of the shots."""
+        """Return the poses for some shots."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ("origin", "axis", "far", "left")})
 
     def rays(self, angles: FloatArray) -> FloatArray:
-        """Return directions of tangent-plane angles [rad], shape (..., 2), of the length 1/cos to the axis."""
+        """Return directions for tangent-plane angles [rad], shape (..., 2), with the length 1/cos to the axis."""
         return np.asarray(self.axis + angles[..., :1] * self.far + angles[..., 1:] * self.left)
 
     def directions(self, angles: FloatArray) -> FloatArray:
@@ -114,21 +114,21 @@ class Pose:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def angles_of(self, directions: FloatArray) -> FloatArray:
-        """Return the tangent-plane angles [rad] of directions of any length, shape (..., 3), as shape (..., 2).
+        """Return the tangent-plane angles [rad], shape (..., 2), for directions of any length, shape (..., 3).
 
-        Those of directions behind the pose are of the opposite ones.
+        Directions behind the pose give the angles of the opposite directions.
         """
         along = directions @ self.axis
         return np.stack([directions @ self.far / along, directions @ self.left / along], axis=-1)
 
     @property
     def off_nadir_deg(self) -> float:
-        """Angle of the axis from the vertical [deg]."""
+        """Axis angle from the vertical [deg]."""
         return float(np.degrees(np.arccos(np.clip(-self.axis[2], -1, 1))))
 
     @property
     def azimuth(self) -> FloatArray:
-        """Direction of the axis from +x to +y [rad], 0 of a vertical one, shape (...,)."""
+        """Axis direction from +x to +y [rad], 0 for a vertical axis, shape (...,)."""
         x, y = self.axis[..., 0], self.axis[..., 1]
         return np.where(np.hypot(x, y) > _SMALLEST_AZIMUTH, np.arctan2(y, x), 0.0)
 

@@ -1,4 +1,4 @@
-"""Shape of the transmitted pulse, and its convolution with the receiver's response over the bins of a time axis."""
+"""Transmitted pulse shape, and its convolution with the receiver's response over time bins."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from mitransient_lidar.physics.piecewise_linear import first_crossing, integral,
 logger = logging.getLogger(__name__)
 
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
-_TAIL = 1e-10  # energy left out at each end of a kernel
-_MOST_BINS = 10**7  # of a kernel
+_TAIL = 1e-10  # energy left out at each kernel end
+_MOST_BINS = 10**7  # in a kernel
 _LONGEST_DIRECT = 2000  # bins of a kernel from which Fourier transforms are faster
 
-#: Lowest sample of a file relative to the largest one; what lies below 0 is noise.
+#: Lowest sample in a file relative to the largest one; negative samples are noise.
 _LOWEST_SAMPLE = -0.1
 
 _POWER = Column(
@@ -38,7 +38,7 @@ _POWER = Column(
 
 @dataclass(frozen=True, eq=False)
 class Pulse:
-    """Pulse of unit energy whose peak leaves the transmitter at t = 0.
+    """Pulse with unit energy whose peak leaves the transmitter at t = 0.
 
     Build one with `gaussian`, `sampled` or `from_file`.
 
@@ -47,8 +47,8 @@ class Pulse:
     shape : {'gaussian', 'sampled'}
         Selects which of the fields below apply.
     fwhm_ns : float
-        Full width at half maximum [ns]; of a sampled pulse, the time between its first and its last crossing of half
-        of its largest sample.
+        Full width at half maximum [ns]; for a sampled pulse, the time from first to last crossing of half the largest
+        sample.
     times_ns : ndarray, shape (S,)
         Times of the samples [ns] with the largest sample at 0.
     power : ndarray, shape (S,)
@@ -92,9 +92,9 @@ class Pulse:
         Parameters
         ----------
         path : path-like
-            File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
-            be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0,
-            down to -0.1 of the largest one, are noise and set to 0 with a warning in the log.
+            File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may be
+            called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
+            to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
 
         Raises
         ------
@@ -106,8 +106,8 @@ class Pulse:
         if lowest < 0 and np.all(np.isfinite(power)):
             if lowest < _LOWEST_SAMPLE * power.max():
                 raise UserError(
-                    f"{path} has power = {lowest:g} with a largest one of {power.max():g}: samples must not be negative"
-                    " beyond noise, a tenth of the largest one."
+                    f"{path} has power = {lowest:g} with a largest one of {power.max():g}: samples must not be "
+                    "negative beyond noise, a tenth of the largest one"
                 )
             logger.warning(
                 "%s: %d of %d samples are below 0, down to %.2g of the largest one, and set to 0",
@@ -136,22 +136,22 @@ class Pulse:
         return integral(self.times_ns, self.power, t)
 
     def kernel(self, bin_width_ns: float, response_time_ns: float = 0.0) -> tuple[int, FloatArray]:
-        """Discrete impulse response of pulse and receiver for histograms of ideal echoes.
+        """Discrete impulse response of pulse and receiver for ideal echo histograms.
 
         Parameters
         ----------
         bin_width_ns : float
-            Width of the bins [ns], positive.
+            Bin width [ns], positive.
         response_time_ns : float
             Time constant tau of a causal single-pole response exp(-t/tau)/tau [ns]; 0 for none.
 
         Returns
         -------
         first_lag : int
-            Lag of the first weight in bins, usually negative.
+            First weight's lag in bins, usually negative.
         weights : ndarray, shape (M,)
-            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m: exact
-            integrals over the bins, truncated where less than 1e-10 lies outside, with the sum 1.
+            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are
+            exact integrals over the bins with the sum 1, truncated where less than 1e-10 lies outside.
 
         Raises
         ------
@@ -196,14 +196,14 @@ class Pulse:
 
 
 def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArray]) -> FloatArray:
-    """Received power from the energies of ideal echoes.
+    """Received power from ideal echo energies.
 
     Parameters
     ----------
     energy : array_like, shape (..., time)
         Energy per bin [J]; at least one bin.
     bin_width_ns : float
-        Width of the bins [ns], positive, that of the kernel.
+        Bin width [ns], positive, the kernel's.
     kernel : (int, ndarray)
         First lag and weights, from `Pulse.kernel`.
 
@@ -221,7 +221,7 @@ def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, Floa
     lags = first + np.arange(weights.size)
     reached = np.abs(lags) < count
     lags, weights = lags[reached], weights[reached]
-    # One convolution of all histograms, with zeros between them.
+    # One convolution for all histograms, with zeros between them.
     padded = np.zeros((histogram.size // count, count + max(lags.size - 1, 0)))
     padded[:, :count] = histogram.reshape(-1, count)
     power = np.zeros((len(padded), count))
@@ -250,7 +250,7 @@ def _convolved(padded: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _reached(sources: npt.NDArray[np.bool_], size: int) -> npt.NDArray[np.bool_]:
-    """Return the bins in which a kernel of some bins has a share of any of the sources."""
+    """Return the bins in which a kernel with some bins contains a share of any source."""
     known = np.concatenate([np.zeros(size, dtype=np.int64), np.cumsum(sources)])
     return np.asarray(known[size:] > known[: sources.size])
 

@@ -13,12 +13,12 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 
 
 def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
-    """Angle of refraction [rad] in water of relative index `n` >= 1 for angles `theta` [rad] in air."""
+    """Refraction angle [rad] in water with relative index `n` >= 1 for angles `theta` [rad] in air."""
     return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
 
 
 def cos_in_water(cosine: npt.ArrayLike, n: float) -> FloatArray:
-    """Return the cosines of angles of refraction in water for those in air, by Snell's law."""
+    """Return the cosines of refraction angles in water from the cosines in air, by Snell's law."""
     return np.asarray(np.sqrt(1 - (1 - np.asarray(cosine, dtype=np.float64) ** 2) / n**2))
 
 
@@ -36,7 +36,7 @@ def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
     direction
         Unit directions of propagation in the air, shape (..., 2 or 3).
     normal
-        Normals of the facets into the air, of any length, of the same shape.
+        Facet normals into the air, of any length, with the same shape.
     n
         Refractive index of the water relative to air, at least 1.
     """
@@ -58,7 +58,7 @@ def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     Parameters
     ----------
     theta : array_like
-        Angle of incidence [rad], 0 to pi/2.
+        Incidence angle [rad], 0 to pi/2.
     n : float
         Index behind the interface relative to that before it; below 1 from water to air.
 
@@ -84,9 +84,9 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
     Parameters
     ----------
     height, depth : array_like
-        Height of the receiver and depth of the point [m].
+        Receiver height and point depth [m].
     theta, n
-        Angle of the ray in air [rad], and refractive index of the water.
+        Ray angle in air [rad], and water refractive index.
 
     Returns
     -------

@@ -26,8 +26,8 @@ _PARTS = 20
 class TimeAxis:
     """Equal, half-open time bins [start, start + width); time is 0 when the pulse's peak leaves the transmitter."""
 
-    start_ns: float  #: Start of the first bin [ns].
-    bin_width_ns: float  #: Width of a bin [ns], positive.
+    start_ns: float  #: First bin's start [ns].
+    bin_width_ns: float  #: Bin width [ns], positive.
     bin_count: int  #: Number of bins, at least 1.
 
     @classmethod
@@ -39,20 +39,20 @@ class TimeAxis:
         start_ns: float | None = None,
         bin_count: int | None = None,
     ) -> TimeAxis:
-        """Return the bins of times from `first_ns` to `last_ns` [ns].
+        """Return the bins for times from `first_ns` to `last_ns` [ns].
 
-        Start and number of bins, unless they are given, are multiples of 1, 2 or 5 times a power of ten of bins: at
-        most a twentieth of these times.
+        Start and number of bins, unless given, are multiples of 1, 2 or 5 times a power of ten of bins: at most a
+        twentieth of these times.
 
         Raises
         ------
         UserError
-            If there are more than 1 000 000 bins, or its length is automatic and more than 10 ms.
+            If there are more than 1 000 000 bins, or the length is automatic and more than 10 ms.
         """
         begin = first_ns if start_ns is None else start_ns
         bins = max(last_ns - min(begin, first_ns), 0.0) / bin_width_ns
         steps = (factor * 10**power for power in itertools.count() for factor in (1, 2, 5))
-        # The largest step of at most a twentieth of the times.
+        # The largest step within a twentieth of the times.
         step = max([1, *itertools.takewhile(lambda each: each * _PARTS <= bins, steps)])
         if start_ns is None:
             start_ns = step * math.floor(first_ns / (step * bin_width_ns)) * bin_width_ns
@@ -72,12 +72,12 @@ class TimeAxis:
 
     @property
     def centres_ns(self) -> FloatArray:
-        """Centres of the bins [ns], shape (bin_count,)."""
+        """Bin centres [ns], shape (bin_count,)."""
         return np.asarray(self.start_ns + self.bin_width_ns * (np.arange(self.bin_count) + 0.5))
 
     @property
     def edges_ns(self) -> FloatArray:
-        """Edges of the bins [ns], shape (bin_count + 1,)."""
+        """Bin edges [ns], shape (bin_count + 1,)."""
         return np.asarray(self.start_ns + self.bin_width_ns * np.arange(self.bin_count + 1))
 
     @property
@@ -87,5 +87,5 @@ class TimeAxis:
 
     @property
     def path_end(self) -> float:
-        """Optical path length of light that arrives at the end of the last bin [m]."""
+        """Optical path length of light that arrives at the last bin's end [m]."""
         return self.end_ns * 1e-9 * C0

@@ -1,9 +1,9 @@
 """Gated cameras: digital numbers of frames for the energy that each pixel collects in a gate, as moments and draws.
 
-A frame is the sum of the pulses of a gate on the chip. Its light passes, in this order: the blur of the optics; events
-(photoelectrons or avalanches, Poisson-distributed, with dark events while the gate is open); their multiplication; the
-blur of an intensifier; the chip with its dark current and full well; the read-out; and the converter. Arrays of pixels
-have the shape (row, column, gate), or (pixel, gate) for pixels that are no image, which have no blur.
+A frame is the sum of a gate's pulses on the chip. Its light passes, in this order: the optics' blur; events
+(photoelectrons or avalanches, Poisson-distributed, with dark events while the gate is open); their multiplication; an
+intensifier's blur; the chip with its dark current and full well; the read-out; and the converter. Pixel arrays have the
+shape (row, column, gate), or (pixel, gate) for pixels that are no image, which have no blur.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 Values = npt.ArrayLike
 
-_TAIL = 1e-6  # of a kernel, left out at its ends
+_TAIL = 1e-6  # left out at the ends of a kernel
 _LEAST_SKEWNESS = 1e-3  # of a clipped distribution, against cancellation
 _FAR = 12.0  # deviations from a limit beyond which nothing is clipped
-_OFFSET = 4.0  # least offset in deviations of the read-out
+_OFFSET = 4.0  # least offset in read-out deviations
 
-#: Parameters that a kind of camera has not.
+#: Parameters that a camera kind lacks.
 _GAIN = ("gain", "excess_noise", "frame_dark", "intensifier_mtf")
 _CHIP = ("dark_current_hz", "read_noise", "full_well", "electrons_per_dn", "offset_dn", "offset_spread_dn")
 _WITHOUT = {
@@ -44,32 +44,32 @@ _WITHOUT = {
 
 
 class Record(NamedTuple):
-    """Drawn frames, each of shape (frame, ..., gate)."""
+    """Drawn frames, each with the shape (frame, ..., gate)."""
 
-    signal: npt.NDArray[np.unsignedinteger[Any]]  #: Digital numbers, of 16 bits, or 32 for a converter of more.
+    signal: npt.NDArray[np.unsignedinteger[Any]]  #: Digital numbers, 16 bits, or 32 for a converter with more.
     saturated: BoolArray  #: Whether the full well or the range of the converter was reached.
 
 
 class Pattern(NamedTuple):
-    """Fixed pattern of a camera's pixels, the same in all frames, each of shape (row, column) or (pixel,)."""
+    """Fixed pattern of a camera's pixels, the same in all frames, each with the shape (row, column) or (pixel,)."""
 
-    response: FloatArray  #: Events over those of the mean pixel [1].
+    response: FloatArray  #: Events relative to the mean pixel [1].
     offset: FloatArray  #: Added to the offset [DN].
-    dark: FloatArray  #: Dark current over that of most pixels [1].
+    dark: FloatArray  #: Dark current relative to most pixels [1].
 
 
 _ALIKE = Pattern(np.ones(1), np.zeros(1), np.ones(1))
 
 
 class Noise(NamedTuple):
-    """Parts of the noise: the covariance of pixels is B diag(shared) B + diag(own) + shift shift^T.
+    """Noise parts: the covariance of pixels is B diag(shared) B + diag(own) + shift shift^T.
 
-    B is that of `Camera.spread`.
+    `Camera.spread` gives B.
     """
 
-    shared: FloatArray  #: Variance of the events of a pixel that the intensifier spreads over its neighbours [DN^2].
+    shared: FloatArray  #: Variance of a pixel's events that the intensifier spreads over its neighbours [DN^2].
     own: FloatArray  #: Variance of a pixel that others do not share [DN^2].
-    shift: FloatArray  #: Change of the mean by a frame's gate that opens one deviation of its jitter later [DN].
+    shift: FloatArray  #: Change in the mean when a frame's gate opens one jitter deviation later [DN].
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,12 @@ class Camera(Plan):
 
     Notes
     -----
-    Mean and variance are exact below saturation; a limit cuts a Pearson distribution of type III with the mean,
-    variance and skewness of the charge. Of full well and converter, the higher limit is left out. Blur is the discrete
-    Gaussian of T. Lindeberg, IEEE Trans. PAMI 12, 234 (1990), doi:10.1109/34.49051, with the MTF exp(-t (1 - cos 2 pi
-    f)) along each axis at f cycles per pixel; images are mirrored at their edges, which keeps the sum. Intensifiers and
-    electron bombardment multiply before the chip. An electron-multiplying CCD needs a shutter before it, and multiplies
-    its dark current. The afterglow of phosphors and the crosstalk and afterpulses of counters are left out.
+    Mean and variance are exact below saturation; a limit cuts a Pearson distribution of type III with the charge's
+    mean, variance and skewness. The higher limit, full well or converter, is left out. Blur is T. Lindeberg's discrete
+    Gaussian, IEEE Trans. PAMI 12, 234 (1990), doi:10.1109/34.49051. Its MTF is exp(-t (1 - cos 2 pi f)) along each axis
+    at f cycles per pixel; images are mirrored at their edges, which keeps the sum. Intensifiers and electron
+    bombardment multiply before the chip. An electron-multiplying CCD needs a shutter before it, and multiplies its dark
+    current. Phosphor afterglow and the crosstalk and afterpulses of counters are left out.
     """
 
     kind: Annotated[
@@ -92,30 +92,30 @@ class Camera(Plan):
     ]
     quantum_efficiency: Annotated[float, Option("Events per photon, with windows and fill factors", 0, 1, above=True)]
     gain: Annotated[float, Option("Mean electrons on the chip per event", 1)] = 1.0
-    excess_noise: Annotated[float, Option("Mean square of these electrons over the square of their mean", 1)] = 1.0
+    excess_noise: Annotated[float, Option("Mean square of these electrons over their squared mean", 1)] = 1.0
     open_dark_hz: Annotated[float, Option("Dark events per pixel while the gate is open", 0, unit="1/s")] = 0.0
     frame_dark: Annotated[float, Option("Dark events per pixel and frame before the gain", 0)] = 0.0
-    dark_current_hz: Annotated[float, Option("Dark current of a pixel of the chip", 0, unit="electrons/s")] = 0.0
-    frame_time_ms: Annotated[float, Option("Exposure of the chip for a frame", 0, unit="ms")] = 0.0
+    dark_current_hz: Annotated[float, Option("Dark current of a chip pixel", 0, unit="electrons/s")] = 0.0
+    frame_time_ms: Annotated[float, Option("Chip exposure per frame", 0, unit="ms")] = 0.0
     leakage: Annotated[float, Option("Share of the daylight recorded during the frame with closed gate", 0, 1)] = 0.0
     pulses_per_exposure: Annotated[int, Option("Pulses in which a pixel counts at most one event", 1, 10**9)] = 1
     read_noise: Annotated[float, Option("Standard deviation of the read-out", 0, unit="electrons")] = 0.0
-    full_well: Annotated[float, positive_option("Largest charge of a pixel or register", "electrons")] = np.inf
-    bits: Annotated[int, Option("Resolution of the converter, or size of the counter", 1, 24)] = 16
+    full_well: Annotated[float, positive_option("Largest pixel or register charge", "electrons")] = np.inf
+    bits: Annotated[int, Option("Converter resolution, or counter size", 1, 24)] = 16
     electrons_per_dn: Annotated[float, positive_option("Charge per digital number", "electrons")] = 1.0
     offset_dn: Annotated[float, Option("Digital number without charge, at least 4 read-out noises", 0, unit="DN")] = 0.0
-    response_spread: Annotated[float, Option("Standard deviation of the pixels' response over its mean", 0, 1)] = 0.0
-    offset_spread_dn: Annotated[float, Option("Standard deviation of the pixels' offset", 0, unit="DN")] = 0.0
+    response_spread: Annotated[float, Option("Standard deviation of pixel responses over their mean", 0, 1)] = 0.0
+    offset_spread_dn: Annotated[float, Option("Standard deviation of pixel offsets", 0, unit="DN")] = 0.0
     hot_pixels: Annotated[float, Option("Share of hot pixels", 0, 1)] = 0.0
-    hot_factor: Annotated[float, Option("Dark current or dark counts of a hot pixel over those of others", 1)] = 1.0
-    pattern_seed: Annotated[int, Option("Seed of the fixed pattern: one for each camera", 0, 2**53)] = 0
+    hot_factor: Annotated[float, Option("Dark current or counts in a hot pixel over those in others", 1)] = 1.0
+    pattern_seed: Annotated[int, Option("Seed of the fixed pattern: one per camera", 0, 2**53)] = 0
     optics_mtf: Annotated[float, Option("MTF of the optics at half a cycle per pixel", 0, 1, above=True)] = 1.0
-    intensifier_mtf: Annotated[float, Option("The same of the intensifier, behind its gain", 0, 1, above=True)] = 1.0
-    gate_jitter_ns: Annotated[float, Option("Standard deviation of the gate's time in a pulse", 0, unit="ns")] = 0.0
+    intensifier_mtf: Annotated[float, Option("MTF of the intensifier, after its gain", 0, 1, above=True)] = 1.0
+    gate_jitter_ns: Annotated[float, Option("Standard deviation of the gate time within a pulse", 0, unit="ns")] = 0.0
     insertion_delay_ns: Annotated[float, Option("Earliest gate after the pulse", 0, unit="ns")] = 0.0
-    shortest_gate_ns: Annotated[float, Option("Width of the shortest gate", 0, unit="ns")] = 0.0
+    shortest_gate_ns: Annotated[float, Option("Shortest gate width", 0, unit="ns")] = 0.0
     wavelength_nm: Annotated[float, positive_option("Vacuum wavelength of the light", "nm")] = 532.0
-    source: Annotated[str, Option("Sources of the numbers, and which of them are assumed", form="a text")] = ""
+    source: Annotated[str, Option("Sources of the numbers, and which are assumed", form="a text")] = ""
     name: str = "custom"
 
     def __post_init__(self) -> None:
@@ -138,7 +138,7 @@ class Camera(Plan):
         return (1 << self.bits) - 1
 
     def pattern(self, pixels: tuple[int, ...]) -> Pattern:
-        """Return the fixed pattern of pixels of a shape (row, column) or (pixel,)."""
+        """Return the fixed pattern for pixels in the shape (row, column) or (pixel,)."""
         random = np.random.default_rng(self.pattern_seed)
         response = np.maximum(random.normal(1, self.response_spread, pixels), 0)
         offset = random.normal(0, self.offset_spread_dn, pixels)
@@ -156,9 +156,9 @@ class Camera(Plan):
         open_ns : array_like
             Integral of the gate's transmission [ns], not negative: a number, or shape (gate,).
         background : array_like
-            Power of the daylight on each pixel [W], not negative: a number, or of the shape of the pixels.
+            Daylight power on each pixel [W], not negative: a number, or an array in the shape of the pixels.
         pulses : int
-            Pulses of a frame.
+            Pulses per frame.
         pattern : Pattern, optional
             Fixed pattern; by default all pixels are alike.
         """
@@ -182,10 +182,10 @@ class Camera(Plan):
         pattern: Pattern = _ALIKE,
         slope: Values | None = None,
     ) -> Expected:
-        """Return mean [DN] and variance [DN^2] of a frame and its probability of saturation, in the shape of `energy`.
+        """Return a frame's mean [DN], variance [DN^2] and saturation probability in the shape of `energy`.
 
-        Parameters are those of `events`; `slope` is the derivative of the energy with respect to the gate's time
-        [J/ns], of the same shape: without it, `gate_jitter_ns` has no effect.
+        Parameters as for `events`; `slope` is the energy's derivative with respect to the gate time [J/ns], in the same
+        shape: without it, `gate_jitter_ns` has no effect.
         """
         from scipy.special import bdtrc
 
@@ -216,7 +216,7 @@ class Camera(Plan):
         pattern: Pattern = _ALIKE,
         slope: Values | None = None,
     ) -> Noise:
-        """Return the parts of the noise without saturation; parameters are those of `expected`."""
+        """Return the noise parts without saturation; parameters as for `expected`."""
         events = self.events(energy, open_ns, background, pulses, pattern)
         variance = self._charge(events, pulses, pattern)[1] + self.read_noise**2
         shared = np.zeros_like(events)
@@ -228,7 +228,7 @@ class Camera(Plan):
         return Noise(shared / scale**2, variance / scale**2 + (0 if self.kind == "counting" else 1 / 12), shift)
 
     def _shift(self, slope: Values, events: FloatArray, pulses: int, pattern: Pattern) -> FloatArray:
-        """Return the change of the mean charge with the time of a frame's gate, for one deviation [electrons]."""
+        """Return how the mean charge changes with a frame's gate time, for one deviation [electrons]."""
         steep = self._signal_events(np.asarray(slope, np.float64), pattern) * self.gate_jitter_ns / np.sqrt(pulses)
         if self.kind == "counting":
             steep = steep * np.exp(-events / self._exposures(pulses))
@@ -243,15 +243,15 @@ class Camera(Plan):
         pulses: int = 1,
         pattern: Pattern = _ALIKE,
     ) -> FloatArray:
-        """Return the third cumulant of the sum of the pixels times weights [1/DN] in each gate, without saturation.
+        """Return the third cumulant of weighted pixel sums [weights in 1/DN] in each gate, without saturation.
 
-        The weights have the shape of `energy`; the other parameters are those of `events`.
+        The weights have the shape of `energy`; other parameters as for `events`.
         """
         events = self.events(energy, open_ns, background, pulses, pattern)
         scaled, pixels = weights / self.electrons_per_dn, tuple(range(events.ndim - 1))
         if self.intensifier_mtf == 1:
             return np.asarray(np.sum(self._charge(events, pulses, pattern)[2] * scaled**3, axis=pixels))
-        # The electrons of an event, whose number is gamma-distributed, meet the weights of the pixels at random.
+        # The electrons of an event, whose number is gamma-distributed, meet the pixel weights at random.
         once, twice, thrice = (self.spread(scaled**power) for power in (1, 2, 3))
         noise = self.excess_noise - 1 / self.gain
         triples = self.gain**3 * noise * (2 * noise - 1) * once**3 + 3 * self.gain**2 * noise * once * twice
@@ -273,7 +273,7 @@ class Camera(Plan):
         pattern: Pattern = _ALIKE,
         slope: Values | None = None,
     ) -> Record:
-        """Draw frames; parameters are those of `expected`, and the shift of a gate is that of all pixels of a frame."""
+        """Draw frames; parameters as for `expected`. All pixels in a frame share the gate's shift."""
         events = self.events(energy, open_ns, background, pulses, pattern)
         steep = 0.0 if slope is None else self._signal_events(np.asarray(slope, np.float64), pattern)
         shape = (integer("frames", frames, 1, 10**9), *events.shape)
@@ -306,17 +306,17 @@ class Camera(Plan):
         return charge
 
     def _charge(self, events: FloatArray, pulses: int, pattern: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the first three cumulants of the charge of a frame without full well [electrons]."""
+        """Return the first three cumulants of a frame's charge without full well [electrons]."""
         if self.kind == "counting":
             exposures = self._exposures(pulses)
             silent, mean = np.exp(-events / exposures), exposures * -np.expm1(-events / exposures)
             return mean, mean * silent, mean * silent * (2 * silent - 1)
-        # Of gamma-distributed charges, the mean cube is that of the mean times F (2 F - 1).
+        # For gamma-distributed charges, the mean cube is the cubed mean times F (2 F - 1).
         gain, noise = self.gain, self.excess_noise - (1 / self.gain if self.intensifier_mtf < 1 else 0)
         mean, pairs = gain * self.spread(events), gain**2 * noise * self.spread(events, 2)
         triples = gain**3 * noise * (2 * noise - 1) * self.spread(events, 3)
         dark = 0.0 if self.kind == "electron_multiplying" else self._dark(pattern)
-        if self.intensifier_mtf < 1:  # a Poisson distribution about each of them
+        if self.intensifier_mtf < 1:  # a Poisson distribution about each electron number
             return mean + dark, pairs + mean + dark, triples + 3 * pairs + mean + dark
         return mean + dark, pairs + dark, triples + dark
 
@@ -367,8 +367,8 @@ def _blur_weights(size: int, mtf: float) -> sparse.csr_array:
 def _clipped(mean: FloatArray, variance: FloatArray, third: FloatArray, limit: Values, over: Values) -> Expected:
     """Return the moments of min(X, limit) and P(X > over), for a Pearson distribution of type III with these cumulants.
 
-    In units of the deviation, from the mean, X is (Y - k)/sqrt(k) with Y gamma-distributed with the shape k = 4 over
-    the square of the skewness, or the negative of that.
+    In deviations from the mean, X is (Y - k)/sqrt(k), or its negative; Y is gamma-distributed with the shape k = 4
+    divided by the squared skewness.
     """
     deviation = np.sqrt(variance)
     limit, over = np.broadcast_to(limit, mean.shape), np.broadcast_to(over, mean.shape)

@@ -1,6 +1,6 @@
 """Receiver chains, from the optical power on a detector to recorded samples with noise.
 
-Powers are means over time bins; before and after a record there is only the background, such as that of
+Powers are means over time bins; before and after a record there is only the background, such as
 `clear_sky.background_power`.
 """
 
@@ -38,7 +38,7 @@ from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter, delayed
 
 _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
 _RARE = 1e-3  # share of records in which a single event is higher than stated
-_OVERLAPPING = 3.0  # events in a bin above which they are no longer single
+_OVERLAPPING = 3.0  # events in a bin above which they overlap
 _HEADROOM = 6.0  # standard deviations of noise below the upper limit of samples in range
 _STRONGEST = 16  # records that a gain or an attenuation is fitted to
 _DARKEST = math.log(1e12)  # largest attenuation that is tried
@@ -54,7 +54,7 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True)
 class ReceiverChain:
-    """Stages of a receiver, in the order of the signal.
+    """Receiver stages, in signal order.
 
     Raises
     ------
@@ -64,20 +64,20 @@ class ReceiverChain:
     Notes
     -----
     Mean and variance are exact up to the amplifier. For logarithm, saturation and rounding a sample is assumed to be
-    normally distributed, which holds where the amplifier's noise or tens of photoelectrons within its response
-    dominate. With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a
-    third in the variance were found; the shots themselves (`apply`) make no such assumption.
+    normally distributed. This holds where the amplifier's noise or tens of photoelectrons within its response dominate.
+    With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a third in
+    the variance were found. The shots themselves (`apply`) make no such assumption.
 
-    Jitter is in the shots alone. Closed forms are those of a shot of mean energy at its nominal time.
+    Only drawn shots have jitter. Closed forms describe a shot with mean energy at its nominal time.
     """
 
     detector: Detector  #: A `SinglePhotonDetector` outputs counts and takes no further stages.
     amplifier: Amplifier | None = None  #: None for an output of charge in electrons per bin.
     logarithm: LogAmplifier | None = None  #: It requires an amplifier.
     digitiser: Digitiser | None = None  #: It requires an amplifier.
-    wavelength_nm: float = 532.0  #: Vacuum wavelength of the light [nm], positive.
+    wavelength_nm: float = 532.0  #: Vacuum wavelength [nm], positive.
     source: str = ""  #: Source of the numbers.
-    jitter: ShotJitter | None = None  #: Energy and time of the shots; None for none.
+    jitter: ShotJitter | None = None  #: Energy and time jitter of the shots; None for none.
 
     def __post_init__(self) -> None:
         positive("wavelength_nm", self.wavelength_nm)
@@ -121,14 +121,14 @@ class ReceiverChain:
         series: bool = False,
         common_seed: int | None = None,
     ) -> Record:
-        """Draw the samples of independent shots.
+        """Draw independent shots.
 
         Parameters
         ----------
         power : array_like, shape (..., time)
             Mean optical power of the signal on the detector in each bin [W], not negative.
         bin_width_ns : float
-            Width of the bins [ns], positive.
+            Bin width [ns], positive.
         shots : int
             Number of shots, 1 to 10^9.
         seed : int
@@ -136,8 +136,8 @@ class ReceiverChain:
         background : array_like
             Constant power added to the signal [W], not negative: a number, or one for each record.
         series : bool
-            Whether the first axis of the power is one of different pulses, each with its own energy and trigger. All
-            other records are channels that share those of a shot.
+            Whether the first power axis counts different pulses, each with its own energy and trigger. All other
+            records are channels that share a shot's energy and trigger.
         common_seed : int, optional
             Seed of energy and trigger, by default `seed`: the same one for channels that are drawn one by one.
 
@@ -184,9 +184,9 @@ class ReceiverChain:
         return Record(record.signal.reshape(whole), record.saturated.reshape(whole))
 
     def expected(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> Expected:
-        """Return mean, variance and probability of saturation of the samples in closed form, in `units`.
+        """Return mean, variance and saturation probability of the samples in closed form, in `units`.
 
-        The arguments are those of `apply`.
+        Arguments as for `apply`.
         """
         mean, variance = self._unlimited(power, bin_width_ns, background)
         if self.amplifier is None:
@@ -194,12 +194,12 @@ class ReceiverChain:
         return self.readout(bin_width_ns).expected(mean, variance)
 
     def with_gain(self, factor: float) -> ReceiverChain:
-        """Return the chain with another gain: of a photomultiplier's dynodes, or of the amplifier behind others.
+        """Return the chain with another gain, by a photomultiplier's dynodes or the amplifier of other detectors.
 
         Raises
         ------
         UserError
-            If the factor is not positive, there is no amplifier, or dynodes would no longer amplify.
+            If the factor is not positive, there is no amplifier, or dynodes would cease to amplify.
         """
         if self.amplifier is None:
             raise UserError(f"gain = {factor:g} needs an amplifier, which this receiver lacks")
@@ -218,8 +218,8 @@ class ReceiverChain:
         """Return the largest factor of the gain, at most 1, that keeps samples in range; see `with_gain`.
 
         Samples are in range with 6 standard deviations of noise below the upper limit of tube, amplifier and digitiser.
-        Only `samples` count. Other arguments are those of `apply`. The factor is 1 without an amplifier or a limit, and
-        0 where the dynodes of a photomultiplier would have to attenuate.
+        Only `samples` count. Other arguments as for `apply`. The factor is 1 without an amplifier or a limit, and 0
+        where a photomultiplier's dynodes would have to attenuate.
         """
         factor, chain = 1.0, self
         light, sky = self._light(power, bin_width_ns, background)
@@ -244,7 +244,7 @@ class ReceiverChain:
         """Return the least factor, at least 1, by which light must be attenuated for samples in range.
 
         Signal and background are attenuated alike. In range is as for `fitting_gain`; infinite if the noise alone
-        exceeds the range. The arguments are those of `apply`.
+        exceeds the range. Arguments as for `apply`.
         """
         from scipy.optimize import brentq
 
@@ -290,9 +290,9 @@ class ReceiverChain:
     def event_height(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
         """Return the height in the samples that a single event exceeds in one of a thousand records, shape (...).
 
-        Events are those of light and dark counts; where many overlap, only a few of each bin count. Their charges are
-        gamma-distributed, as those of `LinearDetector`. 1 for photon counters, 0 of other detectors without an
-        amplifier, or where events are rarer.
+        Events come from light and dark counts; where many overlap, only a few in each bin count. Their charges are
+        gamma-distributed, as in `LinearDetector`. 1 for photon counters; 0 for other detectors without an amplifier, or
+        where events are rarer.
         """
         from scipy.stats import gamma
 
@@ -317,15 +317,15 @@ class ReceiverChain:
         background: npt.ArrayLike = 0.0,
         lit: Expected | None = None,
     ) -> FloatArray:
-        """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).
+        """Return the samples' signal-to-noise ratio in one shot, shape (..., sample).
 
-        The mean above that without signal is divided by the standard deviation with signal: 0 without signal, infinite
-        without noise, and NaN where most samples are saturated. For the mean of n shots the ratio is sqrt(n) times
-        larger. `lit` is `expected` of the other arguments where it is known; these are those of `apply`.
+        The mean excess over the mean without signal is divided by the standard deviation with signal: 0 without signal,
+        infinite without noise, and NaN where most samples are saturated. For the mean of n shots the ratio is sqrt(n)
+        times larger. `lit` is the result of `expected` for the other arguments, if known; arguments as for `apply`.
         """
         if lit is None:
             lit = self.expected(power, bin_width_ns, background)
-        # Records of one background share that without signal.
+        # Records with one background share the result without signal.
         sky = np.broadcast_to(non_negative_array("background", background), np.shape(power)[:-1])
         levels, level = np.unique(sky, return_inverse=True)
         dark = self.expected(np.zeros((levels.size, np.shape(power)[-1])), bin_width_ns, levels)
@@ -339,10 +339,10 @@ class ReceiverChain:
         return MEAN_OF_BINS if self.amplifier is None else self.amplifier.low_pass(bin_width_ns)
 
     def events(self, power: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
-        """Return mean primary events in parts of bins, with those before and after that the low-pass needs.
+        """Return mean primary events in parts of bins, plus the parts before and after that the low-pass needs.
 
-        Events of the detector's tail are included.
-        Powers [W] are of shape (..., time), backgrounds [W] of shape (...).
+        Events in the detector's tail are included. Powers [W] have the shape (..., time), backgrounds [W] the shape
+        (...).
         """
         low_pass = self.low_pass(bin_width_ns)
         ends = [(0, 0)] * (power.ndim - 1) + [(low_pass.before, low_pass.after)]
@@ -356,7 +356,7 @@ class ReceiverChain:
         return self.detector.with_tail(events, self._steady_events(bin_width_ns, background), part)
 
     def _steady_events(self, bin_width_ns: float, background: FloatArray) -> FloatArray:
-        """Return mean primary events of background [W] and dark current in a part of a bin, shape (..., 1)."""
+        """Return mean primary events by background [W] and dark current in a part of a bin, shape (..., 1)."""
         parts = self.low_pass(bin_width_ns).parts
         photons = background[..., None] * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm) / parts
         return self.detector.event_means(photons, bin_width_ns / parts)
@@ -376,7 +376,7 @@ class ReceiverChain:
     def _filtered_moments(
         self, power: FloatArray, bin_width_ns: float, background: FloatArray, stride: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean and variance of the detector's signal in the samples: of charges, or volts behind an amplifier."""
+        """Mean and variance of the detector's signal in the samples: charges, or volts after an amplifier."""
         low_pass = self.low_pass(bin_width_ns)
         weights = low_pass.weights
         events = self.events(power, bin_width_ns, background)
@@ -389,9 +389,9 @@ class ReceiverChain:
         return mean, np.maximum(variance, 0) * volts**2
 
     def coupled(self, volts: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
-        """Return samples of the detector's signal [V], shape (..., sample), behind the coupling capacitor, if any.
+        """Return samples of the detector's signal [V], shape (..., sample), after the coupling capacitor, if any.
 
-        Backgrounds [W] are of shape (...), or of its last axes.
+        Backgrounds [W] have the shape (...), or the shape of its last axes.
         """
         if self.amplifier is None or self.amplifier.coupling_ns is None:
             return volts

@@ -1,17 +1,17 @@
 """Counting with dead time in time bins: probabilities of counts, their covariances, and random realisations.
 
 A cell that fires in a bin is dead for the rest of that bin and for the dead time tau after it. Counted from the firing
-bin, this makes tau/dt + u bins of the width dt, with the mean place u of the event in its bin: 1/2 in weak light, and
-less in strong light, whose first event is early. What exceeds the whole part of tau/dt is the probability of further
-dead bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count rate in
-steady light is exact (W. Feller 1948, "On probability problems in the theory of counters").
+bin, this makes tau/dt + u bins, with the bin width dt and the event's mean position u in its bin. It is 1/2 in weak
+light, and less in strong light, whose first event is early. The excess over the whole part of tau/dt is the probability
+of further dead bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count
+rate in steady light is exact (W. Feller 1948, "On probability problems in the theory of counters").
 
 Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
 probabilities have the same shape. All cells are live at the first bin.
 
 After a count a channel with afterpulses is dead as without them. Once it is live again, the time to an afterpulse is
-exponentially distributed, with a probability that there is one at all; the next count, of either kind, begins this
-anew. Counts are a renewal process, whose state is the time since the channel is live: recursions over it are exact.
+exponentially distributed, with a probability that an afterpulse occurs at all. The next count, of either kind, begins
+this anew. Counts are a renewal process, whose state is the channel's live time: recursions over it are exact.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, positive
 
-_LAST_AFTERPULSES = 1e-9  # share of the afterpulses that is left out
+_LAST_AFTERPULSES = 1e-9  # neglected share of the afterpulses
 
 
 class DeadBins(NamedTuple):
@@ -40,9 +40,9 @@ def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
     Parameters
     ----------
     dead_time_ns : float
-        Dead time [ns], at least the width of a bin. One that is longer than the record leaves only the first count.
+        Dead time [ns], at least the bin width. One that is longer than the record leaves only the first count.
     bin_width_ns : float
-        Width of the bins [ns], positive.
+        Bin width [ns], positive.
     """
     tau, width = positive("dead_time_ns", dead_time_ns), positive("bin_width_ns", bin_width_ns)
     if tau < width:
@@ -54,8 +54,8 @@ def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
 def further_bins(events: FloatArray, dead: DeadBins, paralyzable: bool = False) -> tuple[FloatArray, FloatArray]:
     """Return the probabilities that a cell that fires is dead in the first bin beyond `dead.bins`, and in the second.
 
-    Their sum for a non-paralyzable dead time is the rest and the mean place of the first event in its bin,
-    1/x - 1/(exp(x) - 1) for x events. For a paralyzable one they make the probability of a count x exp(-x tau/dt).
+    For a non-paralyzable dead time their sum is the rest plus the first event's mean position in its bin, 1/x -
+    1/(exp(x) - 1) for x events. For a paralyzable one they make the probability of a count x exp(-x tau/dt).
     """
     x = np.maximum(events, 1e-6)
     hit = -np.expm1(-x)
@@ -107,7 +107,7 @@ def firing_probability_paralyzable(events: FloatArray, dead: DeadBins) -> FloatA
 def pair_covariances(
     events: FloatArray, fired: FloatArray, dead: DeadBins, lags: int, paralyzable: bool = False
 ) -> list[FloatArray]:
-    """Covariances of one cell's counts in pairs of bins.
+    """Covariances between one cell's counts in pairs of bins.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ def pair_covariances(
     Returns
     -------
     list of ndarray
-        Item l has the covariance of the counts in the bins k and k + l, shape (..., time - l).
+        Item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
 
     Notes
     -----
-    A count is a renewal of the process (Feller 1948, "On probability problems in the theory of counters"): the
-    probability of another count at lag l follows from the recursion of `firing_probability` started with a count.
+    A count renews the process (Feller 1948, "On probability problems in the theory of counters"): the probability of
+    another count at lag l follows from the recursion of `firing_probability` started with a count.
     """
     hit, q = -np.expm1(-np.moveaxis(events, -1, 0)), np.moveaxis(fired, -1, 0)
     length = len(q)
@@ -189,8 +189,8 @@ def sample_counter(
 ) -> IntArray:
     """Draw the counts of a single cell, 0 or 1 in each bin, in `shots` records, shape (shots, ..., time).
 
-    `hazard` is the probability of an afterpulse by the number of bins since the cell is live again, see
-    `afterpulse_hazard`; None for no afterpulses.
+    `hazard` is the afterpulse probability by the number of bins since the cell is live again, see `afterpulse_hazard`;
+    None for no afterpulses.
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     first, second = further_bins(np.moveaxis(events, -1, 0), dead, paralyzable)
@@ -226,7 +226,7 @@ def afterpulse_hazard(probability: float, decay_bins: float, bins: int) -> Float
     decay_bins : float
         Mean time to an afterpulse in bins, positive.
     bins : int
-        Length of the record in bins; none lasts longer.
+        Record length in bins; none lasts longer.
 
     Returns
     -------
@@ -243,7 +243,7 @@ def afterpulse_hazard(probability: float, decay_bins: float, bins: int) -> Float
 def afterpulse_moments(
     events: FloatArray, dead: DeadBins, chances: FloatArray, lags: int
 ) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the probability of a count of one channel in each bin, and covariances of pairs of bins.
+    """Return one channel's count probability in each bin, and covariances between pairs of bins.
 
     Parameters
     ----------
@@ -260,12 +260,12 @@ def afterpulse_moments(
     -------
     fired : ndarray, shape (..., time)
     covariances : list of ndarray
-        Item l has the covariance of the counts in the bins k and k + l, shape (..., time - l).
+        Item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     length = len(hit)
     first, second = further_bins(np.moveaxis(events, -1, 0), dead)
-    # Shares of the channels that are live again a number of bins after a count.
+    # Shares of channels that are live again some bins after a count.
     ends = list(enumerate((1 - first, first - second, second), dead.bins))
     state = np.zeros((chances.size, *hit.shape[1:]))
     state[-1] = 1.0  # as if live for long
@@ -288,7 +288,7 @@ def afterpulse_moments(
 
 
 def _next_bin(state: FloatArray, hit: FloatArray, chances: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the probability of a count in a bin, and that of each age of a live channel in the next one."""
+    """Return the probability of a count in a bin, and the probability of each live-channel age in the next bin."""
     quiet = (1 - hit) * (1 - chances.reshape(-1, *(1,) * hit.ndim))
     survived = state * quiet
     after = np.zeros_like(state)

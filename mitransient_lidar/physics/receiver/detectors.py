@@ -5,10 +5,10 @@ Geiger-mode cells, `SinglePhotonDetector` one such cell with a counter. Each has
 
 - `event_means`: mean primary events (photoelectrons, avalanches) per bin, dark events included;
 - `moments`: mean and covariances of the output in closed form;
-- `sample`: realisations of the output.
+- `sample`: output realisations.
 
-The output is a charge in electrons per bin, of the single-photon detector a count per bin. Photons arrive as a Poisson
-process: speckle of the laser averages out over the many coherence cells of an airborne receiver (Goodman 1965).
+The output is a charge in electrons per bin; for the single-photon detector it is a count per bin. Photons arrive as a
+Poisson process: laser speckle averages out over the many coherence cells of an airborne receiver (Goodman 1965).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Moments = tuple[FloatArray, list[FloatArray]]
 
 
 def photons_per_joule(wavelength_nm: float) -> float:
-    """Return the number of photons in 1 J of light of a vacuum wavelength [nm], positive."""
+    """Return the number of photons per joule of light at a vacuum wavelength [nm], positive."""
     return positive("wavelength_nm", wavelength_nm) * 1e-9 / (PLANCK * C0)
 
 
@@ -43,8 +43,8 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
     gain : float
         Mean multiplication M, at least 1.
     ionisation_ratio : float
-        Effective ratio k of the ionisation coefficients, that of holes over that of electrons where electrons begin
-        the avalanche, 0 to 1.
+        Effective ratio k of the ionisation coefficients, holes over electrons where electrons begin the avalanche, 0 to
+        1.
 
     Notes
     -----
@@ -55,7 +55,7 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
 
 
 def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
-    """Excess noise factor of a chain of dynodes with Poisson-distributed secondary electrons.
+    """Excess noise factor for a chain of dynodes with Poisson-distributed secondary electrons.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
 
     Notes
     -----
-    F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes. Variances of a cascade: W. Shockley and J. R.
+    F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes. Cascade variances: W. Shockley and J. R.
     Pierce, Proc. IRE 26, 321 (1938).
     """
     gains = finite_array("dynode_gains", dynode_gains)
@@ -81,8 +81,8 @@ class LinearDetector(SignalTail):
 
     Notes
     -----
-    The charge of n events is drawn from a gamma distribution of mean n gain and variance n gain^2 (excess_noise - 1),
-    the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
+    The charge of n events is drawn from a gamma distribution with mean n gain and variance n gain^2 (excess_noise - 1).
+    The leakage's shot noise is drawn from a normal distribution. Mean and variance are exact, the tail shapes are not.
     """
 
     quantum_efficiency: Annotated[
@@ -90,7 +90,7 @@ class LinearDetector(SignalTail):
         Option("Primary events per photon, of a photomultiplier times the collection efficiency", 0, 1, above=True),
     ]
     gain: Annotated[float, Option("Mean charge per event in electrons", 1)] = 1.0
-    excess_noise: Annotated[float, Option("Mean square of the charge over the square of its mean", 1)] = 1.0
+    excess_noise: Annotated[float, Option("Mean square of the charge over its squared mean", 1)] = 1.0
     dark_current_na: Annotated[
         float, Option("Dark current before the multiplication: the anode's over the gain", 0, unit="nA")
     ] = 0.0
@@ -99,7 +99,7 @@ class LinearDetector(SignalTail):
     ] = 0.0
     dynode_gains: Annotated[
         tuple[float, ...],
-        Option("Gains of the dynodes of a photomultiplier, whose voltage can be lowered; empty for other detectors"),
+        Option("Dynode gains of a photomultiplier, whose voltage can be lowered; empty for other detectors"),
     ] = ()
     largest_current_ma: Annotated[
         float, positive_option("Largest output current in pulses: behind an amplifier, more saturates", "mA")
@@ -153,7 +153,7 @@ class LinearDetector(SignalTail):
 
     @property
     def charge_spread(self) -> float:
-        """Variance of the charge of an event over the square of its mean [1]."""
+        """Variance of an event's charge over its squared mean [1]."""
         return self.excess_noise - 1
 
     def with_gain(self, factor: float) -> LinearDetector:
@@ -177,7 +177,7 @@ class LinearDetector(SignalTail):
         return replace(self, gain=float(np.prod(gains)), excess_noise=noise, dynode_gains=gains)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
-        """Mean events per bin for a mean number of photons per bin, of the same shape."""
+        """Mean events per bin for a mean number of photons per bin, in the same shape."""
         return self.quantum_efficiency * photons + _electrons(self.dark_current_na, bin_width_ns)
 
     def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
@@ -196,37 +196,35 @@ class LinearDetector(SignalTail):
 
 @dataclass(frozen=True)
 class SiliconPhotomultiplier(SignalTail):
-    """Array of Geiger-mode cells in parallel (SiPM, MPPC).
+    """Geiger-mode cells in parallel (SiPM, MPPC).
 
     Notes
     -----
-    Cells without crosstalk are independent: a bin holds a binomial number of primary avalanches. Each makes a
-    Borel-distributed total number of avalanches, of mean 1/(1 - L) and variance L/(1 - L)^3, L = -ln(1 - crosstalk)
+    Cells without crosstalk are independent: the number of primary avalanches in a bin is binomial. Each makes a
+    Borel-distributed total number of avalanches, with mean 1/(1 - L) and variance L/(1 - L)^3, L = -ln(1 - crosstalk)
     (S. Vinogradov, Nucl. Instrum. Methods A 695, 247 (2012), arXiv:1109.2014). Here L is multiplied by the mean
-    fraction of live cells; the dead time of cells fired by crosstalk is neglected, which matters where many cells fire.
-    A cell recovers instantaneously. Afterpulses are in any cell, with equal probability.
+    fraction of live cells. The dead time of cells fired by crosstalk is neglected, which matters where many cells fire.
+    A cell recovers instantaneously. Afterpulses occur in any cell, with equal probability.
     """
 
     quantum_efficiency: Annotated[
         float, Option("Photon detection efficiency, with fill factor and avalanche probability", 0, 1, above=True)
     ]
     cells: Annotated[int, Option("Number of cells, evenly illuminated", 1, 10**9)]
-    recovery_time_ns: Annotated[
-        float, positive_option("Dead time of a cell that has fired, at least the width of a bin", "ns")
-    ]
+    recovery_time_ns: Annotated[float, positive_option("Dead time after a cell fires, at least the bin width", "ns")]
     crosstalk: Annotated[float, Option("Probability that an avalanche immediately triggers further ones", 0, 0.5)] = 0.0
-    dark_count_rate_hz: Annotated[float, Option("Dark counts of all cells, without crosstalk", 0, unit="1/s")] = 0.0
-    gain: Annotated[float, Option("Mean charge of an avalanche in electrons", 1)] = 1.0
+    dark_count_rate_hz: Annotated[float, Option("Dark counts in all cells, without crosstalk", 0, unit="1/s")] = 0.0
+    gain: Annotated[float, Option("Mean avalanche charge in electrons", 1)] = 1.0
     gain_spread: Annotated[float, Option("Standard deviation of the charge over its mean", 0)] = 0.0
 
     @property
     def charge_spread(self) -> float:
-        """Variance of the charge of an event, with those that it triggers, over the square of its mean [1]."""
+        """Variance of an event's charge, including the events that it triggers, over its squared mean [1]."""
         offspring = -np.log1p(-self.crosstalk)
         return float(offspring / (1 - offspring) + self.gain_spread**2 * (1 - offspring))
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
-        """Mean events per bin, with all cells live, for a mean number of photons per bin, of the same shape."""
+        """Mean events per bin, with all cells live, for a mean number of photons per bin, in the same shape."""
         return self.quantum_efficiency * photons + 1e-9 * self.dark_count_rate_hz * bin_width_ns
 
     def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
@@ -278,7 +276,7 @@ class SinglePhotonDetector(SignalTail):
     -----
     The detector is live at the first bin of the record, as if gated on there. The time to an afterpulse is
     exponentially distributed, and an afterpulse may cause another one. Each count begins anew: carriers that earlier
-    ones have trapped no longer count, so that the counts are a renewal process with exact moments.
+    counts have trapped cease to count, so that the counts are a renewal process with exact moments.
     """
 
     quantum_efficiency: Annotated[float, Option("Photon detection efficiency", 0, 1, above=True)]
@@ -290,7 +288,7 @@ class SinglePhotonDetector(SignalTail):
             "ns",
         ),
     ]
-    dark_count_rate_hz: Annotated[float, Option("Dark counts of all channels", 0, unit="1/s")] = 0.0
+    dark_count_rate_hz: Annotated[float, Option("Dark counts in all channels", 0, unit="1/s")] = 0.0
     paralyzable: Annotated[bool, Option("Whether an event in the dead time prolongs it")] = False
     channels: Annotated[
         int, Option("Number of channels, each with its own dead time, whose counts are summed", 1, 10_000)
@@ -319,7 +317,7 @@ class SinglePhotonDetector(SignalTail):
                 raise UserError("afterpulse_decay_ns is required for an afterpulse_probability above 0")
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
-        """Mean events per bin without dead time for a mean number of photons per bin, of the same shape."""
+        """Mean events per bin without dead time for a mean number of photons per bin, in the same shape."""
         return self.quantum_efficiency * photons + 1e-9 * self.dark_count_rate_hz * bin_width_ns
 
     def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
@@ -356,7 +354,7 @@ Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector
 
 
 def _electrons(current_na: float, bin_width_ns: float) -> float:
-    """Electrons per bin of a current."""
+    """Electrons per bin for a current."""
     return current_na * 1e-9 * bin_width_ns * 1e-9 / ELEMENTARY_CHARGE
 
 

@@ -20,12 +20,12 @@ _TAIL = 1e-10  # fraction of a filter's response left out at its ends
 #: Longest part of a bin, in time constants of the responses, for which steady light has its shot noise to 0.5 %.
 _PART = {"single_pole": 0.25, "gaussian": 1 / 3}
 _ENDS = 0.02  # largest value at the ends of a measured impulse response, relative to its peak
-_MOST_SAMPLES = 2**16  # of a measured impulse response
+_MOST_SAMPLES = 2**16  # in a measured impulse response
 _NODES = 48  # of the quadrature over a normal distribution within 8 standard deviations
 
 
 class Expected(NamedTuple):
-    """Mean and variance of samples and their probability of saturation, each of shape (..., sample)."""
+    """Sample mean, variance and saturation probability, each with the shape (..., sample)."""
 
     mean: FloatArray
     variance: FloatArray
@@ -34,11 +34,11 @@ class Expected(NamedTuple):
 
 @dataclass(frozen=True)
 class LowPass:
-    """Response of an amplifier to charges in equal parts of the bins, sampled in the middle of each bin."""
+    """Amplifier response to charges in equal parts of the bins, sampled in the middle of each bin."""
 
-    parts: int  #: Parts of a bin, an even number, or 1 where a sample is the mean of its bin.
-    first: int  #: Parts from the end of the part of the first weight to the middle of the bin; negative after it.
-    weights: FloatArray  #: Weights of parts, from late to early ones, of unit sum.
+    parts: int  #: Parts per bin, an even number, or 1 where a sample is its bin's mean.
+    first: int  #: Parts from the end of the first weight's part to the middle of the bin; negative after it.
+    weights: FloatArray  #: Weights of parts, from late to early parts, with unit sum.
 
     @property
     def before(self) -> int:
@@ -56,19 +56,19 @@ class LowPass:
         return self.before * self.parts + self.parts // 2 - self.first - self.weights.size
 
     def by_bin(self) -> tuple[int, FloatArray]:
-        """Return the response to the light of whole bins: bins before the sample of the first weight, and weights."""
+        """Return the response to light in whole bins: bins before the first weight's sample, and weights."""
         part = self.parts // 2 - 1 - self.first - np.arange(self.weights.size) if self.parts > 1 else np.zeros(1, int)
         lag = -(part // self.parts)
         return int(lag[0]), np.asarray(np.bincount(lag - lag[0], self.weights), dtype=np.float64)
 
     def divided(self, record: FloatArray) -> FloatArray:
-        """Return a record, shape (..., time), that holds in each part of a bin an equal part of its value."""
+        """Return a record, shape (..., time), that contains in each part of a bin an equal part of its value."""
         return record if self.parts == 1 else np.repeat(record / self.parts, self.parts, axis=-1)
 
     def sampled(self, record: FloatArray, stride: int, weights: FloatArray | None = None) -> FloatArray:
         """Filter a record of parts, with `before` and `after`; return every `stride`-th sample.
 
-        `weights` replace those of the response; N weights less need a record that is N parts shorter.
+        `weights` replace the response's own; N weights less need a record that is N parts shorter.
         """
         return filtered(record, self.weights if weights is None else weights)[..., self.start :: stride * self.parts]
 
@@ -83,10 +83,10 @@ class Amplifier(Plan):
 
     Notes
     -----
-    A coupling capacitor removes steady light from the signal. An echo of charge Q leaves a baseline that is lower by
-    R Q/coupling_ns and recovers as exp(-t/coupling_ns), in full where the echo itself is clipped. The amplifier's noise
-    and the variance of the signal are taken as without the capacitor; the latter is less by a share of about the
-    low-pass response time over coupling_ns.
+    A coupling capacitor removes steady light from the signal. An echo with charge Q leaves a baseline that is lower by
+    R Q/coupling_ns and recovers as exp(-t/coupling_ns), in full where the echo itself is clipped. The capacitor changes
+    neither the amplifier's noise nor the signal variance here; really the latter is less by about the low-pass response
+    time over coupling_ns.
 
     Thermal noise: J. B. Johnson and H. Nyquist, Phys. Rev. 32, 97 and 110 (1928), doi:10.1103/PhysRev.32.110.
     """
@@ -113,8 +113,8 @@ class Amplifier(Plan):
     impulse_response: Annotated[
         tuple[tuple[float, ...], tuple[float, ...]] | None,
         Option(
-            "Measured response instead of a bandwidth: times after the light [ns], ascending, with 0 among them, and "
-            "values in any unit, linear between them, of positive area, and at either end within 2 % of their peak"
+            "Measured response instead of a bandwidth: times after the light [ns], ascending, including 0, and "
+            "values in any unit, linear between them, with positive area, and at either end within 2 % of their peak"
         ),
     ] = None
     coupling_ns: Annotated[
@@ -134,7 +134,7 @@ class Amplifier(Plan):
             _check_response(*self.impulse_response)
 
     def low_pass(self, bin_width_ns: float) -> LowPass:
-        """Return the response to charges in parts of bins, short enough for the noise of steady light to 0.5 %."""
+        """Return the response to charges in parts of bins, short enough for the noise in steady light to 0.5 %."""
         if self.impulse_response is not None:
             return _measured(*self.impulse_response, bin_width_ns)
         if self.bandwidth_mhz is None:
@@ -157,7 +157,7 @@ class Amplifier(Plan):
         Parameters
         ----------
         volts : ndarray, shape (..., sample)
-            Voltages less that of steady light [V], 0 before the first sample.
+            Voltages minus the steady-light voltage [V], 0 before the first sample.
         sample_ns : float
             Time between samples [ns].
         """
@@ -174,10 +174,11 @@ class Amplifier(Plan):
         Returns
         -------
         deviation : float
-            Standard deviation [V]: that of the density over the noise bandwidth of the low-pass, pi/2 of the half-power
-            frequency for a single pole and sqrt(pi/ln 16) of it for a Gaussian, or half a period of the bins without.
+            Standard deviation [V]: the density's, over the noise bandwidth of the low-pass. This is pi/2 times the
+            half-power frequency for a single pole and sqrt(pi/ln 16) times it for a Gaussian, or without a low-pass
+            half the inverse bin width.
         weights : ndarray
-            Weights, of unit sum of squares, that give independent normal numbers the correlation of the samples.
+            Weights, with unit sum of squares, that give independent normal numbers the samples' correlation.
         """
         density = (1e-12 * self.noise_pa_per_rthz) ** 2
         if self.load_ohm is not None:
@@ -204,13 +205,13 @@ class Amplifier(Plan):
 
 @dataclass(frozen=True)
 class LogAmplifier(Plan):
-    """Logarithmic compression of voltages of either sign.
+    """Logarithmic compression for voltages of either sign.
 
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
     knee, and smooth at 0, where noise makes the input negative.
     """
 
-    volts_per_decade: Annotated[float, positive_option("Increase of the output per decade of the input", "V")]
+    volts_per_decade: Annotated[float, positive_option("Output increase per input decade", "V")]
     knee_v: Annotated[float, positive_option("Input below which the output is linear", "V")]
 
     def compress(self, volts: FloatArray) -> FloatArray:
@@ -235,12 +236,12 @@ class Digitiser(Plan):
 
     Notes
     -----
-    Rounding adds a variance of step^2/12 (W. R. Bennett, Bell Syst. Tech. J. 27, 446 (1948)) if the noise before it is
-    at least about half a step; a steady signal with less noise has an error of up to half a step instead.
+    Rounding adds a variance of step^2/12 (W. R. Bennett, Bell Syst. Tech. J. 27, 446 (1948)) if the preceding noise is
+    at least about half a step. A steady signal with less noise has an error of up to half a step instead.
     """
 
     bits: Annotated[int, Option("Resolution", 1, 24)]
-    full_scale_v: Annotated[float, positive_option("Width of the range: 2^bits steps", "V")]
+    full_scale_v: Annotated[float, positive_option("Range width: 2^bits steps", "V")]
     low_v: Annotated[float, Option("Voltage of code 0", unit="V")] = 0.0
     sampling_ghz: Annotated[
         float | None,
@@ -272,7 +273,7 @@ class Digitiser(Plan):
 
     @property
     def top_v(self) -> float:
-        """Voltage of the highest code [V]."""
+        """Highest code's voltage [V]."""
         return self.low_v + self.full_scale_v - self.step_v
 
     def stride(self, bin_width_ns: float) -> int:
@@ -329,7 +330,7 @@ class Readout:
         return samples, saturated
 
     def expected(self, mean: FloatArray, variance: FloatArray) -> Expected:
-        """Return the moments of the samples for normally distributed voltages of a mean [V] and variance [V^2].
+        """Return the sample moments for normally distributed voltages with a mean [V] and variance [V^2].
 
         Gauss-Legendre quadrature within the limits; clipped values are included. Samples that an overload may hold at
         the limit are taken as held with the largest probability of an overload in the time before.
@@ -345,7 +346,7 @@ class Readout:
             with np.errstate(divide="ignore", invalid="ignore"):
                 return np.where(sigma > 0, ndtr((edge - mean) / sigma), mean < edge)
 
-        # Moments about the sample of the mean, against cancellation.
+        # Moments about the mean's sample, against cancellation.
         centre = self._compressed(np.clip(mean, *clip))
         first, second = np.zeros_like(mean), np.zeros_like(mean)
         for edge, fraction in ((clip[0], below(clip[0])), (clip[1], 1 - below(clip[1]))):
@@ -441,7 +442,7 @@ def _noise_of_measured(
     size = even.size
     powers = np.abs(np.fft.rfft(even, 2 * size)) ** 2
     correlation = np.interp(shifts, np.arange(size), np.fft.irfft(powers)[:size], right=0.0)
-    # Half of the one-sided density over both signs of the frequency, and 1e9 ns in a second.
+    # Half the one-sided density over both signs of the frequency, and 1e9 ns in a second.
     return volts * math.sqrt(0.5e9 * correlation[0] * fine), _weights_of_correlation(correlation)
 
 
@@ -461,10 +462,10 @@ def filtered(record: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _unit(weights: FloatArray) -> FloatArray:
-    """Return weights of unit sum."""
+    """Return weights with unit sum."""
     return np.asarray(weights / weights.sum())
 
 
 def _normal(weights: FloatArray) -> FloatArray:
-    """Return weights of unit sum of squares."""
+    """Return weights with unit sum of squares."""
     return np.asarray(weights / np.sqrt(np.sum(weights**2)))

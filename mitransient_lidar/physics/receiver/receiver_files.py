@@ -45,7 +45,7 @@ _STAGES: dict[str, Callable[..., Any]] = {
     "digitiser": Digitiser,
     "jitter": ShotJitter,
 }
-#: Names of the samples of an impulse response.
+#: Names for impulse response samples.
 _RESPONSE = Column(
     "impulse_response", ("response", "signal", "amplitude", "power", "v", "mv", "volt", "voltage", "counts")
 )
@@ -53,7 +53,7 @@ _RESPONSE = Column(
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelTable(Plan):
-    """Tables and numbers of a file for a channel; keys of tables are the parameters of the stages."""
+    """Tables and numbers for a channel in a file; table keys are the stages' parameters."""
 
     detector: Annotated[Mapping[str, Any], Option(f"Detector, with type: {', '.join(_DETECTORS)}")] = field(
         default_factory=dict
@@ -69,10 +69,10 @@ class ChannelTable(Plan):
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverFile(ChannelTable):
-    """A file of a receiver; `channels` hold what differs in some of them, by the name of the pixel."""
+    """A receiver file; `channels` contain the differences of single channels, by pixel name."""
 
     preset: Annotated[str | None, Option("Receiver whose stages count where the file has no others")] = None
-    jitter: Annotated[Mapping[str, Any], Option("Energy and time of the shots")] = field(default_factory=dict)
+    jitter: Annotated[Mapping[str, Any], Option("Shot energy and time")] = field(default_factory=dict)
     wavelength_nm: Annotated[float | None, positive_option("Vacuum wavelength of the light", "nm")] = None
     pulse_repetition_khz: Annotated[float | None, positive_option("Pulse repetition rate", "kHz")] = None
     source: Annotated[str | None, Option("Source of the numbers", form="a text")] = None
@@ -83,7 +83,7 @@ class ReceiverFile(ChannelTable):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFile(Plan):
-    """A file of a camera, with the parameters of `Camera` in its table."""
+    """A camera file, with the `Camera` parameters in its table."""
 
     camera: Annotated[Mapping[str, Any], Option("Camera")] = field(default_factory=dict)
     preset: Annotated[str | None, Option("Camera whose parameters count where the file has no others")] = None
@@ -93,7 +93,7 @@ class CameraFile(Plan):
 
 @dataclass(frozen=True)
 class Channel:
-    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `ReceiverChain`."""
+    """One channel's receiver: its chain, gain factor, and filter optical density; see `ReceiverChain`."""
 
     chain: ReceiverChain
     gain: Setting = 1.0
@@ -102,14 +102,14 @@ class Channel:
 
 @dataclass(frozen=True)
 class ReceiverChannels:
-    """Receiver of all channels.
+    """Receivers for all channels.
 
     Attributes
     ----------
     default
-        The channel that counts where `channels` has no other one.
+        Channel for pixels that `channels` does not name.
     channels
-        Channels by the name of their pixel.
+        Channels by pixel name.
     pulse_repetition_khz
         Pulse repetition rate [kHz], or None.
     name
@@ -118,8 +118,8 @@ class ReceiverChannels:
     Raises
     ------
     UserError
-        If the channels differ in the response of the amplifier, in the logarithm, in the converter or in the jitter,
-        which are those of the record.
+        If the channels differ in the amplifier response, the logarithm, the converter or the jitter, which the record
+        has in common.
     """
 
     default: Channel
@@ -148,9 +148,9 @@ class ReceiverChannels:
         return replace(self, default=replace(self.default, **given), channels=channels)
 
     def for_light(self, wavelength_nm: float) -> ReceiverChannels:
-        """Return the receiver for light of a wavelength [nm]; one for green light counts photons of other light, too.
+        """Return the receiver for light at a wavelength [nm]; one for green light counts other photons, too.
 
-        A warning says that its quantum efficiency is kept.
+        A warning reports that its quantum efficiency is kept.
         """
         if is_green(wavelength_nm) or not is_green(self.default.chain.wavelength_nm):
             return self
@@ -175,16 +175,16 @@ class ReceiverChannels:
         return [self.default, *self.channels.values()]
 
     def of(self, pixel: str) -> Channel:
-        """Return the channel of a pixel."""
+        """Return a pixel's channel."""
         return self.all_channels[self.number_of(pixel)]
 
     def number_of(self, pixel: str) -> int:
-        """Return the number of the channel of a pixel in `all_channels`."""
+        """Return the number of a pixel's channel in `all_channels`."""
         return 1 + list(self.channels).index(pixel) if pixel in self.channels else 0
 
 
 def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
-    """Return what the response of an amplifier depends on."""
+    """Return the parameters that determine an amplifier's response."""
     if amplifier is None:
         return None
     return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
@@ -193,12 +193,12 @@ def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
 def receiver(
     name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera,
 ) -> ReceiverChannels | Camera:
-    """Return a receiver: a preset or camera by name, that of an instrument by name, or one from a TOML file.
+    """Return a receiver: a preset, a camera or an instrument's receiver by name, or one from a TOML file.
 
     Raises
     ------
     UserError
-        If there is none of that name, or the file is invalid.
+        If none has that name, or the file is invalid.
     """
     if isinstance(name, (ReceiverChannels, Camera)):
         return name
@@ -238,7 +238,7 @@ def camera(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Cam
 
 
 def instrument_receiver(instrument: str) -> ReceiverChannels | None:
-    """Return the receiver of an instrument by its name; None for an unknown one."""
+    """Return an instrument's receiver by its name; None for an unknown one."""
     folder = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"
     path = folder / f"{instrument}.toml"
     if Path(instrument).name != instrument or not path.is_file():
@@ -247,7 +247,7 @@ def instrument_receiver(instrument: str) -> ReceiverChannels | None:
 
 
 def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
-    """Return the receiver that the text of a TOML file describes, whose keys are those of `ReceiverFile`.
+    """Return the receiver that a TOML text describes, with the keys of `ReceiverFile`.
 
     Files that it names are in `folder`.
 
@@ -277,7 +277,7 @@ def _parsed(text: str, name: str, folder: Path) -> ReceiverChannels | Camera:
 def _receiver(
     given: Mapping[str, Any], name: str, folder: Path, presets: Mapping[str, ReceiverChain]
 ) -> ReceiverChannels:
-    """Return the receiver of the tables of a file."""
+    """Return the receiver that a file's tables describe."""
     values = ReceiverFile.of(given, name, f"{name}: ")
     base = None
     if values.preset is not None:
@@ -295,7 +295,7 @@ def _receiver(
 
 
 def _channel(name: str, values: ChannelTable, base: Channel | None, folder: Path, others: Mapping[str, Any]) -> Channel:
-    """Return a channel from the tables of a file, with the stages of another one where they are missing."""
+    """Return a channel from a file's tables; `base` supplies the missing stages."""
     stages: dict[str, Any] = dict(others)
     if own := dict(values.detector):
         kind, label = own.pop("type", None), f"{name}: detector"
@@ -351,7 +351,7 @@ def _with_dynodes(name: str, detector: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _tried(name: str, build: Callable[[], Any]) -> Any:
-    """Return what a function builds, with the place in the file in the message of an error."""
+    """Return a function's result; add the position in the file to an error message."""
     try:
         return build()
     except UserError as error:

@@ -1,4 +1,4 @@
-"""Mean and covariance of the samples of one record, and their derivatives with respect to the light."""
+"""Mean and covariance of one record's samples, and their derivatives with respect to the light."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from mitransient_lidar.physics.receiver.detectors import (
 )
 from mitransient_lidar.physics.receiver.electronics import LowPass
 
-_STEP = 1e-3  # events of a cell, or share of the light on a linear detector, in a central difference
+_STEP = 1e-3  # events in a cell, or share of the light on a linear detector, in a central difference
 
 
 class SampleMoments(NamedTuple):
-    """Moments of the samples of a record before logarithm and converter.
+    """Moments of a record's samples before logarithm and converter.
 
     They are voltages [V], or without an amplifier electrons or counts per bin.
     """
 
     mean: FloatArray  #: Shape (sample,).
-    covariance: FloatArray  #: Shape (sample, sample), with the noise of the amplifier and that of rounding.
+    covariance: FloatArray  #: Shape (sample, sample), with amplifier noise and rounding noise.
     saturation: FloatArray  #: Probability that a sample is saturated, shape (sample,).
     mean_derivatives: FloatArray  #: Derivatives of `mean` in each direction, shape (direction, sample).
-    covariance_derivatives: FloatArray  #: Of `covariance`, shape (direction, sample, sample).
+    covariance_derivatives: FloatArray  #: Derivatives of `covariance`, shape (direction, sample, sample).
 
 
 def sample_moments(
@@ -41,7 +41,7 @@ def sample_moments(
     bin_width_ns: float,
     background: float = 0.0,
 ) -> SampleMoments:
-    """Return mean and covariance of the samples of one record, and their derivatives.
+    """Return mean and covariance of one record's samples, and their derivatives.
 
     Parameters
     ----------
@@ -50,16 +50,16 @@ def sample_moments(
     power : ndarray, shape (time,)
         Mean optical power of the signal on the detector in each bin [W], not negative.
     directions : ndarray, shape (direction, time)
-        Changes of the power per unit of a parameter [W/unit], of either sign.
+        Changes in the power per unit of a parameter [W/unit], of either sign.
     bin_width_ns : float
-        Width of the bins [ns], positive.
+        Bin width [ns], positive.
     background : float
         Constant power added to the signal [W], not negative.
 
     Returns
     -------
     SampleMoments
-        In `ReceiverChain.units`, and per unit of the parameters.
+        In `ReceiverChain.units`, and per parameter unit.
 
     Raises
     ------
@@ -68,10 +68,10 @@ def sample_moments(
 
     Notes
     -----
-    Neighbouring samples are correlated by the low-pass of the amplifier, which filters its own noise and the shot
-    noise alike, and by the dead time of counters and cells; the covariance is exact for all of these. A converter adds
-    an independent variance of step^2/12, behind a logarithm times the square of its inverse slope at the mean (see
-    `Digitiser`). Derivatives are central differences of the closed forms, exact for linear detectors.
+    The amplifier's low-pass, which filters its own noise and the shot noise alike, correlates neighbouring samples. So
+    does the dead time of counters and cells; the covariance is exact for all of these. A converter adds an independent
+    variance of step^2/12, after a logarithm times its squared inverse slope at the mean (see `Digitiser`). Derivatives
+    are central differences of the closed forms, exact for linear detectors.
     """
     light, changes = non_negative_array("power", power), finite_array("directions", directions)
     width, sky = positive("bin_width_ns", bin_width_ns), non_negative("background", background)
@@ -104,7 +104,7 @@ def sample_moments(
 
 
 def _weights(low_pass: LowPass, bins: int, stride: int) -> sparse.csr_matrix:
-    """Return the weights of parts of bins in samples, shape (sample, part)."""
+    """Return the weights of bin parts in samples, shape (sample, part)."""
     parts = (bins + low_pass.before + low_pass.after) * low_pass.parts
     size = low_pass.weights.size
     first = np.arange(low_pass.start, parts - size + 1, stride * low_pass.parts)

@@ -19,8 +19,8 @@ class ShotJitter(Plan):
 
     Notes
     -----
-    Times are normally distributed. An error of the time of sigma is one of the range from the lidar of c sigma / (2 n),
-    n the group index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom of one channel.
+    Times are normally distributed. A time error sigma is a range error c sigma / (2 n) from the lidar, n the group
+    index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom in one channel.
     """
 
     energy_rms: Annotated[
@@ -31,24 +31,24 @@ class ShotJitter(Plan):
         Option("Standard deviation of the record's start against the pulse, the same in all channels", 0, unit="ns"),
     ] = 0.0
     clock_ns: Annotated[
-        float, Option("Standard deviation of the time of each channel's samples against the others", 0, unit="ns")
+        float, Option("Standard deviation of each channel's sample times against the other channels", 0, unit="ns")
     ] = 0.0
 
     def draw(
         self, shots: int, records: tuple[int, ...], series: bool, seed: int, common_seed: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Draw the energy and the time of shots.
+        """Draw the shots' energy and time.
 
         Parameters
         ----------
         shots : int
-            Number of shots of each record.
+            Shots per record.
         records : tuple of int
             Shape of the records.
         series : bool
-            Whether the first axis of the records is one of different shots, not of channels.
+            Whether the first axis counts different shots instead of channels.
         seed, common_seed : int
-            Seeds of what belongs to a channel, and of what all channels share.
+            Seeds for a channel's own numbers, and for numbers that all channels share.
 
         Returns
         -------
@@ -60,7 +60,7 @@ class ShotJitter(Plan):
         shared = (shots, *(size if series and axis == 0 else 1 for axis, size in enumerate(records)))
         whole = (shots, *records)
         of_energy, of_trigger, of_clock = (
-            # Keys of two numbers differ from those of the noise.
+            # Keys with two numbers differ from the noise's keys.
             np.random.default_rng(np.random.SeedSequence(one, spawn_key=(0, kind)))
             for kind, one in enumerate((common_seed, common_seed, seed))
         )
@@ -84,8 +84,8 @@ def delayed(power: FloatArray, bins: FloatArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (shots, records, time)
-        The integral and the first moment are exact, but for what leaves the record; a delay by the fraction f of a bin
-        widens an echo by a variance of f (1 - f) bins squared.
+        The integral and the first moment are exact, except for light that leaves the record. A delay by the fraction f
+        of a bin widens an echo by a variance of f (1 - f) bins squared.
     """
     whole = np.floor(bins).astype(np.int64)
     later = (bins - whole)[..., np.newaxis]
@@ -98,6 +98,6 @@ def delayed(power: FloatArray, bins: FloatArray) -> FloatArray:
 
 
 def timing_jitter(attributes: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the standard deviations [ns] of trigger and clock that the attributes of a record state, or 0."""
+    """Return the trigger and clock standard deviations [ns] that a record's attributes state, or 0."""
     trigger, clock = (float(attributes.get(f"receiver.jitter.{name}", 0.0)) for name in ("trigger_ns", "clock_ns"))
     return trigger, clock

@@ -1,4 +1,4 @@
-"""Delayed events of detectors: signal-induced noise and the afterpulses of photomultipliers as a tail of the signal."""
+"""Delayed detector events: signal-induced noise, and photomultiplier afterpulses as a tail of the signal."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mitransient_lidar.core.validation import FloatArray
 
 @dataclass(frozen=True, kw_only=True)
 class SignalTail(Plan):
-    """Events that follow those of the light, a sum of decaying exponentials; the default has none.
+    """Events that follow light events, as a sum of decaying exponentials; the default has none.
 
     Notes
     -----
-    Delayed events are a Poisson process with the gain, excess noise and shot noise of other events, whose rate is that
-    of the light convolved with sum_i f_i exp(-(t - d_i)/tau_i)/tau_i. Behind an echo of peak P and of a duration w (its
-    energy over its peak) much shorter than tau, the tail begins at P f w/tau: 1e-3 of the peak for f = 1e-3 tau/w.
+    Delayed events are a Poisson process with the gain, excess noise and shot noise of other events. Their rate is the
+    light's rate convolved with sum_i f_i exp(-(t - d_i)/tau_i)/tau_i. After an echo with peak P and a duration w (its
+    energy over its peak) much shorter than tau, the tail begins at P f w/tau: 1e-3 times the peak for f = 1e-3 tau/w.
 
     Photomultipliers have such tails by fluorescence of their window and by ions: W. H. Hunt and S. K. Poultney, IEEE
     Trans. Nucl. Sci. 22, 116 (1975), doi:10.1109/TNS.1975.4327627; Y. Zhao, Appl. Opt. 38, 4639 (1999),
@@ -30,7 +30,7 @@ class SignalTail(Plan):
 
     tail_fractions: Annotated[
         tuple[float, ...],
-        Option("Events of each exponential per event of the light, or charge per charge, of a sum of at most 1", 0),
+        Option("Events in each exponential per light event, or charge per charge; their sum is at most 1", 0),
     ] = ()
     tail_decays_ns: Annotated[tuple[float, ...], positive_option("Decay time of each exponential", "ns")] = ()
     tail_delays_ns: Annotated[
@@ -47,16 +47,16 @@ class SignalTail(Plan):
                 raise UserError(f"{name} = {list(values)} must have as many numbers as tail_fractions, {count}")
 
     def with_tail(self, events: FloatArray, steady: FloatArray, part_ns: float) -> FloatArray:
-        """Return mean events with the delayed ones.
+        """Return mean events, including delayed ones.
 
         Parameters
         ----------
         events : ndarray, shape (..., time)
             Mean events in parts of bins.
         steady : ndarray, shape (..., 1)
-            Those of background and dark current alone, which were there long before the record.
+            Mean events by background and dark current alone, which were there long before the record.
         part_ns : float
-            Width of the parts [ns].
+            Part width [ns].
         """
         from scipy.signal import lfilter
 

@@ -1,4 +1,4 @@
-"""Measured distribution of the slopes of the sea."""
+"""Measured distribution of sea slopes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range
 
-#: Largest wind speed of all models of the sea [m/s].
+#: Largest wind speed in all sea models [m/s].
 MAX_WIND_SPEED = 30.0
 
 #: Wind speeds at which Cox and Munk measured [m/s].
@@ -44,7 +44,7 @@ def cox_munk(wind_speed: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class GramCharlierSeries:
-    """Ratio of a density of slopes to the Gaussian one of the same variances.
+    """Ratio of a slope density to the Gaussian density with the same variances.
 
     For slopes over their standard deviations, crosswind x and upwind y, positive where the surface rises towards the
     wind, the ratio is
@@ -55,15 +55,15 @@ class GramCharlierSeries:
     Cox and Munk (1954), J. Opt. Soc. Am. 44, 838, doi:10.1364/JOSA.44.000838, equation for the probability of slopes.
     """
 
-    c21: float  #: Skewness of the upwind slope with the square of the crosswind one, negated.
-    c03: float  #: Skewness of the upwind slope, negated.
-    c40: float  #: Excess kurtosis of the crosswind slope.
-    c22: float  #: Excess of the mean product of the squares over 1.
-    c04: float  #: Excess kurtosis of the upwind slope.
+    c21: float  #: Skewness of the upwind slope with the squared crosswind slope, negated.
+    c03: float  #: Upwind slope skewness, negated.
+    c40: float  #: Crosswind slope excess kurtosis.
+    c22: float  #: Excess of the mean product of squared slopes over 1.
+    c04: float  #: Upwind slope excess kurtosis.
 
     @classmethod
     def of_clean_sea(cls, wind_speed: float) -> GramCharlierSeries:
-        """Return the series of a clean sea.
+        """Return the series for a clean sea.
 
         Parameters
         ----------
@@ -78,21 +78,21 @@ class GramCharlierSeries:
         Notes
         -----
         Cox and Munk (1954): 0.01 - 0.0086 W (+- 0.03), 0.04 - 0.033 W (+- 0.12), 0.40 (+- 0.23), 0.12 (+- 0.06) and
-        0.23 (+- 0.41), from slopes of up to 2.5 standard deviations.
+        0.23 (+- 0.41), from slopes up to 2.5 standard deviations.
         """
         wind = in_range("wind_speed of a slope_distribution 'gram_charlier'", wind_speed, *MEASURED_WIND)
         return cls(0.01 - 0.0086 * wind, 0.04 - 0.033 * wind, 0.40, 0.12, 0.23)
 
     def of_part(self, total: tuple[float, float], part: tuple[float, float]) -> GramCharlierSeries:
-        """Return the series of one of two independent parts of the slopes, the other of which is Gaussian.
+        """Return the series of one of two independent slope parts, where the other part is Gaussian.
 
-        Third and fourth cumulants are those of the part alone; the series of the sum is this one exactly.
+        Third and fourth cumulants come from this part alone; the sum then has exactly this series.
 
         Parameters
         ----------
         total, part
-            Slope variances upwind and crosswind of both and of the part [1], positive; in reverse order for the series
-            of the sum from that of the part.
+            Slope variances upwind and crosswind for both parts together and for this part [1], positive; in reverse
+            order, the series of the sum follows from the part's.
         """
         y, x = (np.sqrt(both / one) for both, one in zip(total, part, strict=True))
         factors = x**2 * y, y**3, x**4, x**2 * y**2, y**4
@@ -112,8 +112,8 @@ class GramCharlierSeries:
         Parameters
         ----------
         x, y
-            Cosines of the direction to crosswind and to upwind, each times the standard deviation of the slope in that
-            axis over the one in the direction: the sum of the squares is 1.
+            Cosines of the direction to crosswind and to upwind, each times the slope's standard deviation in that axis
+            over its standard deviation in the direction: the squares sum to 1.
         """
         x2, y2 = x * x, y * y
         skewness = -(self.c03 * y2 + 3 * self.c21 * x2) * y
@@ -138,6 +138,6 @@ class GramCharlierSeries:
         share = self.negative_share
         if share > LARGEST_NEGATIVE_SHARE:
             raise UserError(
-                f"slope_distribution = 'gram_charlier' has a negative density for {100 * share:.2g} % of the slopes of "
-                f"the ripples, of at most {100 * LARGEST_NEGATIVE_SHARE:g} %; {advice}"
+                f"slope_distribution = 'gram_charlier' has a negative density for {100 * share:.2g} % of the slopes "
+                f"of the ripples, of at most {100 * LARGEST_NEGATIVE_SHARE:g} %; {advice}"
             )

@@ -1,14 +1,14 @@
 """Enhancement of echoes from the water by waves that light crosses twice.
 
-Waves focus light under water, and light returns best to where it came from: through the same slopes. Of all pairs of
-ways down and up between lidar and a point, those through nearby points of the sea have alike slopes. The mean over seas
-of the irradiance times the visibility of the point, over the product of their means, is
+Waves focus light under water, and light returns best to its origin: through the same slopes. Among all pairs of ways
+down and up between lidar and a point, those through nearby sea points have alike slopes. The mean over seas of the
+irradiance times the visibility of the point, divided by the product of their means, is
 
     g = integral of N(d - o; (a z)^2 D(d)) over the distance d of the two points on the sea,
 
-with the normal density N, the structure function of slopes D(d), 2x2, the displacement of a ray at the depth z by a
-slope, a z, and the displacement o of one way against the other by scattering, or between laser and receiver. It is
-exact for small Gaussian slopes. Slopes that are drawn anew on each way, as ripples are, have the constant D = 2 v.
+with the normal density N, the 2x2 structure function of slopes D(d), and a ray's displacement a z by a slope at the
+depth z. The offset o is the displacement of one way against the other, by scattering or between laser and receiver. It
+is exact for small Gaussian slopes. Slopes that are drawn anew on each way, such as ripples, have the constant D = 2 v.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from mitransient_lidar.physics.sea.wave_spectrum import SeaState, WaveSpectrum
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
 _SHORTEST_WAVE, _FARTHEST = 8.5e-4, 300.0
 
-#: Least depth of tables [m]: above it little is known of the waves that count, and depths are within them.
+#: Least table depth [m]: above it few data exist on the waves that count, and depths are within them.
 LEAST_DEPTH = 0.5
 
-#: Nodes of wavenumber, of distance, and of the angle between distance and displacement.
+#: Nodes in wavenumber, in distance, and in the angle between distance and displacement.
 _WAVENUMBERS, _DISTANCES, _ANGLES = 400, 120, 16
 
 #: Displacements of a table [m]: the enhancement falls with their logarithm, below the first one by 0.2 % at most.
 _DISPLACEMENTS = np.geomspace(1e-6, 3.0, 40)
 
-#: Ways whose displacement is so many times what slopes do are independent.
+#: Ways whose displacement exceeds the displacement by slopes this many times are independent.
 _FAR_APART = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class SlopeStructure:
-    """Structure functions of the slopes of an isotropic sea, by distance.
+    """Slope structure functions of an isotropic sea against distance.
 
     Attributes
     ----------
     distance
-        Distances of points [m], equally spaced in their logarithm.
+        Point distances [m], equally spaced in their logarithm.
     along, across
         Mean square difference of the slopes along the distance and across it [1].
     """
@@ -69,7 +69,7 @@ class SlopeStructure:
         near = apart**2 <= _FAR_APART**2 * spreads**2 * np.interp(apart, self.distance, self.across)
         spreads, apart = (one[near][:, None, None] for one in (spreads, apart))
         nodes, weights = np.polynomial.legendre.leggauss(_ANGLES)
-        # Denser about the direction of the displacement.
+        # Denser about the displacement's direction.
         angle = np.pi * (0.5 * (nodes + 1)) ** 2
         weight = weights * 0.5 * (nodes + 1) * np.pi
         d = self.distance[:, None]
@@ -99,15 +99,15 @@ class EnhancementTable:
 
     @classmethod
     def of(cls, structure: SlopeStructure, depths: FloatArray, spread_per_depth: float) -> EnhancementTable:
-        """Return the table of a sea; `spread_per_depth` is the displacement of a ray over depth and slope [1]."""
+        """Return a sea's table; `spread_per_depth` is a ray's displacement over depth and slope [1]."""
         spreads = spread_per_depth * depths[:, None]
         return cls(depths, structure.enhancement(spreads, _DISPLACEMENTS))
 
     def at(self, depth: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
         """Return enhancements at depths and displacements [m], arrays that broadcast.
 
-        They are linear in the logarithms of depth and displacement, and those of the ends beyond the table. Above its
-        first depth they fall to 1 at the surface.
+        They are linear in the logarithms of depth and displacement, and constant beyond the table. Above its first
+        depth they fall to 1 at the surface.
         """
         z, apart = np.broadcast_arrays(np.asarray(depth, np.float64), np.asarray(displacement, np.float64))
         place, other = (
@@ -129,7 +129,7 @@ class EnhancementTable:
 def slope_spread(off_nadir: float, refractive_index: float) -> float:
     """Return the displacement of a ray over depth and slope [1], at an angle from the vertical in air [rad].
 
-    The point at a depth moves by `turn_by_slope` across the plane of incidence, and by 1/cos^2(phi) of it, with the
+    The point at a depth moves by `turn_by_slope` across the plane of incidence, and by 1/cos^2(phi) times it, with the
     refracted angle phi, in the plane: this is the geometric mean.
     """
     cos_water = np.sqrt(1 - (np.sin(off_nadir) / refractive_index) ** 2)
@@ -147,7 +147,7 @@ def slope_structures(
         Spectrum of all waves.
     resolved_variance, ripple_variance
         Slope variances of longer waves and of ripples, both axes [1]: ripples are the waves above the wavenumber at
-        which the spectrum has the first one, scaled to the second one.
+        which the spectrum reaches the first variance, scaled to the second.
     """
     from scipy.special import j0, j1
 

@@ -9,10 +9,10 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 
-#: Names of laws of the cover by wind speed.
+#: Names of the laws for the cover against wind speed.
 LAWS = ("monahan_omuircheartaigh_1980", "callaghan_2008", "stramska_petelski_2003")
 
-#: Distance of the surroundings above which crests rise [m].
+#: Distance within which crests rise above their surroundings [m].
 SURROUNDINGS = 2.0
 
 
@@ -55,26 +55,26 @@ def foam_cover(foam: str, wind_speed: float) -> float:
 
 
 def crest_heights(sample: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return by how much waves rise above their surroundings [m] on grid lines [m], shape (len(y), len(x)).
+    """Return how far waves rise above their surroundings [m] on grid lines [m], shape (len(y), len(x)).
 
-    The surroundings are the four places at `SURROUNDINGS` along x and y, so that waves of 2 to 10 m count most, as long
-    as the patches of whitecaps are wide.
+    The surroundings are the four points at `SURROUNDINGS` along x and y, so that waves from 2 to 10 m count most, as
+    long as the patches of whitecaps are wide.
     """
     around = [sample(x + sign * SURROUNDINGS, y) + sample(x, y + sign * SURROUNDINGS) for sign in (-1, 1)]
     return np.asarray(sample(x, y) - 0.25 * (around[0] + around[1]))
 
 
 def foam_on_crests(crests: FloatArray, all_crests: FloatArray, cover: FloatArray) -> FloatArray:
-    """Return the share of foam at places [1]: 1 on the highest crests, as many as the cover says, and 0 elsewhere.
+    """Return the foam share at points [1]: 1 on the highest crests, as many as the cover needs, and 0 elsewhere.
 
     Parameters
     ----------
     crests
-        `crest_heights` of the places [m], of any shape.
+        `crest_heights` at the points [m], of any shape.
     all_crests
-        Those of places all over the sea [m], shape (n,). Where they are all equal, the cover is the share.
+        Crest heights at points all over the sea [m], shape (n,). Where they are all equal, the cover is the share.
     cover
-        Share of the sea with foam about each place [1], of the shape of `crests`.
+        Share of the sea with foam about each point [1], in the shape of `crests`.
     """
     if all_crests.min() == all_crests.max():
         return np.asarray(cover, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Files of heights: points of surveys, NetCDF by the CF conventions, and what values and positions of any file mean."""
+"""Height files: survey points, NetCDF by the CF conventions, and the meaning of values and positions in any file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNEVENNESS = 1e-3
 #: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
 _MOST_SCATTERED = 2 * 10**6
 
-#: Least share of the cells of a grid that have a point, if points are taken as one.
+#: Least share of grid cells with a point for points to count as a grid.
 _LEAST_SHARE = 0.25
 
 _X = Column("x", ("easting", "east", "e", "x coordinate", "point x"), METRES)
@@ -46,12 +46,12 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
 
-#: Attributes of a grid mapping.
+#: Grid mapping attributes.
 _GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
 
 
 def length_unit(name: str, unit: str) -> float:
-    """Return a unit in metres; `name` is what is in it, for the message.
+    """Return a unit in metres; `name` is the quantity, for the message.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def length_unit(name: str, unit: str) -> float:
     """
     key = re.sub(r"[\s_.]+", "", unit.lower())
     if key not in METRES:
-        raise UserError(f"{name} in {unit!r}: allowed are {_ALLOWED}.")
+        raise UserError(f"{name} in {unit!r}: allowed are {_ALLOWED}")
     return METRES[key]
 
 
@@ -81,9 +81,9 @@ def heights_in_metres(
     values : ndarray
         Values as in the file, NaN where they are declared to be missing.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     sign : {'heights', 'depths'}, optional
-        Whether they are positive up or down. Default: what the file states, or up.
+        Whether they are positive up or down. Default: as the file states, or up.
     unit : str, optional
         Their unit, where the file does not state it. Default: metres.
     no_data : float, optional
@@ -102,27 +102,27 @@ def heights_in_metres(
     if suspect := undeclared_no_data(values, metres):
         value, times, reason = suspect
         raise UserError(
-            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
-            f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
+            f"{path} has {times} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be "
+            f"no data: map_no_data = {value:.9g} of a seabed must say so if they are"
         )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"
     return -metres * values if is_down else metres * values
 
 
 def _height_unit(path: Path, stated: Stated, unit: str | None) -> float:
-    """Return the unit of heights in metres."""
+    """Return the height unit in metres."""
     given = None if unit is None else length_unit("map_unit is", unit)
     system = stated.system
     if stated.unit:
         from_system = system is not None and stated.unit == system.vertical_unit
         metres = system.vertical_metres if from_system and system else length_unit(f"{path} has heights", stated.unit)
         if given is not None and not math.isclose(given, metres, rel_tol=1e-9):
-            raise UserError(f"map_unit = {unit!r} must not differ from that of {path}, {stated.unit}.")
+            raise UserError(f"map_unit = {unit!r} must not differ from that of {path}, {stated.unit}")
         return metres
     if given is None and position_unit(path, stated) != 1:
         raise UserError(
-            f"{path} has positions in {stated.position_unit} but does not state the unit of its heights: map_unit must,"
-            f" one of {_ALLOWED}."
+            f"{path} has positions in {stated.position_unit} but does not state the unit of its heights: map_unit "
+            f"must, one of {_ALLOWED}"
         )
     return 1.0 if given is None else given
 
@@ -135,22 +135,22 @@ def position_unit(path: Path, stated: Stated) -> float:
 
 
 def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, cell: float) -> None:
-    """Refuse positions that are degrees, or whose metres are not those on the ground.
+    """Refuse positions in degrees, or whose metres differ from metres on the ground.
 
     Parameters
     ----------
     path : Path
         Their file, for messages.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     x, y : ndarray
         Positions as in the file, at least the least and the largest of them.
     cell : float
-        Typical distance of neighbours.
+        Typical distance between neighbours.
     """
     middle = [0.5 * float(one.min() + one.max()) for one in (x, y)]
     if stated.system is not None:
-        # CF asks for units of the coordinates themselves, which may be kilometres.
+        # CF requires units of the coordinates themselves, which may be kilometres.
         unit = position_unit(path, stated) / stated.system.metres
         stated.system.check_scale(path, unit * middle[0], unit * middle[1])
         return
@@ -159,12 +159,12 @@ def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, ce
     if not stated.position_unit and is_within and is_away and cell < _SMALLEST_CELL:
         raise UserError(
             f"{path} has positions about ({middle[0]:.6g}, {middle[1]:.6g}) in cells of {cell:.2g}, which look like"
-            " degrees: they must be projected, in metres, or their unit be stated."
+            " degrees: they must be projected, in metres, or their unit be stated"
         )
 
 
 def described(stated: Stated, values: str | None, unit: str | None, holes: int) -> str:
-    """Return a description of what a file states, for the log."""
+    """Return a file's statements as text for the log."""
     system = stated.system
     sign = {True: "down", False: "up", None: "up (not stated)"}[stated.is_down]
     sign = {"depths": "down", "heights": "up", None: sign}[values]
@@ -179,10 +179,11 @@ def described(stated: Stated, values: str | None, unit: str | None, holes: int) 
 def read_netcdf_heights(path: Path) -> Grid:
     """Read heights or depths from a NetCDF-4 file.
 
-    The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are
-    (y, x) or (x, y), with or without the coordinates ``x`` and ``y``, which may have other names if their
-    ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions of other names count as
-    (y, x). Read are ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid mapping.
+    The variable is called ``height``, ``elevation`` or ``depth``, or is the only one with two dimensions. These are (y,
+    x) or (x, y), with or without the coordinates ``x`` and ``y``. The coordinates may have other names if their
+    ``standard_name`` is ``projection_x_coordinate`` and ``projection_y_coordinate``. Dimensions with other names count
+    as (y, x). The reader uses ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid
+    mapping.
 
     Raises
     ------
@@ -197,7 +198,7 @@ def read_netcdf_heights(path: Path) -> Grid:
         found = f" ({', '.join(names)})" if names else ""
         raise UserError(
             f"{path} has {len(names)} variables that may be the heights{found}: it must have one called"
-            f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions."
+            f" {', '.join(_NETCDF_NAMES)}, or only one with two dimensions"
         )
     heights = variables[names[0]]
     x, y = _axis(variables, "x"), _axis(variables, "y")
@@ -205,12 +206,12 @@ def read_netcdf_heights(path: Path) -> Grid:
     for name in (*map(str, heights.dims), x, y):
         units = str(variables[name].attrs["units"]) if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
-            raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
+            raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet")
     mapping = next((one.attrs for one in variables.values() if not _GRID_MAPPING.isdisjoint(one.attrs)), None)
     stated = stated_by(None if mapping is None else map_system(path, mapping))
     of_axes = {str(variable.attrs["units"]) for variable in positions.values()}
     if len(of_axes) > 1:
-        raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")
+        raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units")
     unit = "".join(of_axes - set(_NO_UNIT))
     stated = stated._replace(
         unit=stated.unit if heights.attrs["units"] in _NO_UNIT else str(heights.attrs["units"]),
@@ -244,7 +245,7 @@ def _is_down(name: str, attributes: Mapping[str, object], default: bool | None) 
 
 
 def read_points(path: Path) -> tuple[FloatArray, Stated]:
-    """Read a table of points.
+    """Read a point table.
 
     `core.tables.long_tables.read_long_table` describes the format. A heading names the columns x, y and z, or easting,
     northing, and height, elevation or depth, with or without a unit of length. Without one they are the first three.
@@ -268,16 +269,16 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
             return [(i, Heading(column, "", 0.0)) for i, column in enumerate((_X, _Y, _Z))]
         is_placed = any(heading and heading.known_unit for heading in (parse_heading(name, (_X, _Y)) for name in names))
         if not is_placed and any(parse_heading(name, (_ANGLES,)) for name in names):
-            raise UserError(f"{path} has columns of degrees ({', '.join(names)}): positions must be projected.")
+            raise UserError(f"{path} has columns of degrees ({', '.join(names)}): positions must be projected")
         return pick_columns(path, names, ((_X,), (_Y,), (_Z, _DEPTH)))
 
     table = read_long_table(path, (_X, _Y, _Z), (_DEPTH, _ANGLES), choose, [])
     points, (x, y, z) = table.values, table.headings
     if x.unit != y.unit:
-        raise UserError(f"{path} has x in {x.unit or 'no unit'} and y in {y.unit or 'no unit'}: they must be the same.")
+        raise UserError(f"{path} has x in {x.unit or 'no unit'} and y in {y.unit or 'no unit'}: they must be the same")
     for row in np.flatnonzero(~np.isfinite(points[:, :2]).all(axis=1) | np.isinf(points[:, 2]))[:1]:
         shown = ", ".join(f"{one:g}" for one in points[row])
-        raise UserError(f"{path}, line {table.line(row)}: the point {shown} must be finite.")
+        raise UserError(f"{path}, line {table.line(row)}: the point {shown} must be finite")
     return points, Stated(z.unit, True if z.column is _DEPTH else None, x.unit)
 
 
@@ -291,7 +292,7 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
     points : ndarray, shape (points, 3)
         Positions and heights [m]; points with a height of NaN are left out.
     stated : Stated
-        What the file states of them.
+        Statements of the file about them.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m].
 
@@ -305,14 +306,14 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
         logger.warning("%s: %d of %d points have no height and are left out", path, missing, len(points))
         points = points[~np.isnan(points[:, 2])]
     if len(points) < 3:
-        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
+        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3")
     corner = points[:, :2].min(axis=0)
     places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
     if cell is None and (own := _own_grid(places, points[:, 2])) is not None:
         return Grid.of_cells(own[0], (float(corner[0]), float(corner[1])), own[1], stated)
     if len(points) > _MOST_SCATTERED:
         raise UserError(
-            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
+            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them"
         )
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import ConvexHull, Delaunay, QhullError
@@ -320,10 +321,10 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
     try:
         area, triangles = ConvexHull(places).volume, Delaunay(places)
     except (QhullError, ValueError) as error:
-        raise UserError(f"{path} has points on a line: a height map needs an area.") from error
+        raise UserError(f"{path} has points on a line: a height map needs an area") from error
     size = float(np.sqrt(area / len(points))) if cell is None else positive("map_cell", cell)
     if size > 0.5 * extent.min():
-        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}.")
+        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}")
     columns, rows = np.floor(extent / size * (1 + 1e-9)) + 1
     check_size(path, 8 * columns * rows)
     x, y = (

@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 _FARTHEST = 1e4
 
 _Given = tuple[str | None, str | None, float | None]
-"""Sign, unit and value for no data of `heights_in_metres`."""
+"""Sign, unit and no-data value for `heights_in_metres`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +42,14 @@ class HeightMap:
     """Elevation of a surface on a rectangular grid, evenly spaced along each axis."""
 
     heights: FloatArray  #: Elevation [m], shape (rows, columns); row 0 has the smallest y, column 0 the smallest x.
-    x: FloatArray  #: Positions of the columns [m], increasing, at least 2.
-    y: FloatArray  #: Positions of the rows [m], increasing, at least 2.
+    x: FloatArray  #: Column positions [m], increasing, at least 2.
+    y: FloatArray  #: Row positions [m], increasing, at least 2.
     origin: tuple[float, float] | None = None  #: Point of the map at x = y = 0 [m], if it is in map coordinates.
-    filled: npt.NDArray[np.bool_] | None = None  #: Cells without a value of their own, shape of the heights.
+    filled: npt.NDArray[np.bool_] | None = None  #: Cells without a value of their own, in the shape of the heights.
     system: MapSystem | None = None  #: Coordinate system of the file, if it states one.
 
     def covers(self, x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return whether places x, y [m] of one shape are in cells of the map that have a value of their own."""
+        """Return whether locations x, y [m], in one shape, are in map cells with a value of their own."""
         inside, nearest = [], []
         for wanted, positions in ((x, self.x), (y, self.y)):
             cell = (positions[-1] - positions[0]) / (positions.size - 1)
@@ -65,7 +65,7 @@ class HeightMap:
         Parameters
         ----------
         x, y : array_like, shapes (N,) and (M,)
-            Positions of the grid lines [m]. A point outside the map has the height of the nearest point of its edge.
+            Grid line positions [m]. A point outside the map has the height of the nearest edge point.
 
         Returns
         -------
@@ -101,29 +101,29 @@ def read_height_map(
         ``.exr``
             an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
         ``.nc``
-            a variable of two dimensions; see `height_files.read_netcdf_heights`;
+            a variable with two dimensions; see `height_files.read_netcdf_heights`;
         ``.asc``
             an ESRI ASCII grid, with a .prj file beside it or without;
         ``.tif``, ``.tiff``
-            a GeoTIFF of one band;
+            a GeoTIFF with one band;
         ``.bag``
-            a Bathymetric Attributed Grid of one resolution;
+            a Bathymetric Attributed Grid with one resolution;
         ``.xyz``, ``.csv``, ``.txt``
             a table of points x, y, z, with or without a heading; see `height_files.read_points`.
     size : float, optional
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.
     origin : (float, float), optional
-        Point (x, y) of the map [m], within 10 km of it, that lies at x = y = 0 of the result. Default: the centre of
-        an .asc, .tif, .bag or of points; other positions are kept.
+        Map point (x, y) [m], within 10 km of the map, that lies at x = y = 0 in the result. Default: the centre for an
+        .asc, .tif or .bag file and for points; other positions are kept.
     values : {'heights', 'depths'}, optional
-        Whether the values are positive up or down. Default: what the file states, or heights.
+        Whether the values are positive up or down. Default: as the file states, or heights.
     holes : {'refuse', 'fill'}
         Whether cells without a finite value are refused, or filled with the value of the nearest cell that has one,
         with a warning in the log.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m], positive. Default: the square root of the area
-        of their convex hull over their number. Only for points; those of an even grid keep it by default.
+        of their convex hull divided by their number. Only for points; points on an even grid keep its cell by default.
     unit : str, optional
         Unit of the values, such as 'ft', if the file does not state it. Default: metres.
     no_data : float, optional
@@ -132,12 +132,12 @@ def read_height_map(
     Raises
     ------
     UserError
-        If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
-        columns, or with holes; heights beyond 12 000 m, or of an undeclared value for no data; units unknown or not
-        stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or of another scale than
-        the ground; `size` not positive, missing or superfluous; `origin` far outside the map, or given for a file
-        without positions; `cell` for another file than points, or more than half of their extent; or points on a line,
-        or too many.
+        If the file is missing, damaged or in another format; the map not two-dimensional, with fewer than 2 rows or
+        columns, or with holes; heights beyond 12 000 m, or equal to an undeclared value for no data; units unknown or
+        not stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or with another
+        scale than the ground; `size` not positive, missing or superfluous; `origin` far outside the map, or given for a
+        file without positions; `cell` for another file than points, or more than half of their extent; or points on a
+        line, or too many.
 
     Notes
     -----
@@ -149,7 +149,7 @@ def read_height_map(
         raise UserError(f"map_holes = {holes!r} must be refuse or fill")
     kind = readable_suffix(path, (*_READERS, *_POINTS), "height map")
     if cell is not None and kind not in _POINTS:
-        raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points.")
+        raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points")
     given = values, unit, no_data
     if kind in _POINTS:
         if size is not None:
@@ -158,7 +158,7 @@ def read_height_map(
     else:
         grid = _in_metres(path, _READERS[kind](path), size, given)
         if origin is not None and size is not None:
-            raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
+            raise UserError(f"origin_x and origin_y must not be given: {path} has no positions")
     x, y = grid.positions["x"], grid.positions["y"]
     heights, filled = _without_holes(path, grid.values, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
     terrain = _moved(path, HeightMap(heights, x, y, None, filled, grid.stated.system), grid.centre, origin)
@@ -173,7 +173,7 @@ def read_height_map(
 
 
 def _points(path: Path, cell: float | None, given: _Given) -> Grid:
-    """Return the grid of a table of points [m]."""
+    """Return the grid from a point table [m]."""
     points, stated = read_points(path)
     if len(points):
         spacing = float(np.sqrt(np.ptp(points[:, 0]) * np.ptp(points[:, 1]) / len(points)))
@@ -184,17 +184,17 @@ def _points(path: Path, cell: float | None, given: _Given) -> Grid:
 
 
 def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Grid:
-    """Return a grid with heights and positions in metres; without own ones, those of a size about the origin."""
+    """Return a grid in metres; without its own positions, about the origin with the given size."""
     heights, stated = _numbers(path, "heights", grid.values), grid.stated
     if heights.ndim != 2 or min(heights.shape) < 2:
-        raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns.")
+        raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns")
     heights = heights_in_metres(path, heights, stated, *given)
     counts = {"x": heights.shape[1], "y": heights.shape[0]}
     if len(grid.positions) == 1:
-        raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none.")
+        raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none")
     if not grid.positions:
         if size is None:
-            raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres.")
+            raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres")
         cell = positive("size", size) / (counts["x"] - 1)
         return Grid(heights, {name: (np.arange(n) - (n - 1) / 2) * cell for name, n in counts.items()}, stated)
     if size is not None:
@@ -207,7 +207,7 @@ def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Gri
 
 
 def _superfluous_size(path: Path, size: float) -> UserError:
-    return UserError(f"size = {size} must not be given: {path} has positions of its own.")
+    return UserError(f"size = {size} must not be given: {path} has positions of its own")
 
 
 def _without_holes(
@@ -221,8 +221,8 @@ def _without_holes(
     row, column = np.argwhere(empty)[0]
     if treatment == "refuse" or count == heights.size:
         raise UserError(
-            f"{path} has holes, {count} of {heights.size} heights, the first in row {row} and column {column} counted"
-            " from 0 at the smallest y and x: every height must be finite, unless map_holes of a seabed is fill."
+            f"{path} has holes, {count} of {heights.size} heights, the first in row {row} and column {column} counted "
+            "from 0 at the smallest y and x: every height must be finite, unless map_holes of a seabed is fill"
         )
     from scipy.ndimage import distance_transform_edt
 
@@ -249,7 +249,7 @@ def _moved(
         if not low - _FARTHEST <= finite(f"origin_{name}", value) <= high + _FARTHEST:
             raise UserError(
                 f"origin_{name} = {value:.10g} must lie within {_FARTHEST / 1000:g} km of {path}, whose {name} is "
-                f"{low:.10g} to {high:.10g}."
+                f"{low:.10g} to {high:.10g}"
             )
     x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
     _warn_beside(path, (x, y))
@@ -260,8 +260,8 @@ def _warn_beside(path: Path, axes: tuple[FloatArray, FloatArray]) -> None:
     """Warn of a map that does not contain x = y = 0."""
     if not all(axis[0] <= 0 <= axis[-1] for axis in axes):
         logger.warning(
-            "%s: x from %.10g to %.10g and y from %.10g to %.10g m do not contain x = y = 0, where the lidar"
-            " aims by default; origin_x and origin_y of a seabed move the map",
+            "%s: x from %.10g to %.10g and y from %.10g to %.10g m do not contain x = y = 0, where the lidar aims by "
+            "default; origin_x and origin_y of a seabed move the map",
             *(path, axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]),
         )
 
@@ -270,21 +270,21 @@ def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatAr
     """Return `count` finite, increasing, evenly spaced positions."""
     positions = _numbers(path, name, values)
     if positions.shape != (count,):
-        raise UserError(f"{path} has {name} of shape {positions.shape}, but its heights need ({count},).")
+        raise UserError(f"{path} has {name} of shape {positions.shape}, but its heights need ({count},)")
     for i in np.flatnonzero(~np.isfinite(positions))[:1]:
-        raise UserError(f"{path} has {name}[{i}] = {positions[i]:g}: positions must be finite.")
+        raise UserError(f"{path} has {name}[{i}] = {positions[i]:g}: positions must be finite")
     gaps = np.diff(positions)
     for i in np.flatnonzero(gaps <= 0)[:1]:
         raise UserError(
             f"{path} has {name}[{i}] = {positions[i]:g} and {name}[{i + 1}] = {positions[i + 1]:g}:"
-            " positions must increase."
+            " positions must increase"
         )
     spacing = (positions[-1] - positions[0]) / (count - 1)
     worst = int(np.argmax(np.abs(gaps - spacing)))
     if abs(gaps[worst] - spacing) > UNEVENNESS * spacing:
         raise UserError(
             f"{path} has {name}[{worst}] and {name}[{worst + 1}] {gaps[worst]:g} apart, but {spacing:g} on average:"
-            " positions must be evenly spaced."
+            " positions must be evenly spaced"
         )
     return positions
 
@@ -298,14 +298,14 @@ def _cells(positions: FloatArray, wanted: npt.ArrayLike) -> tuple[IntArray, Floa
 def _numbers(path: Path, name: str, values: Array) -> FloatArray:
     """Return real numbers in 64 bits."""
     if values.dtype.kind not in "iuf":
-        raise UserError(f"{path} has {name} of type {values.dtype}, but they must be real numbers.")
+        raise UserError(f"{path} has {name} of type {values.dtype}, but they must be real numbers")
     return values.astype(np.float64)
 
 
 def _read_npz(path: Path) -> Grid:
     arrays = read_npz(path, ("heights", "x", "y"))
     if "heights" not in arrays:
-        raise UserError(f"{path} must have an array heights, and may have x and y.")
+        raise UserError(f"{path} must have an array heights, and may have x and y")
     return Grid(arrays.pop("heights"), arrays)
 
 
@@ -314,7 +314,7 @@ def _read_exr(path: Path) -> Grid:
     names = list(images) if len(images) == 1 else [name for name in "YRZ" if name in images]
     if not names:
         channels = ", ".join(sorted(images))
-        raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
+        raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z")
     return Grid(images[names[0]][::-1], {})
 
 
@@ -330,5 +330,5 @@ _READERS: dict[str, Callable[[Path], Grid]] = {
 }
 _POINTS = (".xyz", ".csv", ".txt")
 
-#: Suffixes of maps that lie about their centre, in coordinates of their own, where no origin is given.
+#: Suffixes of maps that lie about their centre, in their own coordinates, where no origin is given.
 IN_MAP_COORDINATES = (".asc", ".tif", ".tiff", ".bag", *_POINTS)

@@ -1,4 +1,4 @@
-"""Wake of a ship: Kelvin waves of a thin hull on deep water, as a height field."""
+"""Ship wake: Kelvin waves of a thin hull on deep water, as a height field."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def kelvin_wake(
     ship_y: float = 0.0,
     smallest_wavelength: float = 0.1,
 ) -> FloatArray:
-    """Height of a ship's steady wake on the lines of a grid.
+    """Height of a ship's steady wake on grid lines.
 
     Parameters
     ----------
@@ -41,16 +41,16 @@ def kelvin_wake(
     speed : float
         Speed U of the ship through the water [m/s], positive.
     bearing : float
-        Direction of travel [rad], counter-clockwise from +x.
+        Travel direction [rad], counter-clockwise from +x.
     length : float
-        Length L of the waterline [m], positive.
+        Waterline length L [m], positive.
     beam, draught : float, optional
         Full width B and depth T of the hull [m], positive; L/8 and L/20 by default. Heights are proportional to B.
     ship_x, ship_y : float
-        Position of the middle of the ship [m].
+        Position of the ship's middle [m].
     smallest_wavelength : float
-        Shortest wavelength of the result [m], positive. The theory neglects surface tension, which increases the phase
-        speed of waves of 0.1 m by 1.4 %.
+        Shortest wavelength in the result [m], positive. The theory neglects surface tension, which increases the phase
+        speed of 0.1 m waves by 1.4 %.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def kelvin_wake(
         k = k0 sec(theta)^2, k0 = g/U^2,
 
     with waves that are stationary in this frame. The hull displaces the water like sources -2 U dY/dx on its centre
-    plane (Michell 1898), Y its half width, and each source generates the waves of Havelock (1932), so that
+    plane (Michell 1898), Y its half width. Each source generates Havelock's waves (1932), so that
 
         A(theta) = -(2i/pi) k0^2 sec(theta)^4 P,
         P = integral of Y exp(k z) cos(k0 x sec(theta)) over the centre plane = B L T j1(a)/a V(k T),
@@ -82,15 +82,15 @@ def kelvin_wake(
     resistance is ``(pi/2) rho U^2 integral |A|^2 cos(theta)^3 dtheta`` (Newman 1977), Michell's integral.
 
     Only these free waves are included, not the local elevation about the hull, so that heights next to the hull are
-    rough. Ahead of the middle of the ship the integral yields mirrored, negated waves, which are removed; the others
-    grow smoothly from 0 amidships to their full height at the stern. The theory exaggerates the short steep waves on
-    the track, where a real ship leaves turbulent water.
+    rough. Ahead of the ship's middle the integral yields mirrored, negated waves, which are removed; the others grow
+    smoothly from 0 amidships to their full height at the stern. The theory exaggerates the short steep waves on the
+    track, where a real ship leaves turbulent water.
 
-    A grid line has the full amplitude of waves longer than four times its distance to the next line and than twice
-    `smallest_wavelength`. Shorter waves fade out, down to 0 at half that length, against aliasing. The longest wave of
-    a wake has the length 2 pi/k0 = 2 pi U^2/g: the wake of a ship too slow for the grid is 0.
+    A grid line has the full amplitude of waves longer than both four times its distance to the next line and twice
+    `smallest_wavelength`. Shorter waves fade out, down to 0 at half that length, against aliasing. A wake's longest
+    wave has the length 2 pi/k0 = 2 pi U^2/g: a ship too slow for the grid has the wake 0.
 
-    The integral is a sum over evenly spaced k sin(theta), which is exact except for periodic images of the wake, which
+    The integral is a sum over evenly spaced k sin(theta), which is exact except for the wake's periodic images, which
     are kept off the grid. A sum of plane waves over a grid is a product of two matrices.
 
     References

@@ -20,20 +20,20 @@ from mitransient_lidar.physics.sea.wave_spectrum import (
     variances_along,
 )
 
-#: Largest number of cells per side of one grid, and number of cells of the grids for the long waves of a finer sea.
+#: Largest number of cells per grid side, and number of cells in the long-wave grids of a finer sea.
 _MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024
 
-#: Largest ratio of the periods of neighbouring grids, odd.
+#: Largest ratio between the periods of neighbouring grids, odd.
 _MOST_TILES = 31
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What moves waves."""
+    """Causes of wave motion."""
 
     time: float = 0.0  #: Time [s].
     depth: float = math.inf  #: Depth of the water [m], positive or infinite; it slows long waves.
-    current: tuple[float, float] = (0.0, 0.0)  #: Velocity (x, y) of the water [m/s], added to that of all waves.
+    current: tuple[float, float] = (0.0, 0.0)  #: Water velocity (x, y) [m/s], added to the velocity of all waves.
 
 
 _STILL = Motion()
@@ -47,17 +47,17 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
     k : array_like
         Wavenumber [rad/m], not negative.
     depth : float
-        Depth of the water [m], positive or infinite.
+        Water depth [m], positive or infinite.
 
     Returns
     -------
     ndarray
-        omega [rad/s], of the shape of `k`.
+        omega [rad/s], in the shape of `k`.
 
     Notes
     -----
     Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with
-    T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension of the Elfouhaily spectrum's slowest wave.
+    T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension for the slowest wave in the Elfouhaily spectrum.
     """
     if not depth > 0:
         raise UserError(f"depth = {depth:g} must be greater than 0")
@@ -83,7 +83,7 @@ def wave_coefficients(
     spectrum : WaveSpectrum or SeaState
         Waves to realise. They travel towards the half plane of their direction.
     period : float
-        Side of the patch [m], positive. Longer waves are missing.
+        Patch side [m], positive. Longer waves are missing.
     cells : int
         Cells per side, even, at least 2.
     seed : int
@@ -97,8 +97,8 @@ def wave_coefficients(
     Returns
     -------
     ndarray, shape (cells, cells/2 + 1)
-        Complex amplitudes [m] of the waves of `wave_numbers`; the other half plane is their conjugate. Those of the
-        constant and of the Nyquist wavenumbers are 0.
+        Complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
+        Nyquist wavenumbers have amplitude 0.
 
     Raises
     ------
@@ -131,10 +131,10 @@ def wave_coefficients(
 
 
 def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> FloatArray:
-    """Return the elevations [m] of waves of `wave_coefficients`, shape (cells, cells), of the mean 0.
+    """Return the elevations [m] of `wave_coefficients` waves, shape (cells, cells), with mean 0.
 
     Element [j, i] is at x = (i - cells/2) d, y = (j - cells/2) d, d = period/cells. The grid has `cells` per side, even
-    and not fewer than those of the coefficients, which is the default.
+    and at least as many as the coefficients, the default.
     """
     count = len(coefficients)
     cells = cells or count
@@ -149,7 +149,7 @@ def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> Floa
 def facet_slope_variance(
     variance: FloatArray, ix: IntArray, iy: IntArray, period: float, cells: float, axis: float
 ) -> tuple[float, float]:
-    """Return the slope variances [1] along and across an axis of the facets that sample waves.
+    """Return the slope variances [1] along and across an axis for the facets that sample waves.
 
     Parameters
     ----------
@@ -164,10 +164,10 @@ def facet_slope_variance(
 
     Notes
     -----
-    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the
-    side of a cell. Their covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over
-    both triangles of a cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds
-    oblique to the mesh.
+    Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
+    Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
+    cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
+    mesh.
     """
     variance[:, 1:] *= 2  # for the half plane kx < 0
     # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
@@ -189,7 +189,7 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     Returns
     -------
     ix, iy
-        Indices of the columns and rows of a real FFT, shapes (cells/2 + 1,) and (cells,).
+        Column and row indices of a real FFT, shapes (cells/2 + 1,) and (cells,).
     dk
         Wavenumber of one wavelength over the period [rad/m].
     """
@@ -202,9 +202,9 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
 
 
 def _noise(seed: int, number: int, ix: IntArray, iy: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Squared moduli, of mean 1, and phases [rad] of complex Gaussian numbers, shape (iy, ix) (Box-Muller).
+    """Squared moduli, with mean 1, and phases [rad] of complex Gaussian numbers, shape (iy, ix) (Box-Muller).
 
-    They are a function of the seed, the number of the wave system, and the indices.
+    They depend on the seed, the wave system's number, and the indices.
     """
     key = _mix(np.array([int(seed) & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64))
     if number > 0:
@@ -231,7 +231,7 @@ class HeightGrid:
     """Elevations of waves on one grid that is as fine as the facets."""
 
     heights: FloatArray  #: Elevation [m], shape (cells, cells), as from `heights_of`.
-    cell_size: float  #: Spacing of the grid [m].
+    cell_size: float  #: Grid spacing [m].
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
@@ -242,9 +242,9 @@ class HeightGrid:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Waves of a range of wavenumbers as Fourier amplitudes."""
+    """Waves in a wavenumber range as Fourier amplitudes."""
 
-    #: Amplitudes [m] of waves with -h to h wavelengths per period along y and 0 to h along x, shape (2 h + 1, h + 1).
+    #: Wave amplitudes [m] with -h to h wavelengths per period along y and 0 to h along x, shape (2 h + 1, h + 1).
     coefficients: npt.NDArray[np.complex128]
     period: float  #: Period [m].
 
@@ -261,17 +261,17 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class PeriodicHeights:
-    """Elevations of waves: on one grid, or of a period that is too long for one grid of the facets' cells.
+    """Wave elevations on one grid, or with a period that is too long for one grid with the facets' cells.
 
-    The longest waves are those of a coarse grid over the period. Each band of shorter ones has a period that is an odd
-    fraction of the last, so that the wavenumbers of all bands fill the plane without gap or overlap.
+    The longest waves are waves of a coarse grid over the period. Each band of shorter ones has a period that is an odd
+    fraction of the previous one. The bands' wavenumbers thus fill the plane without gap or overlap.
     """
 
     parts: tuple[Band | HeightGrid, ...]  #: Waves by decreasing period, of which the last may be on a grid.
-    cells: int  #: Number of cells per period of the grid that holds the longest waves.
+    cells: int  #: Cells per period in the grid with the longest waves.
     cell_size: float  #: Spacing of that grid [m].
-    #: Numbers of bands of neighbouring wavenumbers, and waves of each band but that of the shortest wind waves, whose
-    #: sum are the waves of all parts.
+    #: Numbers of bands of neighbouring wavenumbers, and each band's waves except the shortest wind waves, whose sum are
+    #: the waves of all parts.
     bands: tuple[tuple[int, Band], ...] = ()
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -289,32 +289,31 @@ def realise_heights(
     shortest_wave: float = 0.0,
     wavenumbers: FloatArray | None = None,
 ) -> tuple[PeriodicHeights, float, tuple[float, float]]:
-    """Realise a sea for facets of a given size.
+    """Realise a sea for facets with a given size.
 
     Parameters
     ----------
     spectrum, seed
         As for `wave_coefficients`.
     period
-        Period of the sea [m], positive.
+        Sea period [m], positive.
     cell
-        Largest side of the cells [m], positive.
+        Largest cell side [m], positive.
     motion
         Time, depth and current.
     axis
-        Direction of the slope variances [rad], counter-clockwise from +x.
+        Axis of the slope variances [rad], counter-clockwise from +x.
     shortest_wave
         Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
     wavenumbers
-        Those of the bands [rad/m], increasing, into which the waves are also divided; by default into none. The share
-        of a band in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is
-        the last band, of its own.
+        Band wavenumbers [rad/m], increasing, by which the waves are also divided; by default not divided. A band's
+        share in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is the
+        last band, on its own.
 
     Returns
     -------
     waves, cell, variance
-        Elevations, the side of the cells [m], and the expected slope variances [1] of the facets along and across the
-        axis.
+        Elevations, the cell side [m], and the expected slope variances [1] of the facets along and across the axis.
     """
 
     def grid_of_waves(part: float) -> int:
@@ -322,7 +321,7 @@ def realise_heights(
         finest = even_cells(cell, part)
         return min(finest, 2 * int(part / shortest_wave) + 2) if shortest_wave > 0 else finest
 
-    # The cell of the last grid is that of the facets of all bands.
+    # The last grid's cell is the facet cell for all bands.
     periods, limits = [period], [0]
     while grid_of_waves(periods[-1]) > _MOST_CELLS:
         tiles = 3
@@ -376,7 +375,7 @@ def realise_heights(
 def _bands_of(
     coefficients: npt.NDArray[np.complex128], period: float, wavenumbers: FloatArray | None, whole: int
 ) -> list[tuple[int, Band]]:
-    """Return the bands of waves of `wave_coefficients`: by wavenumber but the last one, or all as the band `whole`."""
+    """Return the bands of `wave_coefficients` waves: by wavenumber except the last band, or all as the band `whole`."""
     ix, iy, dk = wave_numbers(period, len(coefficients))
     most = len(ix) - 2
     if wavenumbers is None:

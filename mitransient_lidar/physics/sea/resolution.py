@@ -9,19 +9,19 @@ from dataclasses import dataclass, replace
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.physics.lidar.divergence import read_divergence
 
-#: Shortest wave, and sides of a cell and of the patch without a lidar [m].
+#: Shortest wave, and sides of cell and patch without a lidar [m].
 _DEFAULT_WAVE, _DEFAULT_CELL, _DEFAULT_SIZE = 1.0, 0.125, 32.0
 
-#: Side of a pixel in the shortest waves, and limits of the latter [m].
+#: Pixel sides per shortest wave, and limits of the shortest wave [m].
 _PIXELS_PER_WAVE, _SMALLEST_WAVE, _LARGEST_WAVE = 4.0, 0.08, 2.0
 
-#: Cells in the shortest wave of a beam, fewer where the patch would have too many of them, and per side of a pixel.
+#: Cells in a beam's shortest wave, fewer where the patch would have too many, and cells per pixel side.
 _CELLS_PER_WAVE, _FEWEST_CELLS_PER_WAVE, _CELLS_PER_PIXEL = 12.0, 4.0, 2.0
 
-#: Limits of automatic cells [m].
+#: Limits for automatic cells [m].
 _SMALLEST_CELL, _LARGEST_CELL = 0.02, 0.25
 
-#: Number of cells per side of an automatic patch above which waves have fewer cells, and largest number.
+#: Cells per side in an automatic patch above which waves have fewer cells, and largest number.
 _MANY_CELLS, _MOST_CELLS = 512, 1024
 
 #: Side of the patch: factor on the footprint, and margin [m] for scattered light.
@@ -46,13 +46,13 @@ class Footprint:
     off_nadir: float  #: Angle of the axis from the vertical, at most 89.9 degrees [rad].
     is_laser: bool
     half_angle: float  #: Half of the full angle of the light or the field of view [rad].
-    detail: float  #: Standard deviation of the beam, or side of a pixel [rad].
+    detail: float  #: Beam standard deviation, or pixel side [rad].
 
     @classmethod
     def laser(
         cls, aim: tuple[float, float], altitude: float, off_nadir: float, spreads: tuple[float, float]
     ) -> Footprint:
-        """Return that of a laser whose beam has the given narrowest and widest standard deviation [rad]."""
+        """Return the footprint of a laser whose beam has the given narrowest and widest standard deviation [rad]."""
         narrow, wide = spreads
         return cls(aim, altitude, off_nadir, True, _BEAM_HALF_WIDTH * wide, narrow)
 
@@ -60,7 +60,7 @@ class Footprint:
     def receiver(
         cls, aim: tuple[float, float], altitude: float, off_nadir: float, field_of_view: float, pixel: float
     ) -> Footprint:
-        """Return that of a receiver of a full angle and a typical side of a pixel [rad]."""
+        """Return the footprint of a receiver from its full angle and typical pixel side [rad]."""
         return cls(aim, altitude, off_nadir, False, 0.5 * field_of_view, pixel)
 
     @property
@@ -69,14 +69,14 @@ class Footprint:
         return self.altitude / math.cos(self.off_nadir) * self.detail * (1.0 if self.is_laser else _PIXELS_PER_WAVE)
 
     def cell(self, patch: float) -> float:
-        """Return the side of the cells that it needs [m] in a patch of a side [m]."""
+        """Return the cell side that it needs [m] in a patch with a side [m]."""
         if not self.is_laser:
             return self.wave / (_PIXELS_PER_WAVE * _CELLS_PER_PIXEL)
         return max(self.wave / _CELLS_PER_WAVE, min(self.wave / _FEWEST_CELLS_PER_WAVE, patch / _MANY_CELLS))
 
     @property
     def half_side(self) -> float:
-        """Half of the side of the square about the aim point that holds its footprint [m]."""
+        """Half the side of the square about the aim point that contains its footprint [m]."""
         half = min(self.half_angle, math.pi / 4)
         # Towards the horizon a footprint is unbounded; the square is limited to four times the horizontal range.
         tan = math.tan(self.off_nadir)
@@ -90,10 +90,10 @@ class Resolution:
     """Position, sizes and cells of a sea [m]."""
 
     centre: tuple[float, float]  #: Position of the fine patch.
-    cell_size: float  #: Largest side of the patch's cells.
-    refined_size: float  #: Side of the patch.
+    cell_size: float  #: Largest cell side in the patch.
+    refined_size: float  #: Patch side.
     size: float  #: Side of the whole surface.
-    shortest_wave: float  #: Wavelength of the shortest waves.
+    shortest_wave: float  #: Shortest wavelength.
     beam_wave: float  #: The shortest waves that the beam alone needs, not shorter than those.
 
     @classmethod
@@ -103,10 +103,10 @@ class Resolution:
         Parameters
         ----------
         read
-            Reader of the parameters.
+            Parameter reader.
         footprints
-            Those of the lasers and receivers above the sea. Values of the parameters ``altitude``, ``off_nadir_deg``,
-            ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
+            Footprints of the lasers and receivers above the sea. Values of the parameters ``altitude``,
+            ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
 
         Raises
         ------

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
 
-#: Ratio of the lengths of neighbouring cells outside the fine patch.
+#: Ratio between the lengths of neighbouring cells outside the fine patch.
 _GROWTH = 1.3
 
 #: Memory of a cell: its heights, triangles, their copy in Mitsuba and the tree in which rays meet them [bytes].
@@ -19,27 +19,27 @@ _BYTES_PER_CELL = 280
 
 @dataclass(frozen=True)
 class SeaMesh:
-    """Triangle mesh of a height field."""
+    """Triangle mesh for a height field."""
 
     vertices: FloatArray  #: Positions [m], shape (vertices, 3).
     faces: npt.NDArray[np.uint32]  #: Indices of the corners, counter-clockwise seen from the air, shape (faces, 3).
     texcoords: FloatArray  #: Coordinates along and across the wind [m], axes of the ripples, shape (vertices, 2).
-    foam: FloatArray | None = None  #: Share of foam of each face [1], shape (faces,); None of a sea without foam.
+    foam: FloatArray | None = None  #: Foam share of each face [1], shape (faces,); None for a sea without foam.
 
 
 def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int = 1) -> IntArray:
-    """Return the positions of grid lines in cells of the fine patch, counted from its centre.
+    """Return grid line positions in cells of the fine patch, counted from its centre.
 
     Parameters
     ----------
     cells
-        Cells per side of the fine patch, even.
+        Cells per side in the fine patch, even.
     extent
         Side of the whole mesh in these cells, at least `cells`.
     growth
-        Ratio of the lengths of neighbouring cells outside the patch, above 1.
+        Ratio between the lengths of neighbouring cells outside the patch, above 1.
     meshes
-        Number of such meshes that are made at a time.
+        Number of such meshes made at a time.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
 
 
 def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
-    """Return one mesh of several."""
+    """Return one mesh from several."""
     counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.uint32)
     return SeaMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -75,7 +75,7 @@ def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
 
 
 def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:
-    """Return the triangle mesh of heights on grid lines.
+    """Return the triangle mesh for heights on grid lines.
 
     Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.facet_slope_variance` assumes.
 
@@ -84,7 +84,7 @@ def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_directio
     heights
         Elevation [m], shape (len(y), len(x)).
     x, y
-        Positions of the grid lines [m], increasing.
+        Grid line positions [m], increasing.
     wind_direction
         Direction of the first texture coordinate [rad], counter-clockwise from +x.
     """

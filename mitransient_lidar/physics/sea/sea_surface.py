@@ -1,4 +1,4 @@
-"""Sea surface of a scene from its parameters: waves, resolution of the mesh, and slope variance left to ripples."""
+"""A scene's sea surface from its parameters: waves, mesh resolution, and slope variance left to ripples."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ logger = logging.getLogger(__name__)
 #: Smallest slope variance of the ripples along one axis: a perfectly smooth facet has no connection to a point laser.
 _SMALLEST_RIPPLE_VARIANCE = 1e-5
 
-#: Unit of the period of the sea [m], its least length in peak wavelengths, and its largest length [m]. The period does
-#: not depend on the resolution, so that a seed defines one sea.
+#: Unit of the sea period [m], its least length in peak wavelengths, and its largest length [m]. The period does not
+#: depend on the resolution, so that a seed defines one sea.
 _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 
 #: Water depth [m] from which no wave notices the bottom.
@@ -60,7 +60,7 @@ DEEP = 1e4
 #: Wind speed [m/s] below which there are no waves.
 _CALM = 1e-6
 
-#: Largest number of cells per side of the fine patch, and smallest number per period for waves to be resolved.
+#: Largest number of cells per side in the fine patch, and smallest number per period for waves to be resolved.
 _MOST_CELLS, _FEWEST_CELLS = 4096, 16
 
 #: Side of each of several patches with the cells around it [m], and growth of these.
@@ -79,27 +79,27 @@ Wake = Callable[[FloatArray, FloatArray], FloatArray]
 class SeaSurface:
     """A sea surface with its resolution. Pairs of slope variances are along and across the wind [1]."""
 
-    spectrum: str  #: Name of the source of the waves.
+    spectrum: str  #: Name of the wave source.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
     waves: PeriodicHeights | ShoalingHeights | HeightMap | None  #: Elevations, None for a flat sea.
-    cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
-    centre: tuple[float, float]  #: Position of the patch [m].
-    refined_size: float  #: Side of the patch [m].
+    cell_size: float  #: Cell side in the fine patch [m], infinite for a flat sea.
+    centre: tuple[float, float]  #: Patch position [m].
+    refined_size: float  #: Patch side [m].
     size: float  #: Side of the whole surface [m].
-    resolved_variance: tuple[float, float]  #: Slope variances of the facets.
-    ripple_variance: tuple[float, float]  #: Slope variances of the ripples.
+    resolved_variance: tuple[float, float]  #: Facet slope variances.
+    ripple_variance: tuple[float, float]  #: Ripple slope variances.
     wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
-    shortest_wave: float  #: Wavelength of the shortest waves [m], that of two cells in coarse ones.
-    beam_wave: float  #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
-    slope_series: GramCharlierSeries | None = None  #: Series of the ripples' slopes, None for Gaussian ones.
-    #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
+    shortest_wave: float  #: Shortest wavelength [m], two cells in coarse ones.
+    beam_wave: float  #: Shortest wavelength that the beam alone needs [m], at least the sea's.
+    slope_series: GramCharlierSeries | None = None  #: Slope series of the ripples, None for Gaussian slopes.
+    #: Spectrum of waves and ripples that focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
     waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
     foam: float = 0.0  #: Share of the sea with foam [1].
-    surf_foam: float = 0.0  #: That of surf, where the depth limits the waves [1].
+    surf_foam: float = 0.0  #: Share with surf foam, where the depth limits the waves [1].
 
     @classmethod
     def read(
@@ -109,14 +109,14 @@ class SeaSurface:
         is_placeholder: bool = False,
         depths: BottomDepths | None = None,
     ) -> SeaSurface:
-        """Build a sea from parameters of the plugin ``ocean_surface``.
+        """Build a sea from the parameters of the plugin ``ocean_surface``.
 
         Parameters
         ----------
         read
-            Reader of the parameters.
+            Parameter reader.
         footprints
-            Those of the lasers and receivers above the sea, for its automatic values.
+            Footprints of the lasers and receivers above the sea, for its automatic values.
         is_placeholder
             Whether to check the parameters only, and return a sea without waves.
         depths
@@ -239,26 +239,26 @@ class SeaSurface:
     def patches(
         self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
     ) -> tuple[SeaMesh, FloatArray]:
-        """Return the mesh of fine patches about places, and the position of each place in it.
+        """Return the mesh with fine patches about locations, and the position of each location in it.
 
         The patches lie side by side on a square lattice about the origin, each surrounded by cells that grow out to
-        `_SIZE_OF_PATCH` or the size of the sea.
+        `_SIZE_OF_PATCH` or the sea's size.
 
         Parameters
         ----------
         places
-            Places (x, y) on the sea [m], shape (n, 2).
+            Sea locations (x, y) [m], shape (n, 2).
         refined_size
             Side of each fine patch [m].
         seas
-            The sea at the time of each place.
+            The sea at each location's time.
 
         Returns
         -------
         mesh : SeaMesh
             All patches.
         positions : ndarray
-            Positions (x, y) of the places in it [m], shape (n, 2).
+            Positions (x, y) of the locations in it [m], shape (n, 2).
         """
         cells = max(2, 2 * math.ceil(0.5 * refined_size / self.cell_size))
         size = max(refined_size, min(self.size, max(_SIZE_OF_PATCH, 2 * refined_size)))
@@ -269,7 +269,7 @@ class SeaSurface:
         positions = stride * (np.stack([number % side, number // side], axis=-1) - 0.5 * (side - 1))
         meshes = []
         for place, position, sea in zip(places, positions, seas, strict=True):
-            # On the cells of the sea, as in `mesh`.
+            # On the sea's cells, as in `mesh`.
             x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
             lines = (x - place[0] + position[0], y - place[1] + position[1])
             mesh = triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction)
@@ -311,7 +311,7 @@ class SeaSurface:
 
     @property
     def _crested(self) -> PeriodicHeights | HeightMap | None:
-        """Waves whose crests have foam: those of deep water, with the same crests."""
+        """Waves whose crests have foam: the waves over deep water, with the same crests."""
         return self.waves.waves if isinstance(self.waves, ShoalingHeights) else self.waves
 
     @cached_property
@@ -328,7 +328,7 @@ class SeaSurface:
         return crest_heights(waves.sample, *lines).ravel()
 
     def _with_foam(self, mesh: SeaMesh, x: FloatArray, y: FloatArray) -> SeaMesh:
-        """Return a mesh on grid lines of the sea [m] with the foam of its faces, the mean of their corners."""
+        """Return a mesh on the sea's grid lines [m] with the foam on its faces, the mean over their corners."""
         if not self.has_foam:
             return mesh
         shape, waves = (len(y), len(x)), self._crested
@@ -396,10 +396,10 @@ def _waves_at(
 
 
 def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | None:
-    """Return the depths of a bottom that the waves of an ``ocean_surface`` follow, None if they need not.
+    """Return the bottom depths that the waves of an ``ocean_surface`` follow, None if they need not.
 
-    That is for the parameter ``shoaling``, and for ``auto`` for whether the significant height of deep water would be
-    more than half of the least depth.
+    Waves follow them with the parameter ``shoaling``, and with ``auto`` if the significant height over deep water would
+    exceed half the least depth.
     """
     shoaling, spectrum = read("shoaling"), read("spectrum")
     if depths is None or shoaling == "none" or spectrum in ("flat", "height_map"):
@@ -423,7 +423,7 @@ def _check_shoaling(shoaling: str, spectrum: str) -> None:
 
 
 def _read_series(distribution: str, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
-    """Return the series of all slopes of the sea, None for Gaussian ones."""
+    """Return the series for all sea slopes, None for Gaussian ones."""
     if distribution == "gaussian":
         return None
     if slope_variance != "cox_munk":
@@ -467,7 +467,7 @@ def _matched(
 
 
 def _check_number_of_cells(refined_size: float, cell: float) -> None:
-    """Refuse a patch of too many cells."""
+    """Refuse a patch with too many cells."""
     if refined_size / cell > _MOST_CELLS:
         raise UserError(
             f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
@@ -496,7 +496,7 @@ def _read_surf_foam(read: Read) -> float:
 
 
 def _read_wake(read: Read) -> Wake | None:
-    """Return the wake of a ship as a function of grid lines, None without a ship."""
+    """Return a ship's wake as a function of grid lines, None without a ship."""
     speed, length, x, y = map(read, ("wake_speed", "wake_length", "wake_x", "wake_y"))
     bearing = math.radians(read("wake_bearing_deg"))
     if speed == 0:

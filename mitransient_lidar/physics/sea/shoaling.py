@@ -1,4 +1,4 @@
-"""Waves over a bottom whose depth changes from place to place: amplitudes of bands of waves by the local depth."""
+"""Waves over a bottom whose depth varies: wave band amplitudes by the local depth."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum
 #: Largest significant height of waves (four standard deviations) over the local depth.
 HEIGHT_PER_DEPTH = 0.5
 
-#: Ratio of the wavenumbers of neighbouring bands, the first over that of the peak, and the last [rad/m].
+#: Ratio between the wavenumbers of neighbouring bands, the first over the peak wavenumber, and the last [rad/m].
 _BAND, _FIRST_BAND, _LAST_BAND = math.sqrt(2), 0.25, 2 * math.pi
 
-#: Deficit of an amplitude that counts as none: a micrometre of a wave of one metre.
+#: Amplitude deficit that counts as none: a micrometre in a wave of one metre.
 _NO_CHANGE = 1e-6
 
-#: Depths of the table of amplitudes: the least one [m], their ratio, and the deepest one times the first wavenumber.
+#: Depths in the amplitude table: the least one [m], their ratio, and the deepest one times the first wavenumber.
 _LEAST_DEPTH, _DEPTH_RATIO, _DEEPEST = 1e-4, 1.05, 10.0
 
 #: Sharpness of smooth minima: 1 % from the smaller of two values that differ by 1.35, 9 % from equal ones.
 _SHARPNESS = 8.0
 
-#: Wavenumbers of the integral of the elevation variance, and the least of the largest one [rad/m].
+#: Wavenumbers in the integral for the elevation variance, and the least of the largest one [rad/m].
 _NODES, _SHORTEST = 600, 100.0
 
 
@@ -53,9 +53,9 @@ def is_limited(state: SeaState, depths: BottomDepths) -> bool:
 
 
 def band_wavenumbers(state: SeaState, shortest_wave: float) -> FloatArray:
-    """Return the wavenumbers [rad/m] of the bands of wind waves, half an octave apart, up to a shortest wave [m].
+    """Return the wavenumbers [rad/m] of wind wave bands, half an octave apart, up to a shortest wave [m].
 
-    Waves of a metre and less are one band. A sea of swell alone has one band.
+    Waves of a metre and less are one band. A sea with swell alone has one band.
     """
     first = state.components[0]
     if not isinstance(first, CosineSpectrum) or not math.isfinite(first.peak_wavenumber):
@@ -67,31 +67,31 @@ def band_wavenumbers(state: SeaState, shortest_wave: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class DepthResponse:
-    """Amplitudes of bands of waves at each depth, relative to those over deep water.
+    """Band amplitudes at each depth, relative to deep water.
 
     Notes
     -----
-    Wind waves of the wavenumber k have the TMA spectrum of the depth d_e (`wind_spectra.ShallowSpectrum`): the
-    amplitude factor (S(k; d_e)/S(k))^(1/2). At constant frequency this is Kitaigorodskii's factor
-    tanh(kd)^2/(1 + 2kd/sinh(2kd)) of the variance. Its form in wavenumbers fits waves that are realised by wavenumber:
-    it keeps the saturated tail, so that depth takes long waves away and leaves the slopes of short ones. Swell keeps
-    its significant height until that is half of d_e.
+    Wind waves with the wavenumber k have the TMA spectrum for the depth d_e (`wind_spectra.ShallowSpectrum`): the
+    amplitude factor (S(k; d_e)/S(k))^(1/2). At constant frequency this is Kitaigorodskii's variance factor
+    tanh(kd)^2/(1 + 2kd/sinh(2kd)). Its form in wavenumbers fits waves that are realised by wavenumber: it keeps the
+    saturated tail, so that depth takes long waves away and leaves the slopes of short ones. Swell keeps its significant
+    height until this exceeds half of d_e.
 
-    The effective depth d_e is the depth d or, if less, the one at which the significant height of all waves is d/2:
-    where waves break, the longest ones are missing, as in a sea of less depth. Both limits are smooth minima
-    (a^-8 + b^-8)^(-1/8). All amplitudes are 0 at d = 0 and over land.
+    The effective depth d_e is the depth d or, if less, the depth at which the significant height of all waves is d/2.
+    Where waves break, the longest ones are missing, as in a shallower sea. Both limits are smooth minima (a^-8 +
+    b^-8)^(-1/8). All amplitudes are 0 at d = 0 and over land.
     """
 
     depth: FloatArray  #: Increasing depths [m], the first 0, shape (n,).
     #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
     amplitude: FloatArray
-    top: int  #: Number of the band of the shortest wind waves.
+    top: int  #: Band number of the shortest wind waves.
     #: Share by which the largest height lessens the effective depth [1], 0 in deep water to 1 at the shore, shape (n,)
     broken: FloatArray
 
     @classmethod
     def of_state(cls, state: SeaState, wavenumbers: FloatArray) -> DepthResponse:
-        """Return the response of waves over deep water, whose wind waves have bands of `band_wavenumbers`."""
+        """Return the response of waves over deep water, whose wind waves have bands by `band_wavenumbers`."""
         wind = state.components[0] if isinstance(state.components[0], CosineSpectrum) else None
         swell = sum(each.elevation_variance() for each in state.components if isinstance(each, SwellSpectrum))
         deepest = max(_DEEPEST / wavenumbers[0], 100 * math.sqrt(state.elevation_variance()))
@@ -120,7 +120,7 @@ class DepthResponse:
 
 
 def _factor(wind: CosineSpectrum, k: FloatArray, depth: float) -> FloatArray:
-    """Return the amplitude factor of wind waves of wavenumbers k [rad/m] over a depth [m]."""
+    """Return the amplitude factor of wind waves with wavenumbers k [rad/m] over a depth [m]."""
     own = wind.spectrum if isinstance(wind, MatchedSpectrum) else wind
     deep = own.omnidirectional(k)
     shallow = ShallowSpectrum(own, depth).omnidirectional(k)
@@ -136,7 +136,7 @@ def _smooth_minimum(one: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ShoalingHeights:
-    """Elevations of waves that know the local depth."""
+    """Wave elevations that depend on the local depth."""
 
     waves: PeriodicHeights  #: The waves as over deep water, with their bands.
     response: DepthResponse
@@ -144,12 +144,12 @@ class ShoalingHeights:
 
     @property
     def cells(self) -> int:
-        """Number of cells per period, see `PeriodicHeights`."""
+        """Cells per period, see `PeriodicHeights`."""
         return self.waves.cells
 
     @property
     def cell_size(self) -> float:
-        """Spacing of the grid of the longest waves [m]."""
+        """Grid spacing for the longest waves [m]."""
         return self.waves.cell_size
 
     def broken(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -161,8 +161,8 @@ class ShoalingHeights:
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`.
 
-        With amplitudes a of the bands this is a_top times all waves, and (a - a_top) times each band: bands over which
-        the depth has no effect cost no time, and leave the heights as they are.
+        With band amplitudes a, this is a_top times all waves, plus (a - a_top) times each band. Bands over which the
+        depth has no effect cost no time, and leave the heights unchanged.
         """
         table, top = self.response.amplitude, self.response.top
         place = np.interp(self.depths.sample(x, y), self.response.depth, np.arange(table.shape[1]))

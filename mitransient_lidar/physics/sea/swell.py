@@ -1,4 +1,4 @@
-"""Spectrum of swell: long waves of nearly one length and direction from a distant storm."""
+"""Swell spectrum: long waves with nearly one length and direction, from a distant storm."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SwellSpectrum(WaveSpectrum):
         Mean wavelength [m], positive. In a realisation it is rounded to a fraction of the period, and swell more than
         twice as long as the period is missing.
     direction : float
-        Mean direction of travel [rad], counter-clockwise from +x.
+        Mean travel direction [rad], counter-clockwise from +x.
     relative_bandwidth : float
         Standard deviation of the wavenumber over its mean [1], above 0 up to 0.3.
     directional_spread : float
@@ -59,7 +59,7 @@ class SwellSpectrum(WaveSpectrum):
 
     @property
     def smooth_ranges(self) -> tuple[float, ...]:
-        """First and last wavenumber [rad/m] of the hump."""
+        """First and last wavenumber [rad/m] in the hump."""
         reach = _REACH * self.relative_bandwidth
         return self.peak_wavenumber * max(1 - reach, 1e-6), self.peak_wavenumber * (1 + reach)
 
@@ -116,7 +116,7 @@ class SwellSpectrum(WaveSpectrum):
         return np.where((np.abs(iy)[:, None] <= reach) & (np.abs(ix) <= reach), variances, 0)
 
     def _angles(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Angles from the direction [rad] and weights of unit sum of a midpoint rule."""
+        """Angles from the direction [rad] and midpoint rule weights with unit sum."""
         reach = min(_REACH * self.directional_spread, np.pi / 2)
         angle = reach * ((2 * np.arange(count) + 1) / count - 1)
         weight = np.exp(-((angle / self.directional_spread) ** 2) / 2)

@@ -1,9 +1,8 @@
 """Directional wave spectra: systems of waves, their sums, and wind waves matched to given slope variances.
 
 A spectrum Psi(kx, ky) [m^4] is the variance density of a frozen surface: Psi(k) = Psi(-k), and its integral over the
-plane is the elevation variance. Psi does not contain the direction of travel: waves travel towards the half plane of
-the direction of their system. Directions are those that wind and waves travel towards, in rad counter-clockwise from
-+x.
+plane is the elevation variance. Psi does not contain the travel direction: waves travel towards the half plane of their
+system's direction. Wind and waves travel towards the stated directions, in rad counter-clockwise from +x.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ GRAVITY = 9.81
 SLOWEST_WAVENUMBER = 370.0
 """Wavenumber of the slowest gravity-capillary wave [rad/m], which defines the surface tension."""
 
-_LARGEST_FRACTION = 0.75  # of the slope variance on one axis: that of the angular density cos^2(phi)/pi
+_LARGEST_FRACTION = 0.75  # of the slope variance on one axis: by the angular density cos^2(phi)/pi
 _NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
 
 
 def phase_speed(k: npt.ArrayLike) -> FloatArray:
-    """Phase speed [m/s] of gravity-capillary waves of wavenumber `k` [rad/m], positive, in deep water."""
+    """Phase speed [m/s] of gravity-capillary waves with wavenumber `k` [rad/m], positive, in deep water."""
     wavenumber = np.asarray(k, dtype=np.float64)
     return np.asarray(np.sqrt(GRAVITY / wavenumber * (1 + (wavenumber / SLOWEST_WAVENUMBER) ** 2)))
 
@@ -63,14 +62,14 @@ class WaveSpectrum(ABC):
 
     @abstractmethod
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
-        """Elevation variances of the waves of a periodic patch.
+        """Elevation variances of the waves in a periodic patch.
 
         Parameters
         ----------
         ix, iy : ndarray of int, shapes (I,) and (J,)
             Numbers of wave periods along x and y over the patch.
         dk : float
-            Spacing of the wavenumbers [rad/m]: 2 pi over the side of the patch.
+            Wavenumber spacing [rad/m]: 2 pi divided by the patch side.
 
         Returns
         -------
@@ -97,7 +96,7 @@ class WaveSpectrum(ABC):
         """Ascending wavenumbers [rad/m] between which S is smooth; it is negligible beyond the first and last."""
 
     def elevation_variance(self) -> float:
-        """Variance of the elevation [m^2]."""
+        """Elevation variance [m^2]."""
         k, weight = self.quadrature()
         return float(np.sum(self.omnidirectional(k) * weight))
 
@@ -133,7 +132,7 @@ class CosineSpectrum(WaveSpectrum):
 
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances Psi dk^2 [m^2]; see `WaveSpectrum.mode_variances`."""
-        # S and Delta once for each integer ix^2 + iy^2 that occurs: a fifth of the waves of a large patch.
+        # S and Delta once for each integer ix^2 + iy^2 that occurs: a fifth of the waves in a large patch.
         square = ix**2 + iy[:, None] ** 2
         occurs = np.zeros(square.max() + 1, dtype=bool)
         occurs[square] = True
@@ -153,7 +152,7 @@ class CosineSpectrum(WaveSpectrum):
 
 @dataclass(frozen=True)
 class SeaState:
-    """Sum of independent wave systems, each with its own direction of travel.
+    """Sum of independent wave systems, each with its own travel direction.
 
     Parameters
     ----------
@@ -189,7 +188,7 @@ class SeaState:
         return np.asarray(sum(component.omnidirectional(k) for component in self.components))
 
     def elevation_variance(self) -> float:
-        """Variance of the elevation [m^2]."""
+        """Elevation variance [m^2]."""
         return sum(component.elevation_variance() for component in self.components)
 
     def slope_covariance(self) -> FloatArray:
@@ -206,7 +205,7 @@ class SeaState:
 
     @property
     def systems(self) -> tuple[WaveSpectrum, ...]:
-        """Independent wave systems, in the order of the components."""
+        """Independent wave systems, in component order."""
         return self.components
 
 
@@ -222,12 +221,12 @@ class MatchedSpectrum(CosineSpectrum):
         Elfouhaily, Pierson-Moskowitz or JONSWAP. One with less than a millionth of the given variances, as in the
         lightest winds, is made flat.
     upwind, crosswind : float
-        Slope variances [1] along and across the direction, not negative, such as those of Cox and Munk. Their ratio is
-        limited to a factor of 3 (cos^2 about the direction); beyond it, as for Cox and Munk below 0.4 m/s, the larger
-        one is reduced.
+        Slope variances [1] along and across the direction, not negative, such as Cox and Munk's. Their ratio is limited
+        to a factor of 3 (cos^2 about the direction); beyond it, as for Cox and Munk below 0.4 m/s, the larger one is
+        reduced.
     k_from : float
         Waves with wavenumbers [rad/m] above this are scaled, positive. If the others alone have too much slope
-        variance, or a ratio that scaling cannot correct, it is reduced in steps of a tenth; below the longest wave all
+        variance, or a ratio that scaling cannot correct, it is reduced in steps of a tenth. Below the longest wave all
         are scaled.
 
     Attributes
@@ -269,7 +268,7 @@ class MatchedSpectrum(CosineSpectrum):
 
     @property
     def peak_wavenumber(self) -> float:
-        """Wavenumber of the unscaled spectrum's peak [rad/m]."""
+        """Wavenumber at the unscaled spectrum's peak [rad/m]."""
         return self.spectrum.peak_wavenumber
 
     @property

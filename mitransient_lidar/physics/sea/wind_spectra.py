@@ -1,4 +1,4 @@
-"""Spectra of wind waves: Elfouhaily, Pierson-Moskowitz and JONSWAP, and TMA in shallow water.
+"""Wind wave spectra: Elfouhaily, Pierson-Moskowitz and JONSWAP, and TMA in shallow water.
 
 Wind speeds are at 10 m height. All share the directional spreading of Elfouhaily et al. (1997).
 """
@@ -19,7 +19,7 @@ from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY, SLOWEST_WAVENUM
 
 _DRAG_COEFFICIENT = 0.00144
 _SLOWEST_SPEED = 0.23  # phase speed of the slowest wave, rounded as in Elfouhaily et al., m/s
-_OLDEST, _YOUNGEST = 0.84, 5.0  # range of the inverse wave age
+_OLDEST, _YOUNGEST = 0.84, 5.0  # inverse wave age range
 _PIERSON_MOSKOWITZ_BETA = 0.74
 
 
@@ -59,7 +59,7 @@ def inverse_wave_age(wind_speed: float, fetch: float) -> float:
 
 
 class WindSpectrum(CosineSpectrum):
-    """Spectrum of wind waves with the directional spreading of Elfouhaily et al. (1997) about its own peak."""
+    """Wind wave spectrum with the directional spreading of Elfouhaily et al. (1997) about its own peak."""
 
     wind_speed: float
 
@@ -94,9 +94,8 @@ class ElfouhailySpectrum(WindSpectrum):
     Notes
     -----
     Elfouhaily, Chapron, Katsaros and Vandemark (1997), J. Geophys. Res. 102, 15781, doi:10.1029/97JC00467, with the
-    drag coefficient 0.00144 and the low-frequency roll-off L_PM J_p also on the capillary branch, without which the
-    waves of light winds would be tens of metres high. A negative capillary amplitude of eq. 44 (below 2.2 m/s) is
-    replaced by 0.
+    drag coefficient 0.00144. The low-frequency roll-off L_PM J_p also acts on the capillary branch; without it waves in
+    light winds would be tens of metres high. A negative capillary amplitude in eq. 44 (below 2.2 m/s) is replaced by 0.
     """
 
     wind_speed: float
@@ -109,7 +108,7 @@ class ElfouhailySpectrum(WindSpectrum):
 
     @property
     def peak_wavenumber(self) -> float:
-        """Wavenumber of the spectral peak [rad/m]; infinite without wind."""
+        """Wavenumber at the spectral peak [rad/m]; infinite without wind."""
         if self.wind_speed == 0:
             return np.inf
         return GRAVITY * (self.inverse_wave_age / self.wind_speed) ** 2
@@ -149,9 +148,9 @@ class ElfouhailySpectrum(WindSpectrum):
 class SaturatedSpectrum(WindSpectrum):
     """Wavenumber form of a frequency spectrum with the tail alpha g^2 omega^-5, up to the slowest wave.
 
-    S(omega) d omega = S(k) dk with omega^2 = g k gives the tail (alpha/2) k^-3, whose slope variance grows by
-    alpha/2 with every factor e in k. These spectra do not include capillary waves; they end at `CUT_OFF`, the limit of
-    gravity waves.
+    S(omega) d omega = S(k) dk with omega^2 = g k gives the tail (alpha/2) k^-3, whose slope variance grows by alpha/2
+    with every factor e in k. These spectra do not include capillary waves; they end at `CUT_OFF`, the limit of gravity
+    waves.
     """
 
     CUT_OFF: ClassVar[float] = SLOWEST_WAVENUMBER
@@ -178,7 +177,7 @@ class SaturatedSpectrum(WindSpectrum):
 
 @dataclass(frozen=True)
 class PiersonMoskowitzSpectrum(SaturatedSpectrum):
-    """Spectrum of the gravity waves of a fully developed sea.
+    """Gravity wave spectrum of a fully developed sea.
 
     Parameters
     ----------
@@ -208,7 +207,7 @@ class PiersonMoskowitzSpectrum(SaturatedSpectrum):
 
 @dataclass(frozen=True)
 class JonswapSpectrum(SaturatedSpectrum):
-    """Spectrum of the gravity waves of a fetch-limited sea.
+    """Gravity wave spectrum of a fetch-limited sea.
 
     Parameters
     ----------
@@ -216,7 +215,7 @@ class JonswapSpectrum(SaturatedSpectrum):
         As for `ElfouhailySpectrum`, but with a wind speed above 0.
     fetch : float
         Distance from the upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the
-        peak reaches that of the fully developed sea and the growth ends.
+        peak reaches the fully developed sea's peak and the growth ends.
     peak_enhancement : float
         gamma, 1 to 7; the mean over the measurements is 3.3.
 
@@ -236,7 +235,7 @@ class JonswapSpectrum(SaturatedSpectrum):
         wind, distance = positive("wind_speed", self.wind_speed), positive("fetch", self.fetch)
         unit = wind**2 / GRAVITY
         shortest = 0.1 * unit
-        # The fetch at which omega_p is that of Pierson and Moskowitz
+        # The fetch at which omega_p reaches Pierson and Moskowitz's
         longest = (22 * 1.026 / (0.8 * _PIERSON_MOSKOWITZ_BETA) ** 0.25) ** 3 * unit
         if distance > longest:
             raise UserError(
@@ -249,7 +248,7 @@ class JonswapSpectrum(SaturatedSpectrum):
 
     @property
     def peak_wavenumber(self) -> float:
-        """Wavenumber of the frequency spectrum's peak [rad/m]."""
+        """Wavenumber at the frequency spectrum's peak [rad/m]."""
         return GRAVITY * (22 / self.wind_speed) ** 2 / math.pow(self._relative_fetch, 2 / 3)
 
     def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
@@ -269,16 +268,16 @@ class ShallowSpectrum(CosineSpectrum):
     Parameters
     ----------
     deep : CosineSpectrum
-        Spectrum of the same wind over deep water.
+        Spectrum for the same wind over deep water.
     depth : float
         Water depth [m], positive.
 
     Notes
     -----
-    TMA spectrum of Bouws, Guenther, Rosenthal and Vincent (1985), J. Geophys. Res. 90, 975,
-    doi:10.1029/JC090iC01p00975: k^3 S(k) is that of deep water at the same frequency, thus at the wavenumber
-    k tanh(k depth), and so is the spreading. In frequencies it is the deep spectrum times Kitaigorodskii's factor, from
-    (depth omega^2/g)/2 for long waves to 1.
+    TMA spectrum by Bouws, Guenther, Rosenthal and Vincent (1985), J. Geophys. Res. 90, 975,
+    doi:10.1029/JC090iC01p00975: k^3 S(k) and the spreading equal their deep-water values at the same frequency, thus at
+    the wavenumber k tanh(k depth). In frequencies it is the deep spectrum times Kitaigorodskii's factor, from (depth
+    omega^2/g)/2 for long waves to 1.
     """
 
     deep: CosineSpectrum
@@ -291,7 +290,7 @@ class ShallowSpectrum(CosineSpectrum):
 
     @property
     def peak_wavenumber(self) -> float:
-        """Wavenumber [rad/m] of the frequency of the deep peak."""
+        """Wavenumber [rad/m] at the deep peak's frequency."""
         return self._shallow(self.deep.peak_wavenumber)
 
     @property
@@ -311,7 +310,7 @@ class ShallowSpectrum(CosineSpectrum):
         return self.deep.spreading(wavenumber * np.tanh(wavenumber * self.depth))
 
     def _shallow(self, deep: float) -> float:
-        """Return the wavenumber of the frequency of a wave over deep water [rad/m]: a root of k tanh(k depth)."""
+        """Return the wavenumber [rad/m] at the frequency of a wave over deep water: a root of k tanh(k depth)."""
         from scipy.optimize import brentq
 
         if not math.isfinite(deep):

@@ -1,4 +1,4 @@
-"""Bubbles below a windy sea: void fraction and sizes by wind speed, and what they do to light.
+"""Bubbles below a windy sea: void fraction and sizes against wind speed, and their effect on light.
 
 The background layer of bubbles that breaking waves leave behind, a mean over time, not the plumes below fresh breakers.
 """
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
-#: Highest wind speed of the model [m/s].
+#: Highest wind speed in the model [m/s].
 STRONGEST_WIND = 20.0
 
 CLEAN_BACKSCATTER = 233.0
-"""Volume scattering at 180 degrees over void fraction of clean bubbles of any sizes [1/(m sr)] (Churnside 2010)."""
+"""Volume scattering at 180 degrees over void fraction for clean bubbles of any size [1/(m sr)] (Churnside 2010)."""
 
 #: Bubbles per volume and radius at the reference radius, at 13 m/s [1/m^4], and that wind speed [m/s].
 _DENSITY, _REFERENCE_WIND = 1.6e10, 13.0
@@ -27,7 +27,7 @@ _EXPONENTS = 4.0, 4.37
 #: Depth of the layer up to a wind speed [m], that speed [m/s], and its rise [s].
 _LEAST_DEPTH, _WIND_OF_LEAST_DEPTH, _DEEPENING = 0.4, 7.5, 0.115
 
-#: Ratios bb/b of the Fournier-Forand functions among which that of bubbles is sought.
+#: Range of Fournier-Forand ratios bb/b within which the bubbles' ratio is sought.
 _RATIOS = 1e-4, 0.4
 _BISECTIONS = 40
 
@@ -36,7 +36,7 @@ _BISECTIONS = 40
 class WindBubbles:
     """Bubbles whose void fraction falls with depth as exp(-z / depth)."""
 
-    void_fraction: float  #: Volume of air in that of water at the surface, 0 to 0.001.
+    void_fraction: float  #: Air volume per water volume at the surface, 0 to 0.001.
     depth: float  #: Depth at which it has fallen to 1/e [m], 0.05 to 20.
     radius: float  #: Effective radius, of the mean cube over the mean square [m].
 
@@ -46,12 +46,12 @@ class WindBubbles:
 
         Notes
         -----
-        The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4, with G = (a_r / a)^4 from a radius
-        of 10 um to a_r = 54.4 um and (a_r / a)^4.37 to 1000 um, and L = 0.4 m up to 7.5 m/s, 0.4 + 0.115 (U - 7.5)
-        above. Hall (1989), J. Acoust. Soc. Am. 86, 1103, doi:10.1121/1.398102; Novarini, Keiffer and Norton (1998),
-        IEEE J. Oceanic Eng. 23, 423, doi:10.1109/48.725236. Their changes of the sizes with depth, of a_r by 1.984 um
-        a metre and of the upper exponent by (z / 2.55 m)^2, are left out: they raise the void fraction by at most 7 %
-        down to 3 m, and the scattering by 14 % at 1 m and 28 % at 2 m.
+        The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4. G = (a_r / a)^4 from a radius of 10
+        um to a_r = 54.4 um and (a_r / a)^4.37 to 1000 um. L = 0.4 m up to 7.5 m/s, 0.4 + 0.115 (U - 7.5) above. Hall
+        (1989), J. Acoust. Soc. Am. 86, 1103, doi:10.1121/1.398102; Novarini, Keiffer and Norton (1998), IEEE J. Oceanic
+        Eng. 23, 423, doi:10.1109/48.725236. They also change the sizes with depth: a_r by 1.984 um per metre and the
+        upper exponent by (z / 2.55 m)^2. These changes are left out: they raise the void fraction by at most 7 % down
+        to 3 m, and the scattering by 14 % at 1 m and 28 % at 2 m.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Tables of numbers that come with the package, and log-log interpolation of phase functions."""
+"""Number tables that come with the package, and log-log interpolation of phase functions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def log_log_interpolation(
     values : ndarray, shape (N,)
         Values, above 0.
     extrapolation : callable
-        Change of ln p below the first angle, as a function of ln(theta/theta[0]).
+        Change in ln p below the first angle, as a function of ln(theta/theta[0]).
     """
     log_theta, log_p = np.log(theta), np.log(values)
 

@@ -10,13 +10,13 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
-#: Nodes of the inverse of a phase function's distribution.
+#: Nodes in the inverse of a phase function's distribution.
 _NODES = 8192
 
 #: Scattering by more is loss: the light has left the beam [rad].
 LARGEST_ANGLE = np.radians(80.0)
 
-#: Displacement in place of that by larger angles [m].
+#: Displacement in place of displacements by larger angles [m].
 _FAR = 1e6
 
 
@@ -39,7 +39,7 @@ def displacements(
     Parameters
     ----------
     column, phases
-        Layers of water, and the phase function of each.
+        Water layers, and the phase function of each.
     depths
         Depths [m], shape (depths,), positive.
     most

@@ -25,7 +25,7 @@ class WaterColumn:
     Parameters
     ----------
     layer_tops : array_like, shape (L,)
-        Depth of the upper edge of each layer [m]. The first is 0 and they increase strictly.
+        Depth of each layer's upper edge [m]. The first is 0 and they increase strictly.
     attenuation : array_like, shape (L,)
         Beam attenuation coefficient c [1/m], at least `scattering`, at most 1000.
     scattering : array_like, shape (L,)
@@ -69,12 +69,12 @@ class WaterColumn:
     ) -> WaterColumn:
         """Build from numbers, sequences, or strings of numbers separated by commas or spaces.
 
-        A single value of a coefficient applies to all layers. Parameters and units are those of the class.
+        A single coefficient value applies to all layers. Parameters and units as for the class.
 
         Raises
         ------
         UserError
-            As for the class, or if a string does not hold numbers only.
+            As for the class, or if a string contains anything else than numbers.
         """
         edges = number_list("layer_tops", layer_tops)
         coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}
@@ -130,8 +130,8 @@ class WaterColumn:
     def layer_shares(self, depth: npt.ArrayLike) -> FloatArray:
         """Share of each layer in the water from z = 0 to `depth` [m], shape (..., L).
 
-        At or above the mean sea level all is the first layer. At an unknown depth (NaN) the shares are those of a
-        single layer, or NaN where there are several.
+        At or above the mean sea level all is the first layer. At an unknown depth (NaN) a single layer has its usual
+        share, and several layers have NaN.
         """
         z = np.asarray(depth, dtype=np.float64)[..., np.newaxis]
         if self.count == 1:
@@ -142,7 +142,7 @@ class WaterColumn:
 
     @property
     def _layer_ends(self) -> FloatArray:
-        """Lower edges of the layers [m]."""
+        """Lower layer edges [m]."""
         return np.append(self.layer_tops[1:], np.inf)
 
     def optical_depth(self, depth0: npt.ArrayLike, depth1: npt.ArrayLike, distance: npt.ArrayLike) -> FloatArray:
@@ -158,7 +158,7 @@ class WaterColumn:
         Returns
         -------
         ndarray
-            Optical depth, of the broadcast shape. A horizontal segment lies in the layer that owns its depth.
+            Optical depth, in the broadcast shape. A horizontal segment lies in the layer that owns its depth.
         """
         z0, z1, length = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (depth0, depth1, distance)))
         upper, lower = np.minimum(z0, z1), np.maximum(z0, z1)

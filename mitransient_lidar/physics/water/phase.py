@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range
 from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_phase, read_columns
 
 _SLOPE_RANGE = (3.0001, 4.9999)
-"""Junge slopes mu of the one-parameter Fournier-Forand family."""
+"""Junge slopes mu in the one-parameter Fournier-Forand family."""
 
 _BISECTIONS = 52
 """Halvings of this range that leave the rounding error."""
@@ -35,7 +35,7 @@ def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     Returns
     -------
     ndarray
-        Phase function [1/sr], of the shape of `theta`; infinite at theta = 0.
+        Phase function [1/sr], in the shape of `theta`; infinite at theta = 0.
 
     Notes
     -----
@@ -110,7 +110,7 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
 
     Notes
     -----
-    The line is that of Mobley, Sundman and Boss (2002), Appl. Opt. 41, 1035, doi:10.1364/AO.41.001035.
+    The line comes from Mobley, Sundman and Boss (2002), Appl. Opt. 41, 1035, doi:10.1364/AO.41.001035.
     """
 
     def ratio(mu: float) -> float:
@@ -135,7 +135,7 @@ def henyey_greenstein_backscatter_ratio(g: float) -> float:
 
 
 def petzold_average_particle() -> PhaseFunction:
-    """Petzold's average-particle phase function as a function of the angle [rad].
+    """Petzold's average-particle phase function as a function of angle [rad].
 
     Returns
     -------
@@ -145,7 +145,7 @@ def petzold_average_particle() -> PhaseFunction:
 
     Notes
     -----
-    Table 2 of Mobley et al. (1993), Appl. Opt. 32, 7484, doi:10.1364/AO.32.007484, derived from Petzold (1972), SIO
+    Table 2 in Mobley et al. (1993), Appl. Opt. 32, 7484, doi:10.1364/AO.32.007484, derived from Petzold (1972), SIO
     Ref. 72-78. With this interpolation the raw table integrates to 0.9929, by which it is divided. The mean cosine is
     0.9241 and bb/b = 0.01826; linear interpolation of p, as in the paper, integrates to 1.0200 instead.
     """
@@ -196,11 +196,11 @@ PETZOLD_WATERS = {
     "nuc_2200": (0.337, 1.583),
     "nuc_2240": (0.125, 1.205),
 }
-"""Absorption and scattering (a, b) [1/m] of Petzold's waters at 530 nm, those of pure water included."""
+"""Absorption and scattering (a, b) [1/m] of Petzold's waters at 530 nm, including pure water."""
 
 
 def petzold_water(name: str) -> PhaseFunction:
-    """Phase function of one of Petzold's waters as a function of the angle [rad].
+    """Phase function of one of Petzold's waters as a function of angle [rad].
 
     Parameters
     ----------
@@ -213,8 +213,8 @@ def petzold_water(name: str) -> PhaseFunction:
     -------
     callable
         Function from angles [rad], 0 to pi, to p [1/sr], normalised to 1; infinite at 0. Between the tabulated angles
-        ln p is linear in ln theta; below 0.1 degree the power law of the first two angles continues, with exponents of
-        -1.19 to -1.60.
+        ln p is linear in ln theta; below 0.1 degree the power law through the first two angles continues, with
+        exponents from -1.19 to -1.60.
 
     Raises
     ------
@@ -224,9 +224,9 @@ def petzold_water(name: str) -> PhaseFunction:
     Notes
     -----
     Petzold (1972), Volume scattering functions for selected ocean waters, Scripps Institution of Oceanography, SIO Ref.
-    72-78, measured in green light (a band of 75 nm about 514 nm). Molecules and particles were measured together: do
-    not add the scattering of sea water. There are no measurements below 0.17 degree, in the harbour below 0.09, where
-    the report extrapolates with a power law.
+    72-78, measured in green light (a 75 nm band about 514 nm). Molecules and particles were measured together: do not
+    add scattering by sea water. There are no measurements below 0.17 degree, in the harbour below 0.09, where the
+    report extrapolates with a power law.
 
     With this interpolation the tables of ``clear``, ``coastal`` and ``turbid`` integrate to 0.0372, 0.2189 and 1.820
     1/m; the report's own sums are 0.0373, 0.2193 and 1.824. Mean cosines are 0.871, 0.947 and 0.920, and bb/b is

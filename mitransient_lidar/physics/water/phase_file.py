@@ -38,9 +38,9 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     Parameters
     ----------
     path : path-like
-        Text file of two columns, as `text_tables.read_table` reads it: scattering angle in degrees, or in rad if
-        its heading says so, increasing within 0 to 180 degrees, at least 10 of any spacing, the last 170 or more; and
-        value, positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
+        Text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in rad
+        if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
+        The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 
     Returns
     -------
@@ -55,11 +55,11 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
 
     Notes
     -----
-    Between the angles ln p is linear in ln theta, as for `phase.petzold_average_particle`. Below the first
-    angle the power law of the first two continues, or p is constant where that would decrease towards 0. If the first
-    angle is 0, ln p is linear in theta^2 up to the second: flat at 0. Beyond the last angle p is constant. The result
-    has 32768 nodes, 0.05 degree apart at 90 degrees but 0.4 at 165 and 3.3 at 180: kinks are smoothed accordingly, and
-    of a backward peak the value at 180 degrees is kept but no shape narrower than 3 degrees.
+    Between the angles ln p is linear in ln theta, as for `phase.petzold_average_particle`. Below the first angle the
+    power law through the first two continues, or p is constant where the power law would decrease towards 0. If the
+    first angle is 0, ln p is linear in theta^2 up to the second: flat at 0. Beyond the last angle p is constant. The
+    result has 32768 nodes, 0.05 degree apart at 90 degrees but 0.4 at 165 and 3.3 at 180. Kinks are smoothed
+    accordingly. A backward peak keeps its value at 180 degrees, but no shape narrower than 3 degrees.
     """
     theta, value = _read_columns(path)
     raw = _interpolation(path, theta, value)

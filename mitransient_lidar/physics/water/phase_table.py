@@ -16,7 +16,7 @@ from mitransient_lidar.physics.water.phase import fournier_forand, fournier_fora
 DEFAULT_LOG_S0 = float(np.log(1e-12))
 DEFAULT_COUNT = 2048
 
-#: Nodes of a function that is changed near 180 degrees, and the e^-1 width of the change there [rad].
+#: Nodes in a function that is changed near 180 degrees, and the e^-1 width of the change there [rad].
 _PEAK_COUNT, _PEAK_WIDTH = 16384, float(np.radians(6.0))
 
 
@@ -25,28 +25,28 @@ class PowerLawTable:
     """Phase function tabulated in s = sin^2(theta/2), a power of s between nodes.
 
     The nodes are uniform in ln s: ln s_i = log_s0 + i step for i = 0..N-1, and the last is s = 1 (180 degrees). Over
-    all azimuths the solid angle is 4 pi ds, so 4 pi p is the probability density of s. On segment i,
-    p = value_i (s/s_i)^-exponent_i; below s_0, p = value_0 (s/s_0)^-cap_exponent. Density, cumulative distribution and
-    its inverse are closed forms of the same function, so that samples follow the density exactly.
+    all azimuths the solid angle is 4 pi ds, so 4 pi p is the probability density of s. On segment i, p = value_i
+    (s/s_i)^-exponent_i; below s_0, p = value_0 (s/s_0)^-cap_exponent. Density, cumulative distribution and its inverse
+    are closed forms of the same function, so that samples follow the density exactly.
 
-    Forward peaks of natural water rise as a power of the angle over six decades, which uniform nodes in ln s resolve
+    Forward peaks in natural water rise as a power of the angle over six decades, which uniform nodes in ln s resolve
     and a table in cos(theta) does not. The default, 2048 nodes from s = 1e-12 (theta = 2 microradian), has 51 nodes in
-    the backward hemisphere, which spans only ln 2; there the interpolation of Fournier-Forand functions is accurate to
-    2e-4. Narrow backward peaks need more nodes: with a weak backward Henyey-Greenstein lobe the error at 180 degrees is
-    3e-4 for g = 0.3, 2e-3 for 0.5 and 2e-2 for 0.7, or 2e-3 for 0.7 with 8192 nodes.
+    the backward hemisphere, which spans only ln 2. There Fournier-Forand functions are interpolated to 2e-4. Narrow
+    backward peaks need more nodes. With a weak backward Henyey-Greenstein lobe the error at 180 degrees is 3e-4 for g =
+    0.3, 2e-3 for 0.5 and 2e-2 for 0.7, or 2e-3 for 0.7 with 8192 nodes.
 
     Build one with `from_function`, `from_values`, `fournier_forand` or `mixture`.
 
     Parameters
     ----------
     log_s0 : float
-        ln s of the first node, negative.
+        ln s at the first node, negative.
     value : ndarray, shape (N,)
         p at the nodes [1/sr].
     exponent : ndarray, shape (N,)
         Power-law exponents of the segments; the last is 0 and unused.
     cdf : ndarray, shape (N,)
-        Probability below each node; cdf[0] is that of the cap and cdf[-1] = 1.
+        Probability below each node; cdf[0] belongs to the cap, and cdf[-1] = 1.
     cap_exponent : float
         Exponent below s_0, less than 1.
     """
@@ -68,7 +68,7 @@ class PowerLawTable:
         values : array_like, shape (N,)
             p at nodes uniform in ln s from log_s0 to 0, in any common unit; positive; N at least 2.
         log_s0 : float
-            ln s of the first node, negative.
+            ln s at the first node, negative.
         cap_probability : float, optional
             4 pi int_0^s_0 p ds in the unit of `values`. By default the first segment's power law continues to s = 0.
 
@@ -147,11 +147,11 @@ class PowerLawTable:
     def with_chi(self, chi: float) -> PowerLawTable:
         """Return the function with another value at 180 degrees and the same backscatter ratio.
 
-        Between 90 and 180 degrees it is multiplied by A + B exp(-(1 - s)/w^2), where 1 - s is about a quarter of the
+        Between 90 and 180 degrees it is multiplied by A + B exp(-(1 - s)/w^2). Here 1 - s is about a quarter of the
         squared angle from 180 degrees and 2 w is 6 degrees: at 170 degrees B counts by 6 %. Measured functions over
-        their bb agree within 5 % from 90 to 170 degrees (Sullivan and Twardowski 2009, doi:10.1364/AO.48.006811), and
-        nearer to 180 degrees they do not (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where
-        the function has no peak of its own in the last 10 degrees.
+        their bb agree within 5 % from 90 to 170 degrees (Sullivan and Twardowski 2009, doi:10.1364/AO.48.006811), but
+        not nearer to 180 degrees (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where the
+        function has no peak of its own in the last 10 degrees.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class PowerLawTable:
         backward = s > 0.5
         peak = np.exp(-(1 - s) / np.sin(_PEAK_WIDTH / 2) ** 2)
         ratio = self.backscatter_ratio
-        # The fraction of the backscattering that has the shape of the peak.
+        # The fraction of the backscattering that has the peak's shape.
         in_peak, behind = (float(np.sum(_segments(p, self.log_s0)[backward[:-1]])) for p in (old * peak, old))
         in_peak /= behind
         wanted = ratio / (2 * np.pi * positive("chi", chi)) / old[-1]
@@ -188,7 +188,7 @@ class PowerLawTable:
 
     @property
     def step(self) -> float:
-        """Spacing of the nodes in ln s."""
+        """Node spacing in ln s."""
         return -self.log_s0 / (self.count - 1)
 
     @property
@@ -238,7 +238,7 @@ class PowerLawTable:
 
 
 def _segments(p: FloatArray, log_s0: float) -> FloatArray:
-    """Return the integral of a phase function, a power of s between nodes uniform in ln s, over each segment."""
+    """Return the integral over each segment of a phase function, a power of s between nodes uniform in ln s."""
     step = -log_s0 / (p.size - 1)
     s = np.exp(log_s0 + step * np.arange(p.size - 1))
     return np.asarray(4 * np.pi * p[:-1] * s * step * _growth(step + np.diff(np.log(p))))

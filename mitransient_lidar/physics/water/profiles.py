@@ -26,10 +26,10 @@ COEFFICIENT_FLOOR = 1e-4
 """Attenuation and scattering [1/m] below which tolerances are absolute; pure sea water scatters 20 times as much."""
 
 BACKSCATTERING_FLOOR = 1e-6
-"""Backscattering [1/m] below which tolerances are absolute; that of pure sea water is 1000 times as large."""
+"""Backscattering [1/m] below which tolerances are absolute; pure sea water has 1000 times as much."""
 
 THINNEST_LAYER = 1e-6
-"""Least thickness of a layer [m], in steep profiles."""
+"""Least layer thickness [m], in steep profiles."""
 
 _PROPERTIES = ("a", "b", "c", "omega")
 
@@ -54,7 +54,7 @@ _COLUMNS = (
     ),
 )
 
-#: First words of other columns in the files of probes.
+#: First words of other columns in probe files.
 _OTHER_QUANTITIES = frozenset(
     {
         *("time", "date", "datetime", "timestamp", "hour", "station", "cast", "record", "scan", "index", "flag"),
@@ -108,7 +108,7 @@ class Profile:
             values = finite_array(name, getattr(self, name))
             if values.ndim != 1 or values.size < 2 or values.size != np.size(self.depth):
                 raise UserError(
-                    f"{name} of shape {values.shape} must be a list of one value per depth, of 2 depths or more."
+                    f"{name} of shape {values.shape} must be a list of one value per depth, of 2 depths or more"
                 )
             _require(values >= 0, name + " = {:g} must not be negative", values)
             values.flags.writeable = False
@@ -128,8 +128,8 @@ class Profile:
         """Divide the profile into layers with mean properties.
 
         From the surface down every layer is as thick as the tolerance allows, also across nodes. For properties that
-        change monotonically this gives the least number of layers, ln(q_2/q_1) / ln(1 + 2 tolerance) for one that goes
-        from q_1 to q_2; for others a few percent more.
+        change monotonically this gives the least number of layers: ln(q_2/q_1) / ln(1 + 2 tolerance) from q_1 to q_2.
+        Other properties need a few percent more.
 
         Parameters
         ----------
@@ -140,10 +140,11 @@ class Profile:
         -------
         WaterColumn
             At every depth attenuation, scattering and backscattering each deviate from the profile by at most
-            `tolerance` times the profile's value there, or times `COEFFICIENT_FLOOR` (`BACKSCATTERING_FLOOR`) if that
-            is larger, except in layers of the least thickness `THINNEST_LAYER`. Vertical optical depths from z = 0 are
-            exact at the edges; within a layer they deviate by at most `tolerance`/2 of that layer's own optical depth.
-            The last layer, which has no lower edge, begins where the profile becomes constant.
+            `tolerance` times the profile's value there. Where `COEFFICIENT_FLOOR` (`BACKSCATTERING_FLOOR`) is larger,
+            it replaces this value. Layers with the least thickness `THINNEST_LAYER` are exceptions. Vertical optical
+            depths from z = 0 are exact at the edges; within a layer they deviate by at most `tolerance`/2 times the
+            layer's own optical depth. The last layer, which has no lower edge, begins where the profile becomes
+            constant.
         """
         tolerance = in_range("tolerance", tolerance, 1e-5, 0.5)
         z, (a, b, bb) = self._varying_part()
@@ -209,7 +210,7 @@ class _LayerProperty:
 
 
 def _layer_tops(z: list[float], properties: list[_LayerProperty]) -> list[float]:
-    """Return the upper edges of the layers from z[0] to z[-1], and of the last one at z[-1]."""
+    """Return the layers' upper edges from z[0] to z[-1], with the last one at z[-1]."""
     layer_tops = []
     start, segment = z[0], 0
     while start < z[-1]:
@@ -261,9 +262,9 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     Parameters
     ----------
     path : path
-        ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `text_tables.read_table` reads, or ``.nc``, NetCDF-4
-        with variables over the dimension ``depth`` or ``z``, whose attributes ``units`` and ``positive`` are read.
-        Names of columns, in any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
+        ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `text_tables.read_table` reads, or ``.nc``, NetCDF-4 with
+        variables over the dimension ``depth`` or ``z``, whose attributes ``units`` and ``positive`` are read. Column
+        names, in any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
 
         ``depth`` or ``z``
             depth [m], at least 0; z may also be the height, at most 0;
@@ -273,9 +274,9 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
         ``bb`` or ``bb_ratio``
             backscattering [1/m], at most b, or its ratio to b, 0 to 1. Default: the ratio 0.0183.
 
-        Rows are sorted by depth, and those of one depth are averaged. Rows with missing values are left out; of
-        coefficients, -99, -999, -9999 and -99999 count as missing. The log tells of all this. Columns of other
-        quantities that a probe measures, such as temperature or time, are not used; all others are rejected as possible
+        Rows are sorted by depth, and rows at one depth are averaged. Rows with missing values are left out; in
+        coefficients, -99, -999, -9999 and -99999 count as missing. The log reports all this. Other quantities that a
+        probe measures, such as temperature or time, are not used; all other columns are rejected as possible
         misspellings.
     wavelength_nm : float, optional
         Which wavelength [nm] to read from a file with several. Columns without wavelength belong to all.
@@ -288,7 +289,7 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     Raises
     ------
     UserError
-        If the file is missing, damaged or of another format; names or units are unknown, missing or repeated; a value
+        If the file is missing, damaged or in another format; names or units are unknown, missing or repeated; a value
         is not a number within its range, or contradicts the others; or there are fewer than 2 depths. The message names
         the line, or the index along the dimension.
     """
@@ -298,9 +299,9 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
     try:
         columns = _in_order(path, _checked(path, columns))
     except _RowError as error:
-        raise UserError(f"{path}, {places[error.row]}: {error.text}.") from None
+        raise UserError(f"{path}, {places[error.row]}: {error.text}") from None
     if columns["depth"].size < 2:
-        raise UserError(f"{path} has {columns['depth'].size} depths but a profile must have at least 2.")
+        raise UserError(f"{path} has {columns['depth'].size} depths but a profile must have at least 2")
     return Profile(**columns)
 
 
@@ -322,7 +323,7 @@ def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, lis
     for (name, item), heading in zip(profiles.items(), headings, strict=True):
         if heading is not None:
             if item.values.dtype.kind not in "iuf":
-                raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers.")
+                raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers")
             column, values = heading.column.name, item.values.astype(np.float64) * heading.factor
             if (direction := str(item.attrs.get("positive", "")).lower()) in ("up", "down"):
                 column, values = "depth", values if direction == "down" else -values
@@ -337,10 +338,10 @@ def _check_names(path: Path, names: list[str]) -> None:
     """Reject missing and contradictory columns."""
     if ("depth" in names) == ("z" in names) or sum(name in _PROPERTIES for name in names) < 2:
         raise UserError(
-            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth or z and two of a, b, c, omega."
+            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth or z and two of a, b, c, omega"
         )
     if "bb" in names and "bb_ratio" in names:
-        raise UserError(f"{path} has the columns bb and bb_ratio, but must have only one of them.")
+        raise UserError(f"{path} has the columns bb and bb_ratio, but must have only one of them")
 
 
 def _checked(path: Path, columns: _Columns) -> _Columns:

@@ -16,7 +16,7 @@ WAVELENGTH_RANGE = (400.0, 1100.0)
 """Wavelengths [nm] of all formulas and tables in this module."""
 
 VISIBLE_RANGE = (400.0, 700.0)
-"""Wavelengths [nm] of Quan and Fry's index; beyond it pure water has the index of Daimon and Masumura."""
+"""Wavelengths [nm] of Quan and Fry's index; beyond it pure water has Daimon and Masumura's index."""
 
 _TEMPERATURE_RANGE = (0.0, 30.0)  # degrees C
 _SALINITY_RANGE = (0.0, 40.0)  # per mille; the index was fitted up to 35 and is extrapolated linearly
@@ -26,7 +26,8 @@ DEPOLARISATION = 0.039
 
 _MOLAR_MASS = 0.018  # of water, kg/mol
 
-#: Strengths and squares of the resonances [um^2] of pure water at 20 degrees C (Daimon and Masumura 2007, Table 2).
+#: Strengths and squared wavelengths of the resonances [um^2] of pure water at 20 degrees C (Daimon and Masumura 2007,
+#: Table 2).
 _RESONANCES = (
     (5.684027565e-1, 5.101829712e-3),
     (1.726177391e-1, 1.821153936e-2),
@@ -52,16 +53,16 @@ def refractive_index(
     Returns
     -------
     ndarray
-        Index [1], of the broadcast shape.
+        Index [1], in the broadcast shape.
 
     Notes
     -----
-    Up to 700 nm Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. Beyond, their formula is not
-    valid: at 1064 nm its index of pure water is 0.001 too high, and its group index 0.005 too low. There pure water at
-    20 degrees C has the index of Daimon and Masumura (2007), Appl. Opt. 46, 3811, doi:10.1364/AO.46.003811, which is
-    valid to 1129 nm, over that of air (Ciddor 1996). The change with temperature and salinity, 0.006 for sea water, is
-    that of Quan and Fry's formula, extrapolated. At 700 nm the index of both differs by 4e-5, the group index by 2e-4.
-    The index relative to air determines refraction at the surface; the simulator uses the index 1 for air.
+    Up to 700 nm Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. Beyond, their formula is not valid:
+    at 1064 nm its index for pure water is 0.001 too high, and its group index 0.005 too low. There pure water at 20
+    degrees C has Daimon and Masumura's index (2007), Appl. Opt. 46, 3811, doi:10.1364/AO.46.003811, valid to 1129 nm,
+    divided by the index of air (Ciddor 1996). The change with temperature and salinity, 0.006 for sea water,
+    extrapolates Quan and Fry's formula. At 700 nm the two indices differ by 4e-5, the group indices by 2e-4. The index
+    relative to air determines refraction at the surface; the simulator uses the index 1 for air.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     visible = _quan_fry(lam, t, s)
@@ -81,7 +82,7 @@ def group_index(
     Returns
     -------
     ndarray
-        n - wavelength dn/dwavelength [1], of the broadcast shape, with the derivative of the same formulas. Travel
+        n - wavelength dn/dwavelength [1], in the broadcast shape, with the derivative of the same formulas. Travel
         times are too short by 0.03 % in all media alike, since air has the index 1 here.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
@@ -108,11 +109,11 @@ def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
 
     Notes
     -----
-    Up to 700 nm Table 3 of Pope and Fry (1997), Appl. Opt. 36, 8710, doi:10.1364/AO.36.008710, measured at 22 degrees
+    Up to 700 nm Table 3 in Pope and Fry (1997), Appl. Opt. 36, 8710, doi:10.1364/AO.36.008710, measured at 22 degrees
     C. From 705 nm Kou, Labrie and Chylek (1993), Appl. Opt. 32, 3531, doi:10.1364/AO.32.003531: 14.4 1/m at 1064 nm,
-    like Kedenburg et al. (2012), doi:10.1364/OME.2.001588; the compilation of Segelstein (1981) has 15.1 1/m. At 700 nm
-    Kou's value is 7 % above that of Pope and Fry. The table of Hale and Querry (1973) has no values between 1000 and
-    1200 nm: a line between these would give 61 1/m at 1064 nm.
+    like Kedenburg et al. (2012), doi:10.1364/OME.2.001588; Segelstein's compilation (1981) has 15.1 1/m. At 700 nm
+    Kou's value is 7 % above Pope and Fry's. Hale and Querry's table (1973) has no values between 1000 and 1200 nm: a
+    line between these would give 61 1/m at 1064 nm.
     """
     nodes, values = read_columns("water_absorption.csv")
     return np.asarray(np.interp(_within("wavelength_nm", wavelength_nm, WAVELENGTH_RANGE), nodes, values))
@@ -142,9 +143,9 @@ def water_scattering(
 
     Notes
     -----
-    Zhang, Hu and He (2009), Opt. Express 17, 5698, doi:10.1364/OE.17.005698: fluctuations of density and of salt
-    concentration, with the equation of state of UNESCO (1981) and the `refractive_index` relative to vacuum. Beyond 700
-    nm no measurements confirm it; 1.1e-4 1/m at 1064 nm does not matter beside the absorption.
+    Zhang, Hu and He (2009), Opt. Express 17, 5698, doi:10.1364/OE.17.005698: density and salt concentration
+    fluctuations, with UNESCO's equation of state (1981) and the `refractive_index` relative to vacuum. Beyond 700 nm no
+    measurements confirm it; 1.1e-4 1/m at 1064 nm does not matter beside the absorption.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     delta = in_range("depolarisation", depolarisation, 0, 0.2)
@@ -174,7 +175,7 @@ def water_phase_function(theta: npt.ArrayLike, depolarisation: float = DEPOLARIS
     Returns
     -------
     ndarray
-        Phase function [1/sr], of the shape of `theta`.
+        Phase function [1/sr], in the shape of `theta`.
     """
     delta = in_range("depolarisation", depolarisation, 0, 0.2)
     p = (1 - delta) / (1 + delta)
@@ -201,7 +202,7 @@ def _within(name: str, values: npt.ArrayLike, limits: tuple[float, float]) -> Fl
 
 
 def _quan_fry(lam: FloatArray, t: FloatArray | float, s: FloatArray | float) -> FloatArray:
-    """Index of Quan and Fry (1995) relative to air."""
+    """Quan and Fry's index (1995) relative to air."""
     by_salinity = (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2 + 0.01155 / lam) * s
     by_colour = (15.868 - 0.00423 * t) / lam - 4382 / lam**2 + 1.1455e6 / lam**3
     return np.asarray(1.31405 - 2.02e-6 * t**2 + by_salinity + by_colour)
@@ -245,7 +246,7 @@ def _density(t: FloatArray, s: FloatArray) -> FloatArray:
 
 
 def _activity_slope(t: FloatArray, s: FloatArray) -> FloatArray:
-    """Return the derivative of the logarithm of water's activity with respect to salinity (Millero and Leung 1976)."""
+    """Return the derivative of the logarithmic water activity with respect to salinity (Millero and Leung 1976)."""
     slope = _polynomial(t, -5.58651e-4, 2.40452e-7, -3.12165e-9, 2.40808e-11)
     slope = slope + 1.5 * _polynomial(t, 1.79613e-5, -9.9422e-8, 2.08919e-9, -1.39872e-11) * np.sqrt(s)
     return np.asarray(slope + 2 * _polynomial(t, -2.31065e-6, -1.37674e-9, -1.93316e-11) * s)

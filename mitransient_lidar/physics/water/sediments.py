@@ -1,7 +1,7 @@
-"""Reflection by sediment: reflectance of bottoms by name, and the model of Hapke, with opposition effect and two lobes.
+"""Reflection by sediment: bottom reflectance by name, and Hapke's model, with opposition effect and two lobes.
 
-A layer of particles of the single-scattering albedo w reflects, at the phase angle g between the directions to source
-and receiver, whose cosines with the normal are mu_i and mu_o,
+A particle layer with the single-scattering albedo w reflects, at the phase angle g between the directions to source and
+receiver, whose cosines with the normal are mu_i and mu_o,
 
     f = w / (4 pi (mu_i + mu_o)) ([1 + B(g)] p(g) + H(mu_i) H(mu_o) - 1)   [1/sr].
 
@@ -22,14 +22,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, is_number, shown
 from mitransient_lidar.physics.water.data_tables import read_columns
 
-#: Bottoms and land in the order of the columns of their tables.
+#: Bottoms and land in the order of their table columns.
 _TABLES = {
     "bottom_reflectance.csv": ("coral_sand", "green_algae", "brown_algae", "red_algae"),
     "land_reflectance.csv": ("sand", "wet_sand", "asphalt", "concrete", "basalt", "limestone", "grass", "rush"),
 }
 BOTTOMS = tuple(name for names in _TABLES.values() for name in names)
 
-#: Halvings of the range of albedos that leave the rounding error.
+#: Halvings of the albedo range that leave the rounding error.
 _BISECTIONS = 52
 
 #: Incidences at which energy is checked [deg]: the reflectance grows towards the horizon.
@@ -38,7 +38,7 @@ _CHECKED_DEG = (0.0, 45.0, 70.0, 80.0, 88.0)
 
 @dataclass(frozen=True)
 class HapkeSurface(Checked):
-    """Reflection by a layer of particles.
+    """Reflection by a particle layer.
 
     Raises
     ------
@@ -47,9 +47,9 @@ class HapkeSurface(Checked):
     """
 
     albedo: float = checked(in_range, 0, 1)  #: Single-scattering albedo w of the particles, 0 to 1.
-    #: Asymmetry b of both lobes of the particles' phase function, 0 to 0.9.
+    #: Asymmetry b of both lobes in the particles' phase function, 0 to 0.9.
     lobe_asymmetry: float = checked(in_range, 0, 0.9, default=0.0)
-    #: Share of the lobe towards the source, 0 to 1: (1 + c)/2 with the c of Hapke.
+    #: Share of the lobe towards the source, 0 to 1: (1 + c)/2 with Hapke's c.
     backward_share: float = checked(in_range, 0, 1, default=0.5)
     #: Opposition effect B0, 0 to 3; above 1 shadows alone do not explain it.
     opposition_amplitude: float = checked(in_range, 0, 3, default=1.0)
@@ -85,7 +85,7 @@ class HapkeSurface(Checked):
         return np.asarray(self.albedo / (4 * np.pi * (mu_i + mu_o)) * (once + often))
 
     def reflectance(self, cos_in: float = 1.0) -> float:
-        """Return the share of light that is reflected into the hemisphere, at a cosine of incidence above 0 to 1."""
+        """Return the share of light that is reflected into the hemisphere, at an incidence cosine above 0 to 1."""
         # About the direction of the source, where the opposition effect peaks; azimuths from its plane.
         end, weights = _gauss_legendre(96)
         azimuth, azimuth_weights = _gauss_legendre(48)
@@ -146,7 +146,7 @@ def _gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -> float:
-    """Return the reflectance of a bottom given as a number or by its name.
+    """Return a bottom's reflectance given as a number or by name.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
     value
         Number from 0 to 1, or its text, or one of `BOTTOMS`.
     wavelength_nm
-        Wavelength of a bottom by name [nm], 400 to 700 of coral sand and algae, 400 to 1100 of the others.
+        Wavelength for a bottom by name [nm], 400 to 700 for coral sand and algae, 400 to 1100 for the others.
 
     Returns
     -------
@@ -169,12 +169,12 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
 
     Notes
     -----
-    Reflectance of irradiance by clean coral sand, the green alga Boodlea, brown algae (mean of Turbinaria and
-    Sargassum) and red algae (mean of Porolithon and Corallinaceae), from figure 6 of Maritorena, Morel and Gentili
-    (1994), Limnol. Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Dry and wet sand of one beach, an old road of
-    asphalt, a light grey one of concrete, weathered basalt, limestone, lawn grass and green salt-marsh rush: Kokaly et
-    al. (2017), USGS Spectral Library Version 7, doi:10.3133/ds1035, measured in air. Single samples: other sands and
-    plants differ by factors.
+    Irradiance reflectance of clean coral sand, the green alga Boodlea, brown algae (mean of Turbinaria and Sargassum)
+    and red algae (mean of Porolithon and Corallinaceae), from figure 6 in Maritorena, Morel and Gentili (1994), Limnol.
+    Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Dry and wet sand from one beach, an old asphalt road, a light
+    grey concrete road, weathered basalt, limestone, lawn grass and green salt-marsh rush: Kokaly et al. (2017), USGS
+    Spectral Library Version 7, doi:10.3133/ds1035, measured in air. Single samples: other sands and plants differ by
+    factors.
     """
     if not isinstance(value, str) or is_number(value):
         return in_range(name, value, 0.0, 1.0)

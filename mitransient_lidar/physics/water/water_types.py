@@ -1,8 +1,8 @@
 """Absorption, scattering and backscattering of water given by type, chlorophyll, Kd or Secchi depth.
 
-These are rough estimates: waters of the same Kd differ in scattering by a factor of 2, which changes the column signal
-of a lidar. Scattering is that of molecules and of particles with a Fournier-Forand function. `pure_seawater` is valid
-from 400 to 1100 nm, `chlorophyll` from 400 to 700 nm, the others at 532 nm; `near_infrared` takes them beyond 700 nm.
+These are rough estimates: waters with the same Kd differ in scattering by a factor of 2, which changes a lidar's column
+signal. Scattering is by molecules and by particles with a Fournier-Forand function. `pure_seawater` is valid from 400
+to 1100 nm, `chlorophyll` from 400 to 700 nm, the others at 532 nm; `near_infrared` takes them beyond 700 nm.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mitransient_lidar.physics.water.seawater import (
     water_scattering,
 )
 
-_CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, of the Case 1 model
-_SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than that of pure water
+_CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, in the Case 1 model
+_SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than pure water has
 
 PETZOLD_BACKSCATTER_RATIO = 0.0183
 """bb/b of Petzold's average particle (Mobley et al. 1993)."""
@@ -115,12 +115,12 @@ class InherentProperties:
     def kd(self) -> float:
         """Diffuse attenuation coefficient of downwelling irradiance [1/m], with the sun at the zenith and no waves.
 
-        The mean down to the depth of a tenth of the irradiance just below the surface:
-        Kd^2 = a^2 + 4.10 a^0.934 bb_p^0.849 b_p^0.217 + 1.6 a b_w, of particles p with Fournier-Forand functions and
-        molecules w. It fits a Monte Carlo (``oracles/diffuse_attenuation.py`` of the tests) with an error of 0.2 % rms
-        and 0.6 % at most for b/a of 0.5 to 16 and bb_p/b_p of 0.003 to 0.05. The formula of Lee, Du and Arnone (2005),
-        J. Geophys. Res. 110, C02016, doi:10.1029/2004JC002275, gives 0 to 2 % more in Jerlov's types I to 3C, and 4 to
-        7 % more in 5C to 9C.
+        The mean down to the depth of a tenth of the irradiance just below the surface: Kd^2 = a^2 + 4.10 a^0.934
+        bb_p^0.849 b_p^0.217 + 1.6 a b_w. The particles p have Fournier-Forand functions, and w are molecules. It fits a
+        Monte Carlo (``oracles/diffuse_attenuation.py`` in the tests) with an error of 0.2 % rms and 0.6 % at most for
+        b/a from 0.5 to 16 and bb_p/b_p from 0.003 to 0.05. The formula by Lee, Du and Arnone (2005), J. Geophys. Res.
+        110, C02016, doi:10.1029/2004JC002275, gives 0 to 2 % more in Jerlov's types I to 3C, and 4 to 7 % more in 5C to
+        9C.
         """
         return _diffuse_attenuation(self.absorption, self.scattering, self.backscattering, self.water_scattering)
 
@@ -140,12 +140,12 @@ def pure_seawater(
 
 
 def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
-    """Water of one of Jerlov's optical types at 532 nm, with Jerlov's Kd.
+    """Water with one of Jerlov's optical types at 532 nm, with Jerlov's Kd.
 
     Parameters
     ----------
     water_type : str
-        I, IA, IB, II or III of the open ocean, 1C, 3C, 5C, 7C or 9C of the coast.
+        I, IA, IB, II or III in the open ocean, 1C, 3C, 5C, 7C or 9C at the coast.
     wavelength_nm : float
         Wavelength [nm], 531 to 533: the table is for 532 nm only.
 
@@ -156,16 +156,16 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
 
     Notes
     -----
-    Kd: Jerlov (1976), Marine Optics, Table XXVII. Scattering of IB to 5C: measurements compiled by Williamson and
-    Hollins (2022), Appl. Opt. 61, 9951; of 7C and 9C: Solonenko and Mobley (2015), Appl. Opt. 54, 5392,
-    doi:10.1364/AO.54.005392, who derived it from Kd. No source gives the backscattering: the bb/b of particles is 0.010
-    in types IB to III, as Westberry et al. (2010), Opt. Express 18, 15419, doi:10.1364/OE.18.015419, measured in the
-    open ocean, with a scatter of 0.002, and that of Petzold's average particle, 0.0183, at the coast. Absorption then
-    follows from Kd (`InherentProperties.kd`). Types I and IA are `chlorophyll` of the same Kd.
+    Kd: Jerlov (1976), Marine Optics, Table XXVII. Scattering in IB to 5C: measurements compiled by Williamson and
+    Hollins (2022), Appl. Opt. 61, 9951; in 7C and 9C: Solonenko and Mobley (2015), Appl. Opt. 54, 5392,
+    doi:10.1364/AO.54.005392, who derived it from Kd. No source gives the backscattering. In types IB to III the
+    particles' bb/b is 0.010, as Westberry et al. (2010), Opt. Express 18, 15419, doi:10.1364/OE.18.015419, measured in
+    the open ocean, with a scatter of 0.002. At the coast it is 0.0183, as for Petzold's average particle. Absorption
+    then follows from Kd (`InherentProperties.kd`). Types I and IA are `chlorophyll` with the same Kd.
 
-    Uncertainties are 20 to 30 % of b, 30 % of bb in the ocean and 50 % at the coast, and 3 to 15 % of a. Williamson and
-    Hollins give less absorption in all types but IB: by 13 % (II), 22 % (III), 3 % (1C), 16 % (3C) and 26 % (5C). With
-    it, Jerlov's Kd would take particles of bb/b 0.028, 0.041, 0.021, 0.035 and 0.043.
+    Uncertainties are 20 to 30 % for b, 30 % for bb in the ocean and 50 % at the coast, and 3 to 15 % for a. Williamson
+    and Hollins give less absorption in all types but IB: by 13 % (II), 22 % (III), 3 % (1C), 16 % (3C) and 26 % (5C).
+    With it, Jerlov's Kd would need particles with bb/b 0.028, 0.041, 0.021, 0.035 and 0.043.
     """
     if water_type not in _JERLOV:
         raise UserError(f"water_type = {water_type!r} must be one of {', '.join(_JERLOV)}")
@@ -198,11 +198,11 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
 
     Notes
     -----
-    Diffuse attenuation: Kd = aw + bw/2 + chi C^e of Morel and Maritorena (2001), J. Geophys. Res. 106, 7163,
-    doi:10.1029/2000JC000319. Particles: b_p = 0.416 C^0.766 (wavelength/550)^v of Loisel and Morel (1998), Limnol.
+    Diffuse attenuation: Kd = aw + bw/2 + chi C^e by Morel and Maritorena (2001), J. Geophys. Res. 106, 7163,
+    doi:10.1029/2000JC000319. Particles: b_p = 0.416 C^0.766 (wavelength/550)^v by Loisel and Morel (1998), Limnol.
     Oceanogr. 43, 847, doi:10.4319/lo.1998.43.5.0847, with v = (lg C - 0.3)/2 below 2 mg/m^3 and 0 above, and
-    bb_p/b_p(550 nm) = 0.002 + 0.01 (0.5 - 0.25 lg C) (wavelength/550)^v of the former paper. Absorption: from this Kd
-    (`InherentProperties.kd`). Water: `pure_seawater` at 20 degrees C. In real waters of one C, b varies by a factor
+    bb_p/b_p(550 nm) = 0.002 + 0.01 (0.5 - 0.25 lg C) (wavelength/550)^v from the former paper. Absorption: from this Kd
+    (`InherentProperties.kd`). Water: `pure_seawater` at 20 degrees C. In real waters with one C, b varies by a factor
     of 2.
     """
     c = in_range("concentration", concentration, *_CHLOROPHYLL_RANGE)
@@ -221,7 +221,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
 
 
 def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentProperties:
-    """Return a water of 532 nm at a wavelength in the near infrared.
+    """Return a 532 nm water at a wavelength in the near infrared.
 
     Parameters
     ----------
@@ -232,11 +232,11 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
 
     Notes
     -----
-    Absorption is that of `water_absorption`, at least 0.62 1/m, and of what the water at 532 nm absorbs beyond pure
-    water, times exp(-0.014 (wavelength - 532)), as dissolved matter does (Bricaud, Morel and Prieur 1981, Limnol.
-    Oceanogr. 26, 43, doi:10.4319/lo.1981.26.1.0043); at 1064 nm a ten thousandth of it is left. Scattering and
-    backscattering by particles are proportional to 1/wavelength (Gordon and Morel 1983); exponents of real waters lie
-    between 0 and 2. At 1064 nm this scattering is a hundredth of the attenuation.
+    The absorption has two parts. `water_absorption` gives at least 0.62 1/m. The excess over pure water at 532 nm
+    decreases by exp(-0.014 (wavelength - 532)), as for dissolved matter (Bricaud, Morel and Prieur 1981, Limnol.
+    Oceanogr. 26, 43, doi:10.4319/lo.1981.26.1.0043); a ten thousandth is left at 1064 nm. Scattering and backscattering
+    by particles are proportional to 1/wavelength (Gordon and Morel 1983); exponents in real waters lie between 0 and 2.
+    At 1064 nm this scattering is a hundredth of the attenuation.
     """
     lam = in_range("wavelength_nm", wavelength_nm, VISIBLE_RANGE[1], WAVELENGTH_RANGE[1])
     ratio, pure, molecules = 532.0 / lam, pure_seawater(), green.water_scattering
@@ -252,10 +252,10 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
 
 
 def default_water(wavelength_nm: float) -> dict[str, float]:
-    """Return what a medium has by default at a wavelength [nm] that is not green.
+    """Return a medium's defaults at a wavelength [nm] that is not green.
 
-    These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm, and above 700 nm ``attenuation``,
-    ``scattering`` and ``backscattering`` [1/m] of the default water of 532 nm (`near_infrared`).
+    These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm. Above 700 nm they include
+    ``attenuation``, ``scattering`` and ``backscattering`` [1/m] of the default 532 nm water (`near_infrared`).
     """
     found = {"refractive_index": refractive_index(wavelength_nm), "group_index": group_index(wavelength_nm)}
     if wavelength_nm > VISIBLE_RANGE[1]:
@@ -275,9 +275,9 @@ def from_kd(kd: float) -> InherentProperties:
 
     Notes
     -----
-    Albedo and bb/b are linear in ln Kd between those of `jerlov`, so that Kd = 0.0796 gives jerlov("II"). Absorption
-    follows from `InherentProperties.kd`. Its error is about 15 %, that of scattering a factor of 2: at
-    Kd = 0.08 the two sources of `jerlov` have 0.18 and 0.38 1/m.
+    Albedo and bb/b are linear in ln Kd between the `jerlov` values, so that Kd = 0.0796 gives jerlov("II"). Absorption
+    follows from `InherentProperties.kd`. It has an error of about 15 %, and scattering a factor of 2: at Kd = 0.08 the
+    two sources of `jerlov` have 0.18 and 0.38 1/m.
     """
     waters = [jerlov(name) for name in _JERLOV]
     table = [kd for kd, _ in _JERLOV.values()]
@@ -309,11 +309,11 @@ def from_secchi(depth: float) -> InherentProperties:
 
     Notes
     -----
-    Kd = 1.7/z of Poole and Atkins (1929), J. Mar. Biol. Assoc. 16, 297, and c + Kd = 8.7/z of Tyler (1968), Limnol.
-    Oceanogr. 13, 1, doi:10.4319/lo.1968.13.1.0001; absorption then follows from `InherentProperties.kd`.
-    In turbid coastal water Holmes (1970), Limnol. Oceanogr. 15, 688, found 1.44 and 9.42; the first constant was 1.2 to
-    3 in single waters. The error of the attenuation is about 20 %, that of Kd and absorption about 40 %. The eye is
-    assumed to see deepest at 532 nm.
+    Kd = 1.7/z by Poole and Atkins (1929), J. Mar. Biol. Assoc. 16, 297, and c + Kd = 8.7/z by Tyler (1968), Limnol.
+    Oceanogr. 13, 1, doi:10.4319/lo.1968.13.1.0001; absorption then follows from `InherentProperties.kd`. In turbid
+    coastal water Holmes (1970), Limnol. Oceanogr. 15, 688, found 1.44 and 9.42; the first constant was 1.2 to 3 in
+    single waters. The attenuation has an error of about 20 %, Kd and absorption about 40 %. The eye is assumed to see
+    deepest at 532 nm.
     """
     z = in_range("depth", depth, *_SECCHI_RANGE)
     kd = 1.7 / z
@@ -330,7 +330,7 @@ def from_secchi(depth: float) -> InherentProperties:
 def water_of(
     kind: str, value: str | None, wavelength_nm: float = 532.0, temperature: float = 20.0, salinity: float = 35.0
 ) -> InherentProperties:
-    """Return the inherent optical properties of a water.
+    """Return a water's inherent optical properties.
 
     Parameters
     ----------
@@ -340,8 +340,8 @@ def water_of(
         Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
         ``coastal`` or ``turbid``; None for pure sea water.
     wavelength_nm, temperature, salinity
-        Wavelength [nm], temperature [deg C] and salinity [per mille]. Above 700 nm a water with particles is that at
-        532 nm, taken there by `near_infrared`.
+        Wavelength [nm], temperature [deg C] and salinity [per mille]. Above 700 nm, `near_infrared` takes a water with
+        particles there from 532 nm.
 
     Raises
     ------
@@ -396,7 +396,7 @@ def _case1_terms(lam: float) -> tuple[float, float, float]:
 
 
 def _diffuse_attenuation(absorption: float, scattering: float, backscattering: float, water_scattering: float) -> float:
-    """Return Kd by the formula of `InherentProperties.kd` [1/m]."""
+    """Return Kd by the formula in `InherentProperties.kd` [1/m]."""
     b_p, bb_p = max(scattering - water_scattering, 0.0), max(backscattering - water_scattering / 2, 0.0)
     by_particles = 4.10 * absorption**0.934 * bb_p**0.849 * b_p**0.217
     return float(np.sqrt(absorption**2 + by_particles + 1.6 * absorption * water_scattering))

@@ -1,9 +1,9 @@
 """Self-contained HTML page that shows a gate stack or waveforms, without network or installation.
 
-The page shows the image of a gate, steps and plays through the gates, maps depths, and plots the records of selected
-pixels. Of waveforms, the time bins take the place of the gates. Its parts are ``page.html``, ``page.css`` and the
-``.js`` files. The arrays are embedded as base64 of raw deflate data of little-endian float32 numbers: the first bytes
-of all numbers, then the second ones, ...
+The page shows a gate image, steps and plays through the gates, maps depths, and plots the records of selected pixels.
+For waveforms, time bins replace the gates. Its parts are ``page.html``, ``page.css`` and the ``.js`` files. The arrays
+are embedded as base64 from raw deflate data of little-endian float32 numbers: the first bytes of all numbers, then the
+second ones, ...
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _STRIP_ASPECT = 4.0  # at most, of pixels drawn side by side
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Encoded arrays of means over blocks of `factor` times `factor` pixels."""
+    """Encoded arrays with means over blocks of `factor` times `factor` pixels."""
 
     factor: int
     rows: int
@@ -59,27 +59,27 @@ class _Blocks:
 def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: float = 200.0) -> str:
     """Return the text of the HTML page that shows a gate stack or waveforms.
 
-    A page that would exceed `limit_mb` shows means over blocks of 2 by 2, 4 by 4, ... pixels, of the waveforms first,
-    and a note about it. Since pixels share photons, the error of such a mean is unknown; the page shows its upper
-    bound, the mean of the errors.
+    A page that would exceed `limit_mb` shows means over blocks of 2 by 2, 4 by 4, ... pixels, first for the waveforms,
+    and a note about it. Since pixels share photons, such a mean's error is unknown; the page shows its upper bound, the
+    mean of the errors.
 
     Parameters
     ----------
     stack : xarray.Dataset
-        A result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time), of which
-        the map shows one time bin; of a series of shots, the page shows the mean. Pixels with outlines
+        A result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the map
+        shows one of its time bins. For a shot series, the page shows the mean. Pixels with outlines
         (``pixel_outlines``) have their shapes.
 
-        Or frames of a camera, of which the page shows the mean above the dark level, or a gate stack: ``gate_energy``
-        and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start``
-        and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of the surface echo is known,
-        ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along them, and those of gates and
-        times are on the receiver's axis.
+        Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
+        ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
+        ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth``
+        [m]. With a result's lines of sight, pixel depths are along them, and depths of gates and times are on the
+        receiver's axis.
     result : xarray.Dataset, optional
         A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms the
         record of a pixel is its energy in the gates.
     limit_mb : float
-        Largest size of the page [MB of 1e6 bytes], above 0.
+        Largest page size [MB of 1e6 bytes], above 0.
 
     Raises
     ------
@@ -113,20 +113,20 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
         "kind": "waveforms" if is_record else "gate stack",
         "data": "\n".join(_data_elements(metadata, gates, waveforms)),
     }
-    # Odd pieces of the frame are names of placeholders.
+    # Odd pieces of the frame are placeholder names.
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(frame))
 
 
 def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
-    """Return the result, if any, after checking that it has waveforms of the pixels of the stack."""
+    """Return the result, if any, after checking that its waveforms have the stack's pixels."""
     if result is None:
         return None
     if "waveform" not in result:
-        raise UserError("the result has no variable waveform.")
+        raise UserError("the result has no variable waveform")
     wanted = {name: size for name, size in stack["gate_energy"].sizes.items() if name != "gate"}
     found = {name: size for name, size in result["waveform"].sizes.items() if name != "time"}
     if found != wanted:
-        raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}.")
+        raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}")
     # A result without angles is in the order of the stack.
     known = {name: stack[name].variable for name in ("angle_x", "angle_y") if name not in result.coords}
     return drawing.as_seen(result.assign_coords(known))
@@ -137,7 +137,7 @@ def _fit(
 ) -> tuple[_Blocks, _Blocks | None]:
     """Return gates and waveforms in the smallest blocks that fit into `room` bytes, or None for the waveforms.
 
-    Of a record, the gates are its time bins, whose values are those of the waveforms.
+    For a record, the gates are its time bins, with the waveforms' values.
     """
     factors = [1]
     if "pixel" not in stack["gate_energy"].dims:
@@ -153,7 +153,7 @@ def _fit(
             break
     else:
         without = "" if is_record else ", even without waveforms"
-        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack{without}.")
+        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack{without}")
     if record is not None:
         for factor in factors[factors.index(gates.factor) :]:
             waveforms = _encode(record, _WAVEFORMS, factor)
@@ -206,7 +206,7 @@ def _base64(values: FloatArray) -> str:
 
 
 def _notes(gates: _Blocks, waveforms: _Blocks | None, has_record: bool, limit_mb: float) -> list[str]:
-    """Return one sentence for each reduction of the data."""
+    """Return one sentence for each data reduction."""
     reason = f"because the page would have exceeded {limit_mb:g} MB"
     means = "means over blocks of {0} by {0} pixels, with upper bounds of their errors, " + reason
     notes = []
@@ -258,26 +258,26 @@ def _metadata(
 
 
 def _quantity(record: xr.Dataset) -> dict[str, str]:
-    """Return name and unit of the waveforms of a record, the unit of counts empty."""
+    """Return name and unit of a record's waveforms, with an empty unit for counts."""
     about = record["waveform"].attrs
     unit = str(about.get("units", "W"))
     return {"name": str(about.get("long_name", "received power")), "unit": "" if unit == "1" else unit}
 
 
 def _words(record: xr.Dataset | None, gated: xr.Dataset) -> dict[str, Any]:
-    """Return names and units of what the page shows: values of gates, or those of a record in its time bins."""
+    """Return names and units of the values shown: gate values, or a record's in its time bins."""
     if record is None:
         about = gated["gate_energy"].attrs
         quantity = {"name": about["long_name"], "unit": about["units"]}
         return {"slice": "gate", "quantity": quantity, "sum": 1.0 if about["units"] == "J" else None}
     quantity = _quantity(record)
-    # The energy after a time is the sum of powers times the width of a bin.
+    # The energy after a time is the sum of powers times the bin width.
     total = 1e-9 * time_axis(record).bin_width_ns if quantity["unit"] == "W" else None
     return {"slice": "time bin", "quantity": quantity, "sum": total, "window": list(drawing.time_limits(record))}
 
 
 def _shapes(stack: xr.Dataset, gates: _Blocks) -> list[list[list[float]]] | None:
-    """Return the outlines of the pixels [mrad], lines angle_x, angle_y, angle_x, ... of each; None if unknown."""
+    """Return the pixel outlines [mrad], lines angle_x, angle_y, angle_x, ... for each; None if unknown."""
     if "pixel" not in stack.dims:
         return None
     lines = json.loads(stack.attrs.get("pixel_outlines", "[]"))
@@ -285,10 +285,10 @@ def _shapes(stack: xr.Dataset, gates: _Blocks) -> list[list[list[float]]] | None
 
 
 def _axes(stack: xr.Dataset, gates: _Blocks, shapes: list[list[list[float]]] | None) -> dict[str, float]:
-    """Return the left and upper edges of the image and the pitch of its blocks [mrad], or in pixels if no image.
+    """Return the image's left and upper edges and its block pitch [mrad], or in pixels if no image.
 
-    The pitch is the change of angle_x from a row to the one above it, and of angle_y from a column to the next one. The
-    image of shapes is as wide as all columns, and has one row.
+    The pitch is the change in angle_x from a row to the one above it, and in angle_y from a column to the next one. The
+    image with shapes is as wide as all columns, and has one row.
     """
     if shapes is not None:
         points = np.concatenate([np.reshape(line, (-1, 2)) for lines in shapes for line in lines])
@@ -316,7 +316,7 @@ def _colour_maps() -> dict[str, str]:
 
 
 def _attributes(stack: xr.Dataset) -> list[list[str]]:
-    """Return names and values of the attributes, without texts of the scene, its files, objects and outlines."""
+    """Return attribute names and values, without texts of the scene, its files, objects and outlines."""
     long = {"scene_xml", "scene_dict", "scene_files", "plugin_parameters"}
     long |= {"pixel_outlines", "beam_outlines", "target_outlines"}
     return [[str(name), _readable(value)] for name, value in stack.attrs.items() if name not in long]

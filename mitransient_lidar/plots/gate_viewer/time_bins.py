@@ -12,15 +12,15 @@ from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
 from mitransient_lidar.results.variables import described
 
-#: Variables with a record in time, and their errors; of a signal the standard deviation of one record.
+#: Variables with a record in time, and their errors; for a signal the standard deviation of one record.
 RECORDS = {"signal": "signal_deviation", "waveform": "waveform_stderr"}
 
 
 def one_record(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the record in time of every pixel as ``waveform`` and ``waveform_stderr``, in picture order.
+    """Return every pixel's record in time as ``waveform`` and ``waveform_stderr``, in picture order.
 
-    Of a series of shots it is the mean, with the standard error of the mean. The attribute ``units`` of the waveform is
-    W, V or 1, its ``long_name`` that of the variable shown.
+    For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
+    and its ``long_name`` belongs to the variable shown.
 
     Parameters
     ----------
@@ -55,10 +55,10 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def time_bins(record: xr.Dataset) -> xr.Dataset:
-    """Return the time bins of `one_record` with the coordinates of a gate stack: its starts, widths and depths.
+    """Return the time bins of `one_record` with a gate stack's coordinates: its starts, widths and depths.
 
-    Depths are those on the axis, NaN where the geometry is unknown; where it is known, ``surface_time`` and
-    ``depth_per_ns`` are the lines of sight of the pixels.
+    Depths are on the axis, NaN where the geometry is unknown; where it is known, ``surface_time`` and ``depth_per_ns``
+    are the pixels' lines of sight.
     """
     axis = time_axis(record)
     try:

@@ -1,1 +1,1 @@
-"""Figures and animations of gate stacks."""
+"""Figures and animations for gate stacks."""

@@ -1,4 +1,4 @@
-"""Depths of echoes in a gate stack."""
+"""Echo depths in a gate stack."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     stack = as_stack(dataset)
     depths = known_depths(stack)
     if depths is None:
-        raise UserError("the stack has no gate_depth, since the time of its surface echo is unknown.")
+        raise UserError("the stack has no gate_depth, since the time of its surface echo is unknown")
     used = ~reached_by_surface(stack) if from_depth is None else depths >= from_depth
     count = np.count_nonzero(used)
     if count < 3:
         place = "below the surface echo" if from_depth is None else f"below from_depth = {from_depth:g} m"
-        raise UserError(f"{count} of {depths.size} gates lie {place}, but a drawing of depths needs at least 3.")
+        raise UserError(f"{count} of {depths.size} gates lie {place}, but a drawing of depths needs at least 3")
     stack, depths = stack.isel(gate=used), depths[used]
     found = depth_image(stack, reach=_reach(stack))
     (_draw_pixel_depths if "pixel" in stack.dims else _draw_depth_image)(figure, stack, found)

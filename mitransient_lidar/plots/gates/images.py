@@ -1,4 +1,4 @@
-"""Contact sheet and animation of the gates of a stack, on one common scale of colours."""
+"""Contact sheet and animation for a stack's gates, on one common colour scale."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from mitransient_lidar.results.geometry import optional_number
 _LIT = 0.01  # share of the beam in a lit pixel, relative to the brightest
 SIGNIFICANT = 3.0  #: Standard errors above which a value counts.
 
-_BRIGHT = 99.0  # percentile of the pixels of a gate within the colours: a small bright target may be clipped
-_DECADES = 3.0  # of a logarithmic colour scale
+_BRIGHT = 99.0  # percentile of a gate's pixels within the colours: a small bright target may be clipped
+_DECADES = 3.0  # on a logarithmic colour scale
 _SHOWN_GATES = 36  # on a contact sheet
 _FRAMES_PER_SECOND = 8
 _FRAME_DPI = 100
-_LABEL_ROOM = 0.2  # inches, below the images of a contact sheet
+_LABEL_ROOM = 0.2  # inches, below the images on a contact sheet
 _PIXEL_DECADES = 5  # at most, on the logarithmic axis of a few pixels
 
 
 class ColourScale(NamedTuple):
-    """Common colours of all gates of a stack."""
+    """Common colours for all gates in a stack."""
 
-    factor: float  #: Energy of one unit [J].
-    unit: str  #: Name of the unit, such as "aJ".
+    factor: float  #: Energy per unit [J].
+    unit: str  #: Unit name, such as "aJ".
     norm: Normalize  #: From energies in that unit to colours.
-    label: str  #: Label of the colour bar, with the share of values above the brightest colour.
+    label: str  #: Colour bar label, with the share of values above the brightest colour.
     extend: Literal["neither", "min", "max", "both"]  #: Ends beyond which values lie.
 
     def draw(self, ax: Axes, energy: FloatArray, stack: xr.Dataset, *, label: bool = True) -> AxesImage:
@@ -62,13 +62,13 @@ class ColourScale(NamedTuple):
 
 
 def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: bool = False) -> Figure:
-    """Draw a contact sheet of gates on one common scale; of pixels without an image, their energy against depth.
+    """Draw a contact sheet of gates on one common scale; for pixels without an image, their energy against depth.
 
-    Of frames of a camera, their mean above the dark level is drawn (`results.gate_stack.as_stack`).
+    For camera frames, it draws their mean above the dark level (`results.gate_stack.as_stack`).
 
-    Of more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the surface
-    (at its 99th percentile), so that the surface echo does not darken the rest; the label of the colour bar gives the
-    share of brighter values. With `log` the scale of the colours, or the energy axis, is logarithmic.
+    From more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the
+    surface (at its 99th percentile), so that the surface echo does not darken the rest; the colour bar label gives the
+    share of brighter values. With `log` the colour scale, or the energy axis, is logarithmic.
 
     Raises
     ------
@@ -86,12 +86,12 @@ def check_animation(stack: xr.Dataset, path: Path) -> None:
     if "pixel" in stack.dims:
         raise UserError(
             f"cannot write {path}: an animation needs images, but this stack has {stack.sizes['pixel']} single pixels; "
-            "draw its contact sheet."
+            "draw its contact sheet"
         )
 
 
 def find_ffmpeg(path: Path) -> str:
-    """Return the ffmpeg that Matplotlib finds, or that of the extra ``movie``; raise `UserError` without both."""
+    """Return the ffmpeg that Matplotlib finds, or the one from the extra ``movie``; raise `UserError` without both."""
     if FFMpegWriter.isAvailable():
         return str(matplotlib.rcParams["animation.ffmpeg_path"])
     try:
@@ -101,14 +101,14 @@ def find_ffmpeg(path: Path) -> str:
     except (ImportError, RuntimeError):
         raise UserError(
             f"cannot write {path}: .mp4 needs the program ffmpeg, which pip install 'mitransient-lidar[movie]' brings; "
-            "choose .gif without it."
+            "choose .gif without it"
         ) from None
 
 
 def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
-    """Write an animation of a gate stack, one frame a gate, with the mean energy against depth.
+    """Write a gate stack animation, one frame per gate, with the mean energy against depth.
 
-    The colours are those of `plot_gates`. The file name ends in ``.gif`` or ``.mp4``.
+    The colours are as in `plot_gates`. The file name ends in ``.gif`` or ``.mp4``.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4.")
+        raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4")
     stack = as_stack(dataset)
     check_animation(stack, path)
     figure, show = _animated_figure(stack, log=log)
@@ -136,14 +136,14 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
                     show(index)
                     writer.grab_frame()
         except CalledProcessError as error:
-            raise UserError(f"cannot write {path}: ffmpeg ended with the error {error.returncode}.") from error
+            raise UserError(f"cannot write {path}: ffmpeg ended with the error {error.returncode}") from error
 
 
 def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
-    """Return the common colours of the gates of an imager.
+    """Return the common colours for an imager's gates.
 
-    They end at the largest of the 99th percentiles of the gates below the surface echo. If the time of that echo is
-    unknown, they end at the value that the 99th percentile exceeds in one gate of ten.
+    They end at the largest 99th percentile over the gates below the surface echo. If this echo's time is unknown, they
+    end at the value that the 99th percentile exceeds in one gate of ten.
     """
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     finite = np.where(np.isfinite(energy), energy, 0.0)
@@ -171,7 +171,7 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
 
 
 def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
-    """Return factor and name of the unit in which values of `as_stack` up to the largest one are drawn."""
+    """Return factor and name of the unit for drawing values of `as_stack` up to the largest one."""
     if (unit := stack["gate_energy"].attrs.get("units", "J")) != "J":
         return 1.0, str(unit)
     factor, prefix = drawing.si_prefix(largest)
@@ -193,7 +193,7 @@ def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
 
 
 def known_depths(stack: xr.Dataset) -> FloatArray | None:
-    """Return the depths of the middles of the gates [m], None if they are unknown."""
+    """Return the depths of the gates' middles [m], None if they are unknown."""
     if "gate_depth" not in stack.coords or not np.isfinite(stack["gate_depth"].values).all():
         return None
     return np.asarray(stack["gate_depth"].values, dtype=np.float64)

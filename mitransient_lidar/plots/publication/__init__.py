@@ -1,1 +1,1 @@
-"""Drawings of the figures of `studies.publication`."""
+"""Drawings for the figures in `studies.publication`."""

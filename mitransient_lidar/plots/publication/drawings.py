@@ -1,4 +1,4 @@
-"""Drawings of the geometry from the numbers of the scenes: figures 5, 6 and 8."""
+"""Geometry drawings from the numbers in the scenes: figures 5, 6 and 8."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, System, 
 
 _BEAM, _VIEW, _WATER, _BOTTOM = "#17963f", "#555555", "#3f8fc9", "#a8743a"
 
-#: Half side of the part of the sea that is drawn, and distance of the refracted axes [m].
+#: Half side of the drawn part of the sea, and distance between the refracted axes [m].
 _HALF_SIDE, _AXES_APART = 1.3, 0.25
 
 

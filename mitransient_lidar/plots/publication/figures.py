@@ -1,4 +1,4 @@
-"""All figures of the publication, and the table of its statements."""
+"""All figures in the publication, and the table of its statements."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mitransient_lidar.studies.publication.statements import Measured, Statement
 
 _LOG = logging.getLogger(__name__)
 
-#: File of the statements.
+#: File for the statements.
 TABLE = "statements.csv"
 
 
@@ -54,7 +54,7 @@ _FIGURES = {
     "fig16": _Figure(waveforms.layer_zoom, quantities.layer_durations),
 }
 
-#: Names of the figures.
+#: Figure names.
 NAMES = tuple(_FIGURES)
 
 
@@ -71,24 +71,24 @@ class Publication:
 @alone
 def figures(
     names: Annotated[
-        Sequence[str] | None, Option("Figures, as fig09; all by default", form="[NAME]...", is_argument=True)
+        Sequence[str] | None, Option("Figures, such as fig09; by default all", form="[NAME]...", is_argument=True)
     ] = None,
     output: str | os.PathLike[str] = "output/figures",
     *,
     target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
-    max_time: Annotated[float | None, positive_option("Begin no further figure after this many seconds")] = None,
-    seed: Annotated[int, Option("Seed of the random numbers", 0, 10**6)] = 0,
+    max_time: Annotated[float | None, positive_option("Begin no figure after this many seconds")] = None,
+    seed: Annotated[int, Option("Random seed", 0, 10**6)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
-    """Make the figures of the multipixel lidar model of FOI (Tulldahl 2006), and the table of its statements.
+    """Make the figures for FOI's multipixel lidar model (Tulldahl 2006), and the table of its statements.
 
     Parameters
     ----------
     names
         Figures, of ``fig01b``, ``fig02``, ``fig04`` to ``fig06``, and ``fig08`` to ``fig16``; by default all.
     output
-        Folder, made if needed. Each figure becomes a file as ``fig09.png``, and the table of the statements of these
-        figures ``statements.csv``. Every file is moved into its place when it is complete.
+        Folder, made if needed. Each figure becomes a file such as ``fig09.png``, and the table with their statements
+        ``statements.csv``. Every file is moved into its place when it is complete.
     target_error
         Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
         warning.
@@ -98,8 +98,8 @@ def figures(
     Returns
     -------
     Publication
-        Paths of the files in the order of the figures, the table last; the statements; and whether Ctrl-C ended the
-        work, in which case the files and statements are those of the figures completed by then.
+        Paths of the files in figure order, the table last; the statements; and whether Ctrl-C ended the work: files and
+        statements then belong to the figures completed by then.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def figures(
 
 
 def check_names(names: Sequence[str] | None) -> list[str]:
-    """Return names of figures in the order of the publication, by default all; raise `UserError` for unknown ones."""
+    """Return figure names in the publication's order, by default all; raise `UserError` for unknown ones."""
     for name in names or ():
         if name not in NAMES:
             raise UserError(f"figure {name!r} must be one of {', '.join(NAMES)}")

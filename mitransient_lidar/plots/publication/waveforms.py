@@ -19,7 +19,7 @@ from mitransient_lidar.studies.publication.renders import Renders, as_series, ge
 
 DEPTH_LABEL = "depth on the axis (m)"
 
-#: Names of the pixels' colours, for legends.
+#: Names of the pixel colours, for legends.
 PIXELS = ("red (0)", "green (1)", "blue (2)", "black (3)")
 
 
@@ -34,9 +34,9 @@ def draw_waveforms(
     label: str = "",
     **style: object,
 ) -> float:
-    """Draw the mean of a series of renders over depth [m], with bands of one standard error; return its unit in W.
+    """Draw the mean over a series of renders against depth [m], with bands of one standard error; return its unit in W.
 
-    `origin` selects the light of one origin, and `pixels` some of the pixels.
+    `origin` selects the light from one origin, and `pixels` some pixels.
     """
     series = as_series(result)
     power = series.parts[origin] if origin else series.power
@@ -72,7 +72,7 @@ def example(renders: Renders) -> Figure:
 
 
 def mine(renders: Renders) -> Figure:
-    """Draw the echo of a sphere (figure 2)."""
+    """Draw a sphere's echo (figure 2)."""
     figure = _with_part(renders.shot(scenes.MINE), (-1.5, 14.0), "2  sphere of 1 m at 9 m", "sphere alone", log=True)
     _show_decades(figure.axes)
     return figure
@@ -85,7 +85,7 @@ def mast(renders: Renders) -> Figure:
 
 
 def _with_part(result: xr.Dataset, limits: tuple[float, float], title: str, label: str, *, log: bool = False) -> Figure:
-    """Draw waveforms and the light of the target alone."""
+    """Draw waveforms and the target's light alone."""
     figure = drawing.new_figure(None, 6.0, 3.4)
     ax = figure.subplots()
     draw_waveforms(ax, result, limits, log=log)

@@ -34,7 +34,7 @@ def surface_echoes(renders: Renders) -> Figure:
 
 
 def bottom_echoes(renders: Renders) -> Figure:
-    """Draw the places of the shots on the sea, and the bottom echoes of the red pixel (figure 11)."""
+    """Draw the shot locations on the sea, and the bottom echoes in the red pixel (figure 11)."""
     figure = drawing.new_figure(None, 10.4, 6.2)
     grid = figure.add_gridspec(2, 3)
     _draw_places(renders, [figure.add_subplot(grid[0, number]) for number in range(3)], "11")

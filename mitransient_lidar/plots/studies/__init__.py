@@ -1,1 +1,1 @@
-"""Figures of studies, one module for each."""
+"""Study figures, one module for each."""

@@ -1,4 +1,4 @@
-"""Figures of the depths of an instrument: their errors against the angle, their uncertainty, and orders of surveys."""
+"""Figures for an instrument's depths: their errors against the angle, their uncertainty, and survey orders."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.studies.panels import finish, name_sides, new_panels
 
-#: Of the orders from the strictest on, of none, and of an unknown depth.
+#: Colours for the orders from the strictest on, for none, and for an unknown depth.
 _ORDER_COLOURS = ("#1a7f37", "#8fd19e", "#f2c14e", "#e07a2f", "#b3261e", "0.9")
 
 
 def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the biases of a result of `studies.depth_bias` against the angle, one panel for each sea, water and depth.
+    """Draw the biases in a result of `studies.depth_bias` against the angle, one panel for each sea, water and depth.
 
-    Lines are those of the estimators, means over the channels, with the spread of single depths as bars.
+    Lines show the estimators, means over the channels, with the spread of single depths as bars.
     """
     cells = found[["bias", "spread"]].mean("pixel").stack(cell=("wind_speed", "water", "depth"))
     figure, axes, lowest, first = new_panels(path, cells.sizes["cell"], (4.2, 3.4), (1.6, 0.5), sharex=True)
@@ -42,10 +42,10 @@ def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> 
 
 
 def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the total vertical uncertainty at 95 % against depth, one panel a water, with the orders of S-44.
+    """Draw the total vertical uncertainty at 95 % against depth, one panel per water, with the S-44 orders.
 
-    `found` is a result of `studies.tpu.tpu` at one altitude and angle. Lines with full markers are of
-    corrected depths, or of measured ones without corrections; open markers of depths as measured.
+    `found` is a result of `studies.tpu.tpu` at one altitude and angle. Lines with full markers show corrected depths,
+    or measured ones without corrections; open markers show measured depths.
     """
     waters = found["water"].values
     figure, axes, lowest, first = new_panels(path, waters.size, (3.9, 3.1), (1.2, 0.6), sharex=True, sharey=True)
@@ -66,10 +66,10 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
 
 
 def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the strictest order of S-44 that is met by wind and water, one panel a depth.
+    """Draw the strictest S-44 order met against wind and water, one panel per depth.
 
-    `found` is a result of `studies.tpu.tpu` at one altitude and angle; corrected depths count where there
-    are any. Cells of seas that were left out are empty.
+    `found` is a result of `studies.tpu.tpu` at one altitude and angle; corrected depths count where there are any.
+    Cells for omitted seas are empty.
     """
     depths = found["depth"].values
     figure = drawing.new_figure(path, 2.3 * depths.size + 1.8, 3.4)

@@ -1,4 +1,4 @@
-"""Figures of light in the water: spread at depth, attenuation by field of view, and orders of scattering."""
+"""Figures for light in the water: spread at depth, attenuation against field of view, and scattering orders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mitransient_lidar.plots.studies.panels import finish
 
 _DEPTHS = matplotlib.colormaps["viridis_r"]
 
-#: Share of the light at which the horizontal axis of a panel begins.
+#: Light share at which a panel's horizontal axis begins.
 _SMALLEST_SHARE = 3e-3
 
 #: Panels: variable, its coordinate, label of that axis, and title.
@@ -32,7 +32,7 @@ _PANELS = (
 def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the share of the light at each depth within a radius, a horizontal shift and a delay.
 
-    Dots are the radii that hold 50 and 90 % of the light. `spread` is a result of `studies.beam_spread.beam_spread`.
+    Dots are the radii that contain 50 and 90 % of the light. `spread` is a result of `studies.beam_spread.beam_spread`.
     """
     figure = drawing.new_figure(path, 12.4, 4.4)
     axes = figure.subplots(1, 3, sharey=True)
@@ -66,7 +66,7 @@ def _add_legend(ax: Axes, spread: xr.Dataset, colours: list[Any]) -> None:
 
 
 def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the attenuations of `studies.fov_sweep.fov_sweep` against the radius of the spot in the field of view."""
+    """Draw the attenuations in `studies.fov_sweep.fov_sweep` against the spot radius in the field of view."""
     figure = drawing.new_figure(path, 7.2, 4.8)
     attributes = found.attrs
     names = ("attenuation", "kd", "a_plus_bb", "absorption", "beam_radius")
@@ -107,9 +107,9 @@ def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
 
 
 def plot_scattering_orders(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw power by order of scattering, and the share of light with several reversals, summed over the pixels.
+    """Draw power by scattering order, and the share of light with several reversals, summed over the pixels.
 
-    `result` is that of `studies.scattering_orders.scattering_orders`.
+    `result` comes from `studies.scattering_orders.scattering_orders`.
     """
     figure = drawing.new_figure(path, 9.0, 6.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

@@ -1,4 +1,4 @@
-"""Panels of the figures of studies: several of one kind, and the elements that each has."""
+"""Panels in study figures: several of one kind, and the elements that each has."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _COLUMNS = 3  # panels side by side
 def new_panels(
     path: drawing.FilePath | None, count: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
 ) -> tuple[Figure, list[Axes], list[Axes], list[Axes]]:
-    """Return a figure of panels of a size in inches, at most three side by side; the panels, the lowest and first ones.
+    """Return a figure with panels, a size in inches each, at most three side by side; all, the lowest and first panels.
 
-    `margin` is added to width and height, and `shared` says which axes are.
+    `margin` is added to width and height, and `shared` states which axes are.
     """
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
@@ -44,7 +44,7 @@ def finish(
 def name_sides(
     figure: Figure, lowest: Sequence[Axes], x: str, first: Sequence[Axes], y: str, title: str | None = None
 ) -> None:
-    """Label the axes below and to the left of panels, and list the curves of the first one on the right."""
+    """Label the axes below and to the left of panels, and list the first one's curves on the right."""
     for ax in lowest:
         ax.set_xlabel(x)
     for ax in first:

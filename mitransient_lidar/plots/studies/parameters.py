@@ -1,4 +1,4 @@
-"""Figures of the parameters of a scene: their least errors, and a fit of them to waveforms."""
+"""Figures for scene parameters: their Cramer-Rao bounds, and a fit to waveforms."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmi
 def plot_bounds(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw a result of `studies.bounds.bounds`.
 
-    Of several designs, a panel for each parameter ranks them by the ratio of their bound to that of the first, best on
-    top, at most 20; of a single one, the bounds beside those with the other parameters known, and the correlations.
+    For several designs, a panel per parameter ranks them by the ratio of their bound to the first, best on top, at most
+    20. For a single design, the bounds stand beside the bounds with the other parameters known, and the correlations.
     """
     if found.sizes["design"] == 1:
         return _plot_one(found.isel(design=0), path)
@@ -60,7 +60,7 @@ def _rank(ax: Axes, one: xr.Dataset) -> None:
 
 
 def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
-    """Draw bounds and correlations of one design."""
+    """Draw one design's bounds and correlations."""
     names = [str(name) for name in one["parameter"].values]
     figure = drawing.new_figure(path, 9.2, 0.42 * len(names) + 2.2)
     left, right = figure.subplots(1, 2)
@@ -101,10 +101,10 @@ _SHOWN_PIXELS = 12  # more would hide each other
 
 
 def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw measured and fitted waveforms above their differences in standard deviations, one colour a pixel.
+    """Draw measured and fitted waveforms above their differences in standard deviations, one colour per pixel.
 
-    `fitted` is a result of `studies.fit.fit`. Of more than 12 pixels, those with the largest peaks are drawn. The title
-    gives the values with their standard errors.
+    `fitted` is a result of `studies.fit.fit`. From more than 12 pixels, those with the largest peaks are drawn. The
+    title gives the values with their standard errors.
     """
     time = fitted["time"].values
     rows = {name: fitted[name].values.reshape(-1, time.size) for name in ("measured", "measured_stderr", "fitted")}

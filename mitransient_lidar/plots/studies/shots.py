@@ -1,4 +1,4 @@
-"""Figures of shots on a sea: footprints and waveforms, and echoes against the slopes of the sea."""
+"""Figures for shots on a sea: footprints and waveforms, and echoes against the sea slopes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FAINT = 5e-3
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the sea with the footprints of beam and pixels at each shot, and the waveforms of the shots.
+    """Draw the sea with the footprints of beam and pixels at each shot, and the shots' waveforms.
 
     `rendered` is a result of `studies.find_shots.render_found_shots`.
     """
@@ -85,9 +85,9 @@ def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
 
 
 def _time_limits(results: Sequence[xr.Dataset]) -> tuple[float, float]:
-    """Return the echo windows of all shots, extended to where the power of a pixel exceeds 0.5 % of its peak [ns].
+    """Return all shots' echo windows, extended to where a pixel's power exceeds 0.5 % of its peak [ns].
 
-    The echoes of a crest are earlier than the window, which is that of the mean sea level.
+    A crest's echoes are earlier than the window, which fits the mean sea level.
     """
     ends = []
     for result in results:

@@ -1,4 +1,4 @@
-"""Figures of the signal of a target, its change with the place of the target, and its detection."""
+"""Figures for a target's signal, its change with target position, and its detection."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _DASHES = (0, (4, 2))
 
 
 def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the power in every pixel with and without the target, and the signal of the target alone; or a map.
+    """Draw the power in every pixel with and without the target, and the target's signal alone; or a map.
 
-    `result` is that of `studies.target_signal.target_signal`.
+    `result` comes from `studies.target_signal.target_signal`.
     """
     if "target_x" in result.dims:
         return plot_target_map(result, path)
@@ -88,7 +88,7 @@ _LABELS = {
     "best": "best weighting",
 }
 
-#: Groups of bars, by their variables.
+#: Bar groups, by their variables.
 _REQUIRED = {"needed_target": "of the\ntarget's signal", "needed_energy": "of the\npulse energy"}
 _ERRORS = {"depth_spread": "standard\ndeviation", "depth_bias": "bias"}
 _GAINS = {
@@ -101,8 +101,8 @@ _GAINS = {
 def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
 
-    `found` is a result of `studies.detection.detect`. Of gates: the gates in which the target is brightest and darkest
-    against the noise, the weights of their sum, and the detection with frames and single gates.
+    `found` is a result of `studies.detection.detect`. For gates: the gates in which the target is brightest and darkest
+    against the noise, the weights in their sum, and the detection with frames and single gates.
     """
     if "gate" in found.dims:
         return _plot_image_detection(found, path)

@@ -1,1 +1,1 @@
-"""Series of shots at several places, rendered together."""
+"""Series of shots at several locations, rendered together."""

@@ -41,23 +41,23 @@ _PATHS, _BINS = 2**17, 2**24
 #: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
 _MOST_SHOTS = 64
 
-#: Memory of a bin of a series, for mean and standard error of energy and power, and their copy in the result [bytes].
+#: Memory per bin in a series, for mean and standard error of energy and power, and their copy in the result [bytes].
 _BYTES_PER_BIN = 64
 
 #: Fewest and most passes that are repeated until an error is reached.
 _PASSES_FOR_ERROR, MOST_PASSES_FOR_ERROR = 4, 400
 
-#: Share of the paths with which the fewest passes reach an error in the published geometry under waves of 6 m/s, and
-#: that error; the error of a pass falls with its number of paths to this exponent.
+#: Path share with which the fewest passes reach an error in the published geometry under 6 m/s waves, and that error. A
+#: pass error falls with its number of paths to this exponent.
 _KNOWN_SHARE, _KNOWN_ERROR, _ERROR_EXPONENT = 0.05, 0.05, 0.65
 
 
 @dataclass(frozen=True)
 class ShotPoses:
-    """Places of shots, and poses that differ from that of the lidar.
+    """Shot locations, and poses that differ from the lidar's.
 
-    The frame of a shot is turned about the vertical, so that its receiver differs least from that of the lidar, and
-    displaced, so that the receiver's axis meets the mean sea level where the lidar's does.
+    A shot's frame is turned about the vertical, so that its receiver differs least from the lidar's. It is also
+    displaced, so that the receiver's axis meets the mean sea level at the same point as the lidar's.
 
     Attributes
     ----------
@@ -66,11 +66,11 @@ class ShotPoses:
     turns
         Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
     receiver, transmitter
-        Poses in the frame of each shot; None where all are those of the lidar.
+        Poses in each shot's frame; None where all are the lidar's.
     in_scene
-        Poses of the receiver in the scene; None where they follow from the places.
+        Receiver poses in the scene; None where they follow from the locations.
     times_s
-        Times at which shots meet the waves [s], shape (shots,); None for that of the scene.
+        Times at which shots meet the waves [s], shape (shots,); None for the scene's time.
     """
 
     places: FloatArray
@@ -82,7 +82,7 @@ class ShotPoses:
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
-        """Return the poses of shots of a lidar whose receiver has given ones in the scene, arrays of shape (shots, 3).
+        """Return the poses of a lidar's shots from the receiver's poses in the scene, arrays with the shape (shots, 3).
 
         The transmitter is fixed to the receiver. All axes must go down.
         """
@@ -105,7 +105,7 @@ class ShotPoses:
         return len(self.places)
 
     def part(self, rows: slice | IntArray) -> ShotPoses:
-        """Return some of the shots."""
+        """Return some shots."""
         turns = None if self.turns is None else self.turns[rows]
         receiver = None if self.receiver is None else self.receiver.part(rows)
         transmitter = None if self.transmitter is None else self.transmitter.part(rows)
@@ -152,7 +152,7 @@ class ShotPoses:
     def extra_range(self, lidar: LidarScene) -> FloatArray:
         """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).
 
-        Times of arrival are relative to it: those of each shot begin later by this length over the speed of light.
+        Arrival times are relative to it: a shot's times begin later by this length over the speed of light.
         """
         if self.receiver is None or self.transmitter is None:
             return np.zeros(len(self))
@@ -186,16 +186,16 @@ class ReceivedShots:
         Mean energy [J per bin], its standard error, mean power after the pulse and the receiver's response [W], and its
         standard error, shape (shots, pixels, bins).
     lost
-        Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
+        Energy lost at the surface mesh's edges [J], mean over the passes of all shots.
     passes
-        Number of passes of each shot, shape (shots,).
+        Passes per shot, shape (shots,).
     parts
         The same four arrays of light by origin, (shots, pixels, origins, bins); none unless the renderer separates it.
     derivatives
-        The same four arrays of derivatives, of shape (shots, parameters, pixels, bins); none unless the renderer has
+        The same four arrays for derivatives, shape (shots, parameters, pixels, bins); none unless the renderer has
         perturbations.
     missed
-        Number of shots whose passes ended before the error that was requested.
+        Number of shots whose passes ended before the requested error.
     errors
         Relative standard errors of the bins that count (`ErrorWindow`), one row.
     """
@@ -229,28 +229,28 @@ class ReceivedShots:
 
 
 class ShotBatches:
-    """The scene of a renderer, displaced to the places of batches of shots.
+    """A renderer's scene, displaced to the locations of shot batches.
 
-    The frame of the lidar is that of the scene, and a place is that of the aim. The sea is refined about each place,
-    and the patches lie beside each other in one mesh. Solids are met at the place itself, except those that go with the
-    lidar. A plume of bubbles is that of one shot: such scenes have a batch for each.
+    The lidar's frame is the scene's frame, and a shot's location is its aim. The sea is refined about each location,
+    and the patches lie beside each other in one mesh. Solids are met at the location itself, except solids that move
+    with the lidar. A bubble plume belongs to one shot: such scenes have a batch for each.
 
     Parameters
     ----------
     renderer
-        Renderer of the shot at the place of the scene.
+        Renderer for the shot at the scene's location.
     aim
-        Place (x, y) of the scene's own shot in the scene [m].
+        Location (x, y) of the scene's own shot in the scene [m].
     passes
         Passes of each shot, the most with a `goal`.
     share
-        Share of the paths of a full pass.
+        Share of a full pass's paths.
     goal
-        Relative standard error of the median bin of a batch that ends its passes.
+        Relative standard error of a batch's median bin that ends its passes.
     window
-        Bins that count, of a shot without land; None where none do.
+        Bins that count, for a shot without land; None where none do.
     companions
-        Solids that go with the lidar.
+        Solids that move with the lidar.
     """
 
     def __init__(
@@ -348,7 +348,7 @@ class ShotBatches:
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].
 
-        The shots of a launch stay the same, so that a batch which the time has ended has the same bits again with its
+        The shots in a launch stay the same, so that a batch that the time has ended has the same bits again with its
         number of passes. Two passes are rendered in any time.
         """
         other = copy.copy(self)
@@ -401,7 +401,7 @@ class ShotBatches:
         return self._window.with_land(lidar, *land_of_shots(several(1).scene, shots))
 
     def parts(self, count: int) -> Iterator[slice]:
-        """Return the shots of each batch of `count`."""
+        """Return the shots in each batch of `count`."""
         for first in range(0, count, self.size):
             yield slice(first, min(first + self.size, count))
 
@@ -425,7 +425,7 @@ def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
 
 
 def share_for_error(error: float) -> float:
-    """Return the share of the paths of a full pass for passes that are repeated until a relative error is reached."""
+    """Return the path share for passes that are repeated until a relative error is reached."""
     return float(np.clip(_KNOWN_SHARE * (_KNOWN_ERROR / error) ** (1 / _ERROR_EXPONENT), SMALLEST_SHARE, 1.0))
 
 

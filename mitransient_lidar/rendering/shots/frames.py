@@ -1,4 +1,4 @@
-"""Frames of gate images, in which each gate has pulses of its own, over a sea and a platform that move."""
+"""Frames of gate images, in which each gate has its own pulses, over a moving sea from a moving platform."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Memory of a pixel in a gate of a frame, and of one in a gate of a pass [bytes].
+#: Memory per pixel in a frame's gate, and per pixel in a pass's gate [bytes].
 _BYTES_PER_VALUE, _BYTES_PER_SUM = 40, 36
 
-#: Sums of pixels and gates in one launch, and places of a moving platform from which the record holds all light.
+#: Sums over pixels and gates in one launch, and locations of a moving platform from which the record contains all
+#: light.
 _SUMS, _PLACES = 2**22, 9
 
 
@@ -47,53 +48,54 @@ def render_frames(
     params: Mapping[str, Any] | None = None,
     *,
     pulse_rate_hz: Annotated[
-        float, Option("Pulses a second, 1000 by default", 0, unit="Hz", above=True, flag="--pulse-rate")
+        float, Option("Pulses per second, by default 1000", 0, unit="Hz", above=True, flag="--pulse-rate")
     ] = 1000.0,
-    frames: Annotated[int, Option("Number of frames, 1 by default", 1, 100_000)] = 1,
+    frames: Annotated[int, Option("Number of frames, by default 1", 1, 100_000)] = 1,
     gate_order: Annotated[
         str,
-        Option("Order of the gates of a frame: in_order (the default), random, or interleaved, pulse by pulse"),
+        Option("Order of a frame's gates: in_order (the default), random, or interleaved, pulse by pulse"),
     ] = "in_order",
     readout_s: Annotated[
-        float, Option("Time without pulses after each image; interleaved, each frame", 0, unit="s", flag="--readout")
+        float,
+        Option("Time without pulses after each image, or after each interleaved frame", 0, unit="s", flag="--readout"),
     ] = 0.0,
-    speed: Annotated[float, Option("Speed of the platform, with laser and receiver", 0, unit="m/s")] = 0.0,
+    speed: Annotated[float, Option("Platform speed", 0, unit="m/s")] = 0.0,
     heading_deg: Annotated[
-        float, Option("Its direction, from +y clockwise to +x", -360, 360, unit="degree", flag="--heading")
+        float, Option("Platform heading, from +y clockwise to +x", -360, 360, unit="degree", flag="--heading")
     ] = 0.0,
-    passes: Annotated[int, Option("Passes of each image, 4 by default", 2, 10_000)] = 4,
+    passes: Annotated[int, Option("Passes of each image, by default 4", 2, 10_000)] = 4,
     pass_share: PassShare = None,
-    max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], 2 by default")] = None,
+    max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], by default 2")] = None,
     seed: SignedSeed = None,
     integrator: Any = None,
     instrument: Instrument = None,
     sensor: Sensor = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render frames of the gates of a scene, each gate with pulses of its own.
+    """Render frames of a scene's gates, each gate with its own pulses.
 
     Parameters
     ----------
     scene, params, integrator, instrument, sensor
-        As for `render.render`; a scene whose film has gates. An image, one gate of one frame, is the sum of its
+        As for `render.render`; a scene whose film has gates. An image, one gate in one frame, is the sum of its
         ``pulses``.
     gate_order
-        As of `GateSequence`; the random order follows from `seed`.
+        As for `GateSequence`; the random order follows from `seed`.
     passes
-        Passes of each image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the
-        image's pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors are from the
-        spread of the passes; those of images of many pulses are at most too large, as they hold the change of the sea.
+        Passes per image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the image's
+        pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors come from the spread of
+        the passes; for images with many pulses they are at most too large, as they include the change in the sea.
     progress
         Called with a `passes.Progress` after every few images.
 
     Returns
     -------
     xarray.Dataset
-        A gate stack with the dimension ``frame`` first, also of one frame: ``gate_energy`` and ``gate_energy_stderr``
-        [J] over (frame, row, column, gate) or (frame, pixel, gate). ``pulse_time`` [s] over (frame, gate) is the time
-        of an image's first pulse after the first one of all, which meets the sea at the time of the scene. With a
-        `speed`, ``platform_x`` and ``platform_y`` [m] are the displacement at that time. Gates start at fixed times
-        after each pulse. After Ctrl-C the completed frames are returned, and the attribute ``interrupted`` is 1.
+        A gate stack with the dimension ``frame`` first, also for one frame: ``gate_energy`` and ``gate_energy_stderr``
+        [J] over (frame, row, column, gate) or (frame, pixel, gate). ``pulse_time`` [s] over (frame, gate) is an image's
+        first pulse time after the first pulse of all, which meets the sea at the scene's time. With a `speed`,
+        ``platform_x`` and ``platform_y`` [m] are the displacement at that time. Gates start at fixed times after each
+        pulse. After Ctrl-C the completed frames are returned, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -102,7 +104,7 @@ def render_frames(
 
     Notes
     -----
-    Waves and platform move from pulse to pulse, and stand still during one. Wakes and height maps of the sea stay.
+    Waves and platform move from pulse to pulse, and stand still during one. Wakes and sea height maps stay.
     """
     variants.leave_the_gpu("frames are rendered")
     session = open_scene(scene, params, instrument, sensor=sensor)
@@ -153,7 +155,7 @@ def render_frames(
 
 
 def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> PassRenderer:
-    """Return the renderer of the scene, whose record holds the light of all places of the platform."""
+    """Return the scene's renderer, whose record contains the light at all platform locations."""
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     loaded = session.scene, session.sensor
@@ -166,7 +168,7 @@ def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> P
 
 
 def _check_size(sequence: GateSequence, pixels: int, max_memory: float) -> None:
-    """Log the memory of all frames; refuse more than `max_memory` [GB], or than the memory of the machine."""
+    """Log the memory for all frames; refuse more than `max_memory` [GB], or than the machine's memory."""
     images, sums = sequence.frames * sequence.gates, pixels * sequence.gates
     size = _BYTES_PER_VALUE * pixels * images + _BYTES_PER_SUM * max(sums, min(sums * images, _SUMS))
     what = f"{sequence.frames} frames of {sequence.gates} gates of {pixels} pixels"
@@ -194,7 +196,7 @@ class _Images:
         weights = train.response_weights(pulse, response)
         self._gates: GateWeights = GateWeights(train, weights, lidar.reference_length)
         seas = lidar.seas
-        # The middle of the fine waves of the scene.
+        # The middle of the scene's fine waves.
         self._middle = np.array(seas[0].sea.centre if seas else lidar.frame_origin[:2])
         self._time_s = seas[0].time_s if seas else 0.0
         aim = float(self._middle[0]), float(self._middle[1])
@@ -203,7 +205,7 @@ class _Images:
         self._size = int(np.clip(_SUMS // (self._pixels * sequence.gates), 1, self._batches.size))
         shape = sequence.frames * sequence.gates, self._pixels
         self.mean, self.stderr = np.zeros(shape), np.zeros(shape)
-        #: Number of rendered images; energy in all gates, and lost at the edge of the surface mesh [J].
+        #: Number of rendered images; energy in all gates, and lost at the surface mesh's edge [J].
         self.done, self.received, self.lost = 0, 0.0, 0.0
 
     def render(self, progress: ProgressCallback | None) -> bool:

@@ -1,4 +1,4 @@
-"""The loaded scene of a series of shots: lidar, time bins, batches, and labelled results."""
+"""The loaded scene for a series of shots: lidar, time bins, batches, and labelled results."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 
 
 class ShotScene:
-    """The scene of a series of shots, at the place of the first one; its time bins are told, and it is checked.
+    """The scene for a series of shots, at the first one's location; its time bins are reported, and it is checked.
 
     Parameters
     ----------
     scene, params, instrument, sensor
-        As of `loading.scenes.open_scene`, with the parameters ``aim_x`` and ``aim_y``.
+        As for `loading.scenes.open_scene`, with the parameters ``aim_x`` and ``aim_y``.
     places
-        Places of the shots [m], shape (shots, 2).
+        Shot locations [m], shape (shots, 2).
     target
-        Distance from the aim to the target [m], which goes with the shots; None if it stays.
+        Distance from the aim to the target [m], which moves with the shots; None if it stays.
     axis
         Time bins instead of automatic ones.
     components, derivatives
-        As of `series.render_shots`.
+        As for `series.render_shots`.
     check
         Whether to tell the time bins, and to check the scene.
     light
@@ -53,7 +53,7 @@ class ShotScene:
     session
         The loaded scene.
     lidar
-        Lidar of the first shot, with the time bins of all shots.
+        Lidar of the first shot, with time bins for all shots.
     parameters
         Parameters by which light is differentiated.
     window
@@ -137,13 +137,13 @@ class ShotScene:
         return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
 
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
-        """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
+        """Return the shots in batches, for passes with a share of a full pass's paths, or until a relative error."""
         from mitransient_lidar.rendering.shots.batches import ShotBatches
 
         return ShotBatches(self._renderer, self._place, passes, share, error, self.window, self.companions)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
-        """Return the attributes of the series, with other ones."""
+        """Return the series attributes, with other ones."""
         found = self.session.attributes(self.lidar, self._integrator, used, **self._described, **others)
         replaced = (*AIM, *(() if self._target is None else TARGET))
         return {

@@ -75,19 +75,21 @@ def render_shots(
     scene: SceneOrResult,
     params: Mapping[str, Any] | None = None,
     *,
-    count: Annotated[int, Option("Number of shots at random places; 20 by default in the command", 2, 100_000)] = 200,
+    count: Annotated[int, Option("Number of shots at random locations; the command's default is 20", 2, 100_000)] = 200,
     positions: Annotated[
-        Any, Option("Place of a shot [m], instead of random ones. Repeatable", form="X,Y", flag="--at")
+        Any, Option("Location of a shot [m], instead of random ones. Repeatable", form="X,Y", flag="--at")
     ] = None,
-    move_target: Annotated[bool, Option("Keep the target's place relative to the aim of each shot")] = False,
+    move_target: Annotated[bool, Option("Move the target with the aim of each shot")] = False,
     passes: Annotated[
-        int | None, Option("Most passes of each shot, 8 by default, 400 with a target error", 2, 10_000)
+        int | None, Option("Most passes of each shot, by default 8, or 400 with a target error", 2, 10_000)
     ] = None,
     target_error: Annotated[
-        float | None, Option("Relative standard error of the median bin, instead of full passes", 0, 1, above=True)
+        float | None,
+        Option("Relative standard error of the median bin at which a shot ends, by default none", 0, 1, above=True),
     ] = None,
     max_time: Annotated[
-        float | None, positive_option("Stop before this many seconds for all shots, with fewer passes or shots")
+        float | None,
+        positive_option("Stop before this many seconds for all shots, with fewer passes or shots; by default no limit"),
     ] = None,
     pass_share: float | None = None,
     light: LightOption = "merging",
@@ -102,26 +104,26 @@ def render_shots(
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render shots at given or random places of one sea, many at a time.
+    """Render shots at given or random locations on one sea, many at a time.
 
     Parameters
     ----------
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
     count
-        Number of random shots, 2 to 100 000, about the origin or, if it is more than 250 m from there, the aim of the
-        scene; it needs an ``ocean_surface`` with waves. Not used with `positions`.
+        Number of random shots, 2 to 100 000, about the origin or, if it is more than 250 m from there, the scene's aim;
+        it needs an ``ocean_surface`` with waves. Not used with `positions`.
     positions
-        Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
+        Locations (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
         apart along x and y.
     move_target
-        Whether the target keeps its place relative to the aim; the scene needs the parameters ``target_x`` and
+        Whether the target keeps its position relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
     passes
         Passes of each shot, 2 to 10 000; by default 8. With a `target_error`, the most, by default 400.
     target_error
-        Relative standard error, greater than 0, at most 1, that ends the passes of a batch when the median of the bins
-        of lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
+        Relative standard error, greater than 0, at most 1, that ends a batch's passes, after at least 4 of them. The
+        median over the bins of lit pixels from the surface echo to the end of the bottom echo must have reached it.
     max_time
         Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
         fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.
@@ -136,10 +138,11 @@ def render_shots(
     first_seed
         Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
     axis
-        Time bins instead of automatic ones, which hold the light of all shots; they must hold it, too, up to a
+        Time bins instead of automatic ones, which contain the light of all shots; they must contain it, too, up to a
         twentieth of the record.
     shot_passes
-        Most passes of each shot, shape (shots,), 2 to `passes`, as the coordinate of a series that is rendered again.
+        Most passes of each shot, shape (shots,), 2 to `passes`, as in the coordinate of a series that is rendered
+        again.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
     describe_sea
@@ -150,24 +153,24 @@ def render_shots(
     Returns
     -------
     xarray.Dataset
-        A result as of `rendering.render.render`, without gates, with the dimension ``shot`` first. Coordinates over
+        A result as from `rendering.render.render`, without gates, with the dimension ``shot`` first. Coordinates over
         ``shot``: ``aim_x``, ``aim_y`` [m]; the means over the beam's footprint ``true_slope_along`` (positive for a
         face towards the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height``
         [m] above the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a
         level sea, meets the bottom (`WaterScene.bottoms`), NaN where it misses; ``true_bottom_depth_below_surface`` [m]
-        below the mean surface in the footprint, as depths of echoes are, the sum of depth and surface height; of the
-        water, whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
+        below the mean surface in the footprint, as echo depths are, the sum of depth and surface height; for the water,
+        whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
         ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
-        bubbles (`truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
-        those of the first shot; positions are left out. ``series_parameters``: JSON of the scene's parameters that
-        shots replace. ``passes`` is the largest number of passes of a shot, of the coordinate ``shot_passes``, and
-        ``most_passes`` the option. ``slope_deviation``: standard deviations of the two slopes of a sea with waves.
-        After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
+        bubbles (`truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window belong
+        to the first shot; positions are left out. ``series_parameters``: JSON of the scene parameters that shots
+        replace. ``passes`` is the largest value of the coordinate ``shot_passes``, and ``most_passes`` the option.
+        ``slope_deviation``: standard deviations of the two slopes in a sea with waves. After Ctrl-C the dataset
+        contains the completed shots, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
     UserError
-        If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
+        If the scene is invalid, has no waves for random locations, or lacks a parameter, or a number is out of range.
     """
     from mitransient_lidar.rendering.shots.batches import (
         MOST_PASSES_FOR_ERROR,
@@ -265,7 +268,7 @@ def render_shots(
 
 
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
-    """Return the progress of a series, with the errors of its last batch."""
+    """Return a series' progress, with the errors in its last batch."""
     median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
     return Progress(
         done=done,
@@ -282,7 +285,7 @@ def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, optio
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:
-    """Return the lines of a table of the shots of `render_shots`: places, truth and the highest power of a pixel.
+    """Return table lines for the shots of `render_shots`: locations, truth and the highest power in a pixel.
 
     The bottom is below the mean sea level, the depth below the mean surface in the beam.
     """
@@ -306,7 +309,7 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
 
 
 def _checked_passes(given: npt.ArrayLike | None, shots: int, passes: int) -> IntArray:
-    """Return the most passes of each shot."""
+    """Return each shot's most passes."""
     if given is None:
         return np.full(shots, passes)
     if (counts := finite_array("shot_passes", given)).shape != (shots,):

@@ -1,4 +1,4 @@
-"""Elevation and slopes of a sea over the beam's footprint, and what is true at the places of shots."""
+"""Sea elevation and slopes over the beam's footprint, and the truth at shot locations."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
 _REACH, _FEWEST_CELLS = 4.5, 4
 
-#: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
+#: Slopes along and across the lidar's azimuth for each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 
 #: Longest side of the sea that is searched [m].
 _LARGEST_SEARCH = 512.0
 
-#: Largest difference of the nearest place from the slopes wanted, in standard deviations of the slopes.
+#: Largest difference between the nearest location and the wanted slopes, in slope standard deviations.
 _NEAREST = 1.0
 
 
@@ -40,7 +40,7 @@ _NEAREST = 1.0
 class Shot:
     """Intersection of the beam's axis with the mean sea level.
 
-    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m], `along` and `across` the mean slopes over the beam's
+    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m]. `along` and `across` are the mean slopes over the beam's
     footprint along the lidar's azimuth, positive for a face towards the lidar, and to its left [1].
     """
 
@@ -74,11 +74,11 @@ class SeaMap:
             raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
         transmitter = transmitter_of(scene)
         transmitter.pose.require_above_sea()
-        # Of a sea of several grids the coarsest.
+        # For a sea with several grids the coarsest.
         grid = None if isinstance(sea.waves, HeightMap) else sea.waves
         cell, cells = (sea.cell_size, int(sea.size / sea.cell_size)) if grid is None else (grid.cell_size, grid.cells)
         count = min(cells, int(_LARGEST_SEARCH / cell)) // 2
-        # About the origin of the scene, or about the frame of a lidar that is far from it.
+        # About the scene's origin, or about the frame of a lidar that is far from it.
         middle = [round(float(place) / cell) for place in transmitter.pose.frame_origin[:2]]
         x, y = (np.asarray((np.arange(-count, count) + place) * cell, dtype=np.float64) for place in middle)
         heights = sea.heights(x, y)
@@ -99,7 +99,7 @@ class SeaMap:
         return float(self.along[j, i]), float(self.across[j, i])
 
     def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:
-        """Return the places with the slopes nearest to those of a kind, at least `apart` metres from each other."""
+        """Return the locations whose slopes are nearest to a kind's, at least `apart` metres from each other."""
         spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
         wanted = slope_sigmas * np.array(SLOPE_KINDS[kind]) * spread
         distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
@@ -119,7 +119,7 @@ class SeaMap:
         return self._nearest("near", distance, count, apart)
 
     def _nearest(self, kind: str, distance: FloatArray, count: int, apart: float) -> list[Shot]:
-        """Return places in the order of a distance of their slopes, shape of the map."""
+        """Return locations in the order of a slope distance, in the shape of the map."""
         shots: list[Shot] = []
         for index in np.argsort(distance, axis=None):
             j, i = np.unravel_index(index, distance.shape)
@@ -149,11 +149,11 @@ def footprint(transmitter: Transmitter) -> tuple[float, float, float]:
 
 
 def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPoses) -> dict[str, Any]:
-    """Return the coordinates over ``shot`` of shots over a sea of an ``ocean_surface``, with units and descriptions.
+    """Return the coordinates over ``shot`` for shots over an ``ocean_surface`` sea, with units and descriptions.
 
-    Places, slopes and depths as of `shots.series.render_shots`, and in scenes with water its coefficients
-    (`water_means`). Where the axis meets land or another solid above the sea, the sea and the water are unknown (NaN);
-    so is the bottom below another solid, and that of land is above the sea, at a negative depth.
+    Locations, slopes and depths as for `shots.series.render_shots`, and in scenes with water its coefficients
+    (`water_means`). Where the axis meets land or another solid above the sea, the sea and the water are unknown (NaN).
+    The bottom below another solid is also unknown; land is a bottom above the sea, at a negative depth.
     """
     from mitransient_lidar.transport.probe import axis_on_bottom, first_along
 
@@ -195,9 +195,9 @@ def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
     """Return the mean coefficients of a ``layered_water`` from the mean sea level to depths [m], bubbles left out.
 
     They are ``true_absorption``, ``true_scattering``, ``true_backscattering``, ``true_attenuation`` and ``true_kd``
-    [1/m], each with the shape of `depth`. Backscattering is that of the phase functions that are rendered, and Kd
-    follows by the formula of `water_types.InherentProperties.kd`. At an unknown depth (NaN) the values are those of a
-    water that is the same at all depths, and NaN in others.
+    [1/m], each in the shape of `depth`. Backscattering belongs to the rendered phase functions, and Kd follows by the
+    formula in `water_types.InherentProperties.kd`. At an unknown depth (NaN) the values are given for a water that is
+    the same at all depths, and NaN for others.
     """
     from mitransient_lidar.transport.medium.water_phases import table_of
 
@@ -205,7 +205,7 @@ def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
     phases = water.phases.phases[: column.count]
     ratios = {id(phase): table_of(phase).backscatter_ratio for phase in phases}
     backscattering = column.scattering * [ratios[id(phase)] for phase in phases]
-    # Rounding of a phase function may give a little less than half of the scattering by molecules.
+    # Phase function rounding may give slightly less than half the scattering by molecules.
     molecules = np.minimum(water.water_scattering, 2 * backscattering)
     rows = zip(column.absorption, column.scattering, backscattering, molecules, strict=True)
     layers = {

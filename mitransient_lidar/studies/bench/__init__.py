@@ -1,1 +1,1 @@
-"""Benchmarks: speed and accuracy of the integrators, of narrow beams, and of images."""
+"""Benchmarks: integrator speed and accuracy, narrow beams, and images."""

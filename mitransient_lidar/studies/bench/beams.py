@@ -1,4 +1,4 @@
-"""Benchmark of narrow beams: figure of merit against divergence, field of view, water and sea."""
+"""Narrow beam benchmark: figure of merit against divergence, field of view, water and sea."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DIVERGENCES = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
 VIEWS = (2, 5, 10, 20, 50, 100)
 _LARGEST_VIEW = 100.0
 
-#: Beam and view of the reference [mrad].
+#: Reference beam and view [mrad].
 REFERENCE = (10.0, 30.0)
 
 WATERS = {"clear": {}, "turbid": TURBID}
@@ -32,9 +32,9 @@ _COLUMNS = {"figure_of_merit": "1/(var s)", "ratio": "of 10 in 30", "cpu_s": "CP
 def run(*, json: bool = False) -> None:
     """Measure each water and sea in its own process; print a table or one JSON object to stdout.
 
-    Scene: the table system over a bottom at 8 m, 2x2 pixels, bins of 1 ns, a flat sea with the ripples of 6 m/s or
-    waves of 6 m/s. The figure of merit is 1 / (median relative variance x CPU time) of the waveform's bins from the
-    surface echo to the end of the bottom echo.
+    Scene: the table system over a bottom at 8 m, 2x2 pixels, 1 ns bins, a flat sea with 6 m/s ripples or 6 m/s waves.
+    The figure of merit is 1 / (median relative variance x CPU time) of the waveform's bins from the surface echo to the
+    end of the bottom echo.
     """
     tasks: Tasks = {(water, sea): {"water": water, "sea": sea} for water in WATERS for sea in SEAS}
     run_processes("beams", ("water", "sea"), tasks, _COLUMNS, json, "beams")

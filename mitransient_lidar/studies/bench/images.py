@@ -1,4 +1,4 @@
-"""Benchmark of images: cost of a gate on the bottom against the number of pixels."""
+"""Image benchmark: the cost of a gate on the bottom against the number of pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAYOUTS = ("2x2", "8x8", "32x32", "128x128", "256x256")
 #: Median relative error over the lit pixels of the gate on the bottom at which a render ends.
 TARGET_ERROR = 0.1
 
-#: A pixel is lit with this share of the energy of the brightest (99th percentile).
+#: A pixel is lit with this share of the brightest energy (99th percentile).
 _LIT = 0.05
 
 _SCENE = "fig09_2x2"
@@ -52,8 +52,7 @@ def run(*, json: bool = False) -> None:
 def measure(layout: str) -> dict[str, float]:
     """Measure one layout in this process.
 
-    ``wall_s`` is the time of the render with compilation, and ``render_s`` that of the passes after the first
-    two.
+    ``wall_s`` is the render time with compilation, and ``render_s`` the time of the passes after the first two.
     """
     from mitransient_lidar.loading.catalogue import scene_text
     from mitransient_lidar.rendering.render import render
@@ -91,7 +90,7 @@ def measure(layout: str) -> dict[str, float]:
 
 
 def _bottom_error(result: Any) -> float:
-    """Return the median relative error over the lit pixels of the gate about the echo of the bottom."""
+    """Return the median relative error over the lit pixels in the gate about the bottom echo."""
     bottom = result.attrs["surface_time_ns"] + 8.0 * 9.24576
     gate = int(np.argmin(np.abs(result["gate_start"].values + 0.5 * result["gate_width"].values - bottom)))
     energy, stderr = (result[name].values[..., gate].ravel() for name in ("gate_energy", "gate_energy_stderr"))

@@ -1,4 +1,4 @@
-"""Benchmark of the speed and the accuracy of the integrators."""
+"""Benchmark for integrator speed and accuracy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LAYERED = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7,
 _IMAGER = {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}
 _SPACE = {"altitude": "500000", "off_nadir_deg": "1", "divergence_mrad": "0.01", "field_of_view_mrad": "0.08"}
 
-#: Shipped scene and parameters of each case.
+#: Shipped scene and parameters for each case.
 CASES: dict[str, tuple[str, dict[str, str]]] = {
     "flat": ("fig09_2x2", {"spectrum": "flat"}),
     "clear": ("fig09_2x2", {}),
@@ -43,7 +43,7 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
 #: Scene and parameters in which instruments are measured: wind of 5 m/s and coastal water.
 INSTRUMENT_CASE = ("table1", {"wind_speed": "5", "petzold": "coastal"})
 
-#: Target of the case ``target``: a plate of 1.5 m x 1.5 m at a depth of 8 m.
+#: Target in the case ``target``: a plate of 1.5 m x 1.5 m at a depth of 8 m.
 _TARGET = """
     <shape type="rectangle" id="target">
         <transform name="to_world"><scale value="0.75"/><translate z="-8"/></transform>
@@ -51,7 +51,7 @@ _TARGET = """
     </shape>
 </scene>"""
 
-#: Cases of ``--quick``.
+#: Cases for ``--quick``.
 QUICK_CASES = ("flat", "clear")
 
 INTEGRATORS = ("lidar_merging", "lidar_volpath")
@@ -93,8 +93,8 @@ def run(
 ) -> None:
     """Measure every case with every integrator, and instruments with merging; print a table or one JSON object.
 
-    With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one, which may be the
-    name of an instrument. With `target_error`, above 0, renders end when the 95th percentile of the relative standard
+    With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one, which may be an
+    instrument's name. With `target_error`, above 0, renders end when the 95th percentile of the relative standard
     errors has reached it, or after `max_time`, above 0 [s], by default 120 s. A `max_time` alone ends them, too.
     """
     from mitransient_lidar.loading.instruments import instrument_names
@@ -117,8 +117,8 @@ def measure(
 ) -> dict[str, float]:
     """Measure one case with one integrator in this process.
 
-    Rates and times are those of the passes after the first one, which also compiles. The figure of merit is
-    1 / (median relative variance x CPU time) of the waveform's bins.
+    Rates and times belong to the passes after the first one, which also compiles. The figure of merit is 1 / (median
+    relative variance x CPU time) of the waveform's bins.
     """
     from mitransient_lidar.loading.scenes import choose_integrator
     from mitransient_lidar.rendering.render import render
@@ -155,7 +155,7 @@ def measure(
 
 
 def _load(case: str) -> mi.Scene:
-    """Load the scene of a case."""
+    """Load a case's scene."""
     from mitransient_lidar.loading.catalogue import scene_text
     from mitransient_lidar.loading.scenes import open_scene
 

@@ -1,4 +1,4 @@
-"""Measurements of benchmarks, each in its own process: its peak memory and compile time are independent of others."""
+"""Benchmark measurements, each in its own process: peak memory and compile time are independent of the others."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 
 from mitransient_lidar.core.errors import UserError
 
-#: Values of a measurement: labels of its task and its arguments.
+#: Measurement values: task labels and arguments.
 Tasks = Mapping[tuple[str, ...], Mapping[str, Any]]
 
 
 def run_processes(
     module: str, heading: tuple[str, ...], tasks: Tasks, columns: Mapping[str, str], as_json: bool, groups: str = ""
 ) -> None:
-    """Run a module of this folder for each task in its own process, and print the figures as a table or as JSON.
+    """Run a module in this folder for each task in its own process, and print the figures as a table or as JSON.
 
-    Tasks are given by their labels, whose headings are `heading`; `columns` are the headings of the figures. With
-    the heading `groups` a task returns the figures of several rows by their labels.
+    Tasks are given by their labels, with the headings `heading`; `columns` are the figures' headings. With the heading
+    `groups` a task returns the figures for several rows by their labels.
     """
     figures: dict[str, Any] = {}
     if not as_json:
@@ -31,7 +31,7 @@ def run_processes(
     for labels, task in tasks.items():
         command = [sys.executable, "-m", f"{__package__}.{module}", json.dumps(task)]
         with tempfile.TemporaryDirectory() as folder:
-            # In a session of its own: after Ctrl-C, it would print what it has as if it were all.
+            # In its own session: after Ctrl-C, it would print its part as if it were all.
             done = subprocess.run(
                 command,
                 check=False,
@@ -55,7 +55,7 @@ def run_processes(
 
 
 def answer(measure: Callable[..., Any]) -> None:
-    """Print the figures of the task of this process."""
+    """Print this process's task figures."""
     print(json.dumps(measure(**json.loads(sys.argv[1]))))
 
 

@@ -1,6 +1,6 @@
 """Quantities that are read from waveforms: highest points, durations, decay, and changes at a layer.
 
-Waveforms have the shape (pixel, time). What a waveform does not show is NaN.
+Waveforms have the shape (pixel, time). Quantities that a waveform does not show are NaN.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from mitransient_lidar.studies.shot_statistics import highest_of
 #: Shares of an echo's height between which its rise is measured.
 _FIRST, _LAST = 0.1, 0.9
 
-#: Distance of a change from its expected time, and lag of the differences of which its curvature is made [ns].
+#: Distance of a change from its expected time, and lag of the differences that give its curvature [ns].
 _REACH_NS, _LAG_NS = 9.0, 1.0
 
 
 @dataclass(frozen=True)
 class Waveform:
-    """Power [W] of the pixels, shape (pixel, time), at times [ns], and its parts by origin of the light."""
+    """Power [W] in the pixels, shape (pixel, time), at times [ns], and its parts by light origin."""
 
     time: FloatArray
     power: FloatArray
@@ -34,7 +34,7 @@ class Waveform:
         return np.asarray(self.power[:, self._bins(gate)].mean(axis=1))
 
     def highest(self, gate: tuple[float, float], origin: str = "") -> tuple[FloatArray, FloatArray]:
-        """Return height [W] and time [ns] of the highest point of each pixel in a gate [ns], as `highest_points`."""
+        """Return height [W] and time [ns] of each pixel's highest point in a gate [ns], as `highest_points`."""
         power = self.parts[origin] if origin else self.power
         return highest_of(self.time, power, np.flatnonzero(self._bins(gate)))
 
@@ -49,7 +49,7 @@ class Waveform:
 
 @dataclass(frozen=True)
 class Series:
-    """Power [W], shape (shot, pixel, time), of renders of one place with independent random numbers, or of places."""
+    """Power [W], shape (shot, pixel, time), in renders with independent random numbers at one or several locations."""
 
     time: FloatArray
     power: FloatArray
@@ -62,15 +62,15 @@ class Series:
         return self._mean(np.arange(len(self)) == shot)
 
     def mean(self) -> Waveform:
-        """Return the mean of the shots."""
+        """Return the mean over the shots."""
         return self._mean(np.full(len(self), True))
 
     def without(self, shot: int) -> Waveform:
-        """Return the mean of the other shots."""
+        """Return the mean over the other shots."""
         return self._mean(np.arange(len(self)) != shot)
 
     def each(self, measure: Callable[[Waveform], float]) -> FloatArray:
-        """Return a measure of each shot, shape (shot,)."""
+        """Return a measure for each shot, shape (shot,)."""
         return np.array([measure(self[shot]) for shot in range(len(self))])
 
     def _mean(self, chosen: FloatArray) -> Waveform:
@@ -79,9 +79,9 @@ class Series:
 
 
 def estimate(measure: Callable[..., float], *series: Series) -> tuple[float, float]:
-    """Return a measure of the means of series, and its standard error by the jackknife over the shots of each.
+    """Return a measure of the series' means, and its standard error by the jackknife over the shots in each.
 
-    The series are independent of each other.
+    The series are independent.
     """
     means = [one.mean() for one in series]
     variance = 0.0
@@ -122,7 +122,7 @@ def half_width(waveform: Waveform, pixel: int, gate: tuple[float, float]) -> flo
 def decay(waveform: Waveform, gate: tuple[float, float]) -> tuple[float, float]:
     """Return the rate of an exponential fitted to the power of all pixels in a gate [1/ns], and the rms residual [1].
 
-    The fit is of least squares in the logarithm; the residual is that of the logarithm.
+    The fit uses least squares in the logarithm, and the residual is logarithmic.
     """
     inside = (waveform.time >= gate[0]) & (waveform.time <= gate[1])
     time, logarithm = waveform.time[inside], np.log(waveform.power.sum(axis=0)[inside])
@@ -131,11 +131,11 @@ def decay(waveform: Waveform, gate: tuple[float, float]) -> tuple[float, float]:
 
 
 def change(waveform: Waveform, pixel: int, middle: float) -> tuple[float, float]:
-    """Return start and stop of a fall to a slower decay [ns], of a pixel's waveform; NaN beside the expected time.
+    """Return start and stop of a fall to a slower decay [ns], in a pixel's waveform; NaN beside the expected time.
 
-    The start is where the decay steepens fastest, the stop where it flattens fastest: the extremes of the second
-    derivative of the power's logarithm. A small step that a Gaussian smears has them one standard deviation before and
-    after its middle; an exponential adds nothing.
+    The start is where the decay steepens fastest, the stop where it flattens fastest: the extremes of the logarithmic
+    power's second derivative. A small step that a Gaussian smears has them one standard deviation before and after its
+    middle; an exponential adds nothing.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def duration(waveform: Waveform, pixel: int, middle: float) -> float:
 
 
 def far_after_near(waveform: Waveform, gate: tuple[float, float], origin: str = "") -> float:
-    """Return the delay of the mean highest point of the far pixels after that of the near ones [ns]."""
+    """Return the delay of the far pixels' mean highest point after the near pixels' [ns]."""
     times = waveform.highest(gate, origin)[1]
     return float(times[:2].mean() - times[2:].mean())
 

@@ -1,4 +1,4 @@
-"""Quantities of the statements of each figure, by their names in the table `statements.csv`."""
+"""Quantities for each figure's statements, by their names in the table `statements.csv`."""
 
 from __future__ import annotations
 
@@ -44,31 +44,31 @@ Quantities = dict[str, Measured]
 #: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
 _COLUMN = (2.0, 6.5)
 
-#: Least field of view of the publication's table 1 [rad].
+#: Least field of view in the publication's table 1 [rad].
 _LEAST_FIELD_OF_VIEW = 0.010
 
-#: Other places of the slopes of two shots.
+#: Other locations with the slopes of two shots.
 _COMBINATIONS = f"combinations of {PLACES_OF_SLOPE * len(SEAS)} places of each slope on {len(SEAS)} seas"
 
-#: Reason for differences of single places on waves.
+#: Reason for differences between single locations on waves.
 _FACETS = "at places of the same mean slope, a few facets make the echo, so that places differ"
 
 
 def _measured(measure: Callable[..., float], result: xr.Dataset, others: Series | None = None, **more: Any) -> Measured:
-    """Return a measure of the waveforms of a result, and of each of others, for texts with further words."""
+    """Return a measure of a result's waveforms, and of each of others, for texts with further words."""
     elsewhere = None if others is None else others.each(measure)
     words = {"shot": described(result), "random": RANDOM, **more}
     return Measured(*estimate(measure, as_series(result)), elsewhere, words)
 
 
 def _column(result: xr.Dataset) -> tuple[float, float]:
-    """Return the times of the depths of the column [ns]."""
+    """Return the times of the column's depths [ns]."""
     start, end = (float(geometry_of(result).time_of_depth(depth)) for depth in _COLUMN)
     return start, end
 
 
 def backscatter(renders: Renders) -> Quantities:
-    """Return the decay of the backscatter (figure 1b)."""
+    """Return the backscatter decay (figure 1b)."""
     result, others = renders.shot(scenes.SINGLE), renders.random(scenes.FOUR)
     gate, per_metre = _column(result), 2 * geometry_of(result).metres_per_ns
     absorption = float(result.attrs["scene.attenuation"]) - float(result.attrs["scene.scattering"])
@@ -103,7 +103,7 @@ def mast(renders: Renders) -> Quantities:
 
 
 def system(_renders: Renders) -> Quantities:
-    """Return angle, footprint and view of the system, from the parameters of its scene (figure 5)."""
+    """Return the system's angle, footprint and view, from its scene parameters (figure 5)."""
     one = scenes.System.of(scenes.FOUR)
     ranges = {"nearest": 1 / one.divergence, "furthest": 2 / one.divergence}
     return {
@@ -149,7 +149,7 @@ def pixels_over_bottom(renders: Renders) -> Quantities:
 
 
 def surface_echoes(renders: Renders) -> Quantities:
-    """Return strengths and times of the surface echoes of three shots (figure 10)."""
+    """Return strengths and times of three shots' surface echoes (figure 10)."""
     shots, slopes = scenes.three_shots(renders), scenes.shot_slopes(renders)
     places = renders.of_slopes(scenes.SHOTS[0], slopes)
     gate = echo_gate(shots[0], 0.0, 11.5)
@@ -185,7 +185,7 @@ def surface_echoes(renders: Renders) -> Quantities:
 
 
 def bottom_echoes(renders: Renders) -> Quantities:
-    """Return strengths and depths of the bottom echoes of three shots in the red pixel (figure 11)."""
+    """Return strengths and depths of three shots' bottom echoes in the red pixel (figure 11)."""
     shots = scenes.three_shots(renders)
     places = renders.of_slopes(scenes.SHOTS[0], scenes.shot_slopes(renders))
     gate = echo_gate(shots[0], float(shots[0].attrs["scene.bottom_depth"]), 12.0)
@@ -215,9 +215,9 @@ def _pair(
     pair: tuple[int, int],
     join: np.ufunc,
 ) -> tuple[tuple[float, float], FloatArray]:
-    """Return what joins the measures of two shots, with its error, and at all combinations of places of their slopes.
+    """Return the joined measures of two shots, with the error, and at all combinations of locations with their slopes.
 
-    The latter are NaN where a place has no measure.
+    The latter are NaN where a location has no measure.
     """
     value = estimate(lambda a, b: join(measure(a), measure(b)), *(as_series(shots[number]) for number in pair))
     one, other = (places[number].each(measure) for number in pair)
@@ -272,7 +272,7 @@ def strip_target(renders: Renders) -> Quantities:
 
 
 def layer_delays(renders: Renders) -> Quantities:
-    """Return delays of the surface echo and of the change of the water in the near pixels (figure 15)."""
+    """Return delays of the surface echo and of the water's change in the near pixels (figure 15)."""
     four, others = renders.shot(scenes.LAYERED_FOUR), renders.random(scenes.LAYERED_FOUR)
     gate, middles = echo_gate(four, 0.0), scenes.layer_times(four)
 
@@ -287,10 +287,10 @@ def layer_delays(renders: Renders) -> Quantities:
 
 
 def layer_durations(renders: Renders) -> Quantities:
-    """Return durations of the change of the water (figure 16)."""
+    """Return durations of the water's change (figure 16)."""
     four, single = renders.shot(scenes.LAYERED_FOUR), renders.shot(scenes.LAYERED_SINGLE)
     middles, middle = scenes.layer_times(four), float(scenes.layer_times(single)[0])
-    # Two standard deviations of the pulse [ns].
+    # Two pulse standard deviations [ns].
     shortest = 2 * float(single.attrs["pulse_fwhm_ns"]) / math.sqrt(8 * math.log(2))
 
     def mean_ratio(one: Waveform) -> float:

@@ -29,33 +29,33 @@ _LOG = logging.getLogger(__name__)
 #: Renders of a place with independent random numbers, from whose spread standard errors come.
 REPEATS = 8
 
-#: Seas of the other places, as values of ``surface_seed``.
+#: Seas for the other locations, as values of ``surface_seed``.
 SEAS = (1, 2, 3)
 
-#: Places on each sea: random ones, and those of the slopes of each shot.
+#: Locations on each sea: random ones, and those with each shot's slopes.
 RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5
 
 #: Random places in words.
 RANDOM = f"{RANDOM_PLACES * len(SEAS)} random places on {len(SEAS)} seas"
 
-#: Share of the paths of a full pass, passes of a place, and most passes for the requested error.
+#: Share of a full pass's paths, passes per location, and most passes for the requested error.
 _SHARE, _PASSES, _MOST_PASSES = 0.25, 4, 256
 
 #: Most passes of scenes that converge slowly: the mast's would take as long as all the others together.
 _FEWER_PASSES = {"fig04_mast": 12}
 
-#: Smallest distance of places of given slopes, and least distance that seeds of the renders are apart.
+#: Smallest distance between locations with given slopes, and least distance between render seeds.
 _APART_M, _SEED_STEP = 6.0, 1000
 
 
 @dataclass
 class Renders:
-    """Results of the publication's scenes.
+    """Results for the publication's scenes.
 
     Parameters
     ----------
     target_error
-        Relative standard error of the median bin of a figure, greater than 0. The mast of figure 4 may miss it.
+        Relative standard error of a figure's median bin, greater than 0. The mast in figure 4 may miss it.
     seed
         Seed of all random numbers, 0 to 10^6.
     progress
@@ -96,7 +96,7 @@ class Renders:
         return joined(found)
 
     def of_slopes(self, scene: str, slopes: Sequence[tuple[float, float]]) -> list[Series]:
-        """Return, for each pair of slopes (along, across) [1], renders at places of all seas with about them."""
+        """Return renders at locations on all seas with about the slopes of each pair (along, across) [1]."""
         found: list[list[Series]] = [[] for _ in slopes]
         for sea in SEAS:
             chart = self.sea(scene, sea)
@@ -113,7 +113,7 @@ class Renders:
     def session(self, scene: str, sea: int = 0) -> LoadedScene:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
-        # Series of its shots are rendered later.
+        # Its shot series are rendered later.
         variants.leave_the_gpu("figures are rendered")
         if key not in self._sessions:
             self._sessions[key] = open_scene(scene, {"surface_seed": sea} if sea else None)
@@ -121,7 +121,7 @@ class Renders:
 
     @alone
     def sea(self, scene: str, sea: int = 0) -> SeaMap:
-        """Return the map of the sea of a scene, on its own sea (0) or on another one."""
+        """Return the map of a scene's sea, on its own sea (0) or on another one."""
         key = (scene, sea)
         if key not in self._seas:
             self._seas[key] = SeaMap.of_scene(self.session(scene, sea).scene)
@@ -143,7 +143,7 @@ class Renders:
 
 
 def as_series(result: xr.Dataset) -> Series:
-    """Return the waveforms of a series of shots, with those by origin where they are known."""
+    """Return the waveforms of a shot series, with those by origin where they are known."""
     parts = {}
     if "waveform_by_origin" in result:
         by_origin = result["waveform_by_origin"]
@@ -152,7 +152,7 @@ def as_series(result: xr.Dataset) -> Series:
 
 
 def joined(series: Sequence[Series]) -> Series:
-    """Return the shots of several series, on the time bins that all of them have."""
+    """Return the shots of several series, on their common time bins."""
     start, end = max(one.time[0] for one in series), min(one.time[-1] for one in series)
     cut = [(one, (one.time >= start - 1e-6) & (one.time <= end + 1e-6)) for one in series]
     parts = {name: np.concatenate([one.parts[name][..., kept] for one, kept in cut]) for name in series[0].parts}
@@ -171,7 +171,7 @@ def echo_gate(result: xr.Dataset, depth: float, half_ns: float = 11.0) -> tuple[
 
 
 def described(result: xr.Dataset) -> str:
-    """Return place, mesh and number of renders of a shot as text."""
+    """Return a shot's location, mesh and number of renders as text."""
     surface = json.loads(result.attrs["plugin_parameters"])["surface"]
     used = {**surface, **surface.get("used", {})}
     scene, seed, cell = result.attrs["scene"], int(used["surface_seed"]), float(used["cell_size"])

@@ -25,13 +25,13 @@ SQUARE, STRIPS, LAYERED_FOUR, LAYERED_SINGLE = "fig13_2x2", "fig14_1x4", "fig15_
 LAYOUTS = (SINGLE, FOUR, STRIPS)
 SHOTS, _BIN_WIDTH_NS = ("fig11_shot1", "fig11_shot2", "fig11_shot3"), 0.25
 
-#: Depth of the change of the water [m].
+#: Depth of the water's change [m].
 _LAYER_DEPTH = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class System(LidarGeometry):
-    """Lidar of a scene: divergence and field of view [rad], and depth of the bottom [m]."""
+    """Lidar in a scene: divergence and field of view [rad], and bottom depth [m]."""
 
     divergence: float
     field_of_view: float
@@ -39,7 +39,7 @@ class System(LidarGeometry):
 
     @classmethod
     def of(cls, scene: str) -> System:
-        """Read the parameters of a scene."""
+        """Read a scene's parameters."""
         values = scene_parameters(scene)
         return cls(
             float(values["altitude"]),
@@ -52,12 +52,12 @@ class System(LidarGeometry):
 
 
 def outlines(renders: Renders, scene: str) -> list[list[FloatArray]]:
-    """Return the outlines (angle_x, angle_y) [rad] of each pixel of a scene."""
+    """Return the outlines (angle_x, angle_y) [rad] of each pixel in a scene."""
     return [list(lines) for lines in pixel_outlines(renders.session(scene).sensor.receiver.pixels)]
 
 
 def shot_places(renders: Renders) -> list[Shot]:
-    """Return places and mean slopes over the footprint of the beam of the three shots, which share one sea."""
+    """Return locations and mean slopes over the beam's footprint for the three shots, which share one sea."""
     sea, found = renders.sea(SHOTS[0]), []
     for number, scene in enumerate(SHOTS, start=1):
         values = scene_parameters(scene)

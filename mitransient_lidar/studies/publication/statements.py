@@ -1,7 +1,7 @@
-"""Statements of the publication, each with a measured quantity, its error, and whether it holds.
+"""Statements in the publication, each with a measured quantity, its error, and whether it holds.
 
 Their table, `statements.csv`, has the published value, the limits between which a statement holds, and texts in which
-names in braces stand for words of the measured quantity.
+names in braces stand for words about the measured quantity.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
 
-#: Names of the columns of the table that is written.
+#: Column names in the written table.
 COLUMNS = (
     *("figure", "statement", "quantity", "published", "value", "standard_error", "holds", "share", "where"),
     "difference",
@@ -30,7 +30,7 @@ _MARGIN = 2.0
 
 
 class Measured(NamedTuple):
-    """Quantity of a statement: value, standard error, values at other places if any, and words of its texts."""
+    """Quantity in a statement: value, standard error, values at other locations if any, and words for its texts."""
 
     value: float
     error: float = 0.0
@@ -40,12 +40,12 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement of the publication in our words, and what was measured.
+    """A statement in the publication, reworded, and the measured quantity.
 
     Attributes
     ----------
     figure, statement, quantity
-        Name of the figure, what is stated, and the measured quantity with its unit.
+        Name of the figure, the statement, and the measured quantity with its unit.
     published
         Published value, empty without a number.
     value, error
@@ -55,9 +55,9 @@ class Statement:
     where
         Measure, place and mesh.
     share
-        Share of other places for which it holds, None if no place was chosen.
+        Share of other locations for which it holds, None if no location was chosen.
     places
-        What these places are.
+        Description of these locations.
     difference
         Reason for a difference from the publication.
     """
@@ -76,10 +76,10 @@ class Statement:
 
     @property
     def holds(self) -> str:
-        """``yes`` within the limits, and at half of the other places or more; ``no``; ``partly`` between these.
+        """``yes`` within the limits, and at half of the other locations or more; ``no``; ``partly`` between these.
 
-        Partly is a value within the limits that holds at fewer places, one outside that holds at half of them, and one
-        that is less than two standard errors outside.
+        Partly is a value within the limits that holds at fewer locations, one outside that holds at half of them, and
+        one that is less than two standard errors outside.
         """
         low, high = self.limits
         common = self.share is None or self.share >= 0.5
@@ -90,7 +90,7 @@ class Statement:
         return "partly" if near and math.isfinite(self.value) else "no"
 
     def row(self) -> list[str]:
-        """Return the texts of the columns."""
+        """Return the column texts."""
         share = "" if self.share is None else f"{self.share:.2f}"
         where = (
             self.where if self.share is None else f"{self.where}; holds at {100 * self.share:.0f} % of {self.places}"
@@ -103,7 +103,7 @@ class Statement:
 
 
 def statements_of(figure: str, found: Mapping[str, Measured]) -> list[Statement]:
-    """Return the statements of a figure in the order of the table, with the quantities that were found, by name."""
+    """Return a figure's statements in table order, with the found quantities by name."""
     text = (resources.files(__package__) / "statements.csv").read_text("utf-8")
     return [
         _statement(row, found[row["measure"]]) for row in csv.DictReader(text.splitlines()) if row["figure"] == figure
@@ -111,7 +111,7 @@ def statements_of(figure: str, found: Mapping[str, Measured]) -> list[Statement]
 
 
 def _statement(row: Mapping[str, str], found: Measured) -> Statement:
-    """Return the statement of a row of the table."""
+    """Return the statement in a table row."""
     texts = {name: text.format(**found.words) for name, text in row.items()}
     low, high = float(texts["low"]), float(texts["high"])
     return Statement(

@@ -1,1 +1,1 @@
-"""Daylight: sun and sky, sampling of the field of view, and the radiance of each pixel."""
+"""Daylight: sun and sky, field-of-view sampling, and each pixel's radiance."""

@@ -1,4 +1,4 @@
-"""Passes of daylight, for the radiance of each pixel."""
+"""Daylight passes, for each pixel's radiance."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ _LONG, _LONG_SURVIVAL = 100, 0.9
 
 @dataclass
 class ReceivedDaylight:
-    """Daylight of one pass.
+    """Daylight in one pass.
 
     Attributes
     ----------
     found
-        Radiance times solid angle of each pixel [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
+        Each pixel's radiance times solid angle [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
     sampled
-        Solid angle of the samples of each pixel [sr], shape (pixels,).
+        Solid angle that each pixel's samples represent [sr], shape (pixels,).
     edge_loss
         Radiance times solid angle that would have been found if the surface mesh did not end, shape (1,).
     rays
-        Number of rays traced.
+        Number of traced rays.
     """
 
     found: mi.Float64
@@ -53,7 +53,7 @@ class ReceivedDaylight:
 
 
 class DaylightLight(PathLight):
-    """Sun and sky, and the light of a pass; uniform random numbers `u` choose a point of the sun's disc per path."""
+    """Sun and sky, and the light of a pass; uniform random numbers `u` choose a point on the sun's disc per path."""
 
     def __init__(self, scene: DaylightScene, received: ReceivedDaylight, u: mi.Point2f, weight: mi.Float) -> None:
         self.scene, self.received, self.weight = scene, received, weight
@@ -78,7 +78,7 @@ class DaylightLight(PathLight):
     def receive(
         self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
-        """Add light of the sun."""
+        """Add sunlight."""
         self.add(path.pixel, energy, active)
 
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
@@ -105,7 +105,7 @@ class DaylightLight(PathLight):
         self.add(path.pixel, self.weight * path.throughput * radiance, bright)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
-        """Add light of the sun to the losses."""
+        """Add sunlight to the losses."""
         sun = self.scene.sun
         if sun is not None:
             missing = share * level_transmittance(self.scene, emitter) * sun.sampled_irradiance
@@ -125,7 +125,7 @@ class DaylightRenderer:
         self.sampler = FovSampler(scene.receiver)
 
     def render_pass(self, seed: int, *, paths: int | None = None) -> ReceivedDaylight:
-        """Render one pass; passes of different seeds are independent."""
+        """Render one pass; passes with different seeds are independent."""
         count = self.paths if paths is None else paths
         require_memory(f"{count} paths", BYTES_PER_PATH * count, "take fewer paths_per_pass")
         with dr.suspend_grad():
@@ -162,4 +162,4 @@ class DaylightIntegrator(Protocol):
     passive: bool
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
-        """Return the renderer of passes of a scene."""
+        """Return the pass renderer for a scene."""

@@ -12,7 +12,7 @@ from mitransient_lidar.transport.rng import pass_streams, stratified_point
 from mitransient_lidar.transport.sensor.pixels import PixelArray, parse_layout
 from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSample, solid_angle_factor
 
-#: Least number of points along each axis of the field of view for the solid angles of pixels.
+#: Least number of points along each field-of-view axis for the pixels' solid angles.
 _LATTICE = 4096
 
 #: Number of rays for the share of the field of view outside the surface mesh.
@@ -41,11 +41,11 @@ class FovSampler:
 
 
 def pixel_solid_angles(pixels: PixelArray) -> NDArray[np.float64]:
-    """Return the solid angle of each pixel [sr], shape (pixels,), counted on a fine lattice of the field of view.
+    """Return each pixel's solid angle [sr], shape (pixels,), counted on a fine lattice over the field of view.
 
-    Cells of a layout that the field of view does not cut are exact.
+    Layout cells that the field of view does not cut are exact.
     """
-    # An integer number of points in every cell of a layout.
+    # An integer number of points in every layout cell.
     cells = parse_layout(pixels.layout) if pixels.layout[0].isdigit() else (1, 1)
     rows, columns = (cell * -(-_LATTICE // cell) for cell in cells)
     index = dr.arange(mi.UInt32, rows * columns)

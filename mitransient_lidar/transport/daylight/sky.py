@@ -1,4 +1,4 @@
-"""Radiance distributions of the sky, and directions of the sun."""
+"""Sky radiance distributions, and sun directions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def direction_of(zenith_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
 
 
 def uniform_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
-    """Return the relative radiance of a uniform sky."""
+    """Return a uniform sky's relative radiance."""
     return mi.Float(1)
 
 
@@ -45,7 +45,7 @@ def clear_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
     return around * (1 - dr.exp(-0.19 / dr.maximum(direction.z, 1e-6)))
 
 
-#: Relative radiance by the name of the distribution.
+#: Relative radiance by distribution name.
 SKIES: dict[str, Callable[[mi.Vector3f, mi.Vector3f], mi.Float]] = {
     "clear": clear_distribution,
     "overcast": overcast_distribution,
@@ -54,7 +54,7 @@ SKIES: dict[str, Callable[[mi.Vector3f, mi.Vector3f], mi.Float]] = {
 
 
 def relative_irradiance(name: str, sun: NDArray[np.float64]) -> float:
-    """Return the irradiance on a level plane of a distribution of relative radiance, by the midpoint rule."""
+    """Return the irradiance on a level plane by a relative radiance distribution, with the midpoint rule."""
     n = _QUADRATURE_POINTS
     index = dr.arange(mi.UInt32, n**2)
     cosine2 = (mi.Float(index % n) + 0.5) / n

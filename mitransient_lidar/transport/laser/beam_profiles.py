@@ -1,4 +1,4 @@
-"""Profiles of a laser beam in tangent-plane angles: density of its energy, sampling, widths and contours."""
+"""Laser beam profiles in tangent-plane angles: energy density, sampling, widths and contours."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
 #: Shares of the peak irradiance at which a beam's outlines are drawn.
 OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
 
-#: Longest side of an image: 32-bit random numbers do not resolve the cells of finer ones.
+#: Longest image side: 32-bit random numbers do not resolve finer cells.
 _LONGEST_SIDE = 2048
 
-#: Outlines of an image that enclose less than this share of the largest are dropped as noise.
+#: Image outlines that enclose less than this share of the largest one are dropped as noise.
 _SMALLEST_ISLAND = 0.02
 
 
 class BeamProfile(ABC):
-    """Energy of a beam over the tangent plane, normalised to 1.
+    """Beam energy over the tangent plane, normalised to 1.
 
     Attributes
     ----------
     spreads
         Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
     rotation
-        Azimuth of the first of these axes, from +angle_x towards +angle_y [rad].
+        Azimuth of the first axis, from +angle_x towards +angle_y [rad].
     divergence
-        Full angles along these axes [rad], as defined for the parameter ``divergence_mrad`` of the transmitter.
+        Full angles along these axes [rad], as defined for the transmitter parameter ``divergence_mrad``.
     reach
         Angle from the optical axis that contains all of the energy but 4e-6 [rad].
     """
@@ -106,7 +106,7 @@ class GaussianBeam(_Ellipse):
         return opaque(peak) * dr.exp(-opaque(steepness) * (x * x + y * y))
 
     def width_slope(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
-        """Return the derivative of the logarithm of the density by that of the widths, their ratio held fixed."""
+        """Return the derivative of the logarithmic density by the logarithmic widths, with their ratio held fixed."""
         x, y = self._to_circle(angle_x, angle_y)
         return (x * x + y * y) * opaque(1 / self.along**2) - 2
 
@@ -134,7 +134,7 @@ class TopHatBeam(_Ellipse):
         return dr.select(inside, opaque(1 / (np.pi * self.along**2 * self._ratio)), 0)
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to uniform points of the ellipse."""
+        """Map uniform numbers to uniform points in the ellipse."""
         radius = opaque(self.along) * dr.sqrt(u.x)
         sin, cos = dr.sincos(dr.two_pi * u.y)
         return self._from_circle(radius * cos, radius * sin)
@@ -207,7 +207,7 @@ class ImageBeam(BeamProfile):
         return self._cell * (0.5 * self._rows - row), self._cell * (0.5 * self._columns - column)
 
     def outlines(self) -> list[tuple[float, list[Outline]]]:
-        """Return the lines of equal irradiance, without islands of noise."""
+        """Return the lines of equal irradiance, without noise islands."""
         # A dark frame closes every line.
         padded = np.pad(self._share / self._share.max(), 1)
         far = self._cell * (0.5 * self._rows + 0.5 - np.arange(self._rows + 2))

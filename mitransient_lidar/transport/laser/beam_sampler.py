@@ -1,4 +1,4 @@
-"""Sampling of the laser's beam within the receiver's field of view."""
+"""Sampling of the laser beam within the receiver's field of view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 #: The field of view is sampled separately when it contains less than this share of the beam.
 _SMALLEST_SHARE = 0.5
 
-#: Radius of the core of the sampled region over that of the field of view, as light around it scatters into it.
+#: Core radius of the sampled region relative to the field of view, as light around it scatters into it.
 _ROOM = 1.5
 
 #: Width around that core beyond which there is little light, over the beam's standard deviation.
@@ -22,7 +22,7 @@ _BEAM_EDGE = 3.0
 
 
 class BeamSampler:
-    """Samples the beam by its energy; half of the samples about the field of view when that is much narrower.
+    """Samples the beam by its energy; half the samples lie about the field of view when that is much narrower.
 
     Light that enters the water farther from the view the deeper reaches it, so that those samples are distributed in
     `Octaves`. Both halves are weighted by the balance heuristic. Samples are stratified.

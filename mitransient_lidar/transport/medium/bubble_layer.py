@@ -25,7 +25,7 @@ class BubbleLayer:
     Parameters
     ----------
     scattering
-        Scattering coefficient of the bubbles at the mean sea level [1/m], at most 1000, added to that of the water.
+        Scattering coefficient of the bubbles at the mean sea level [1/m], at most 1000, added to the water's.
     depth
         Depth at which it has fallen to 1/e [m], 0.05 to 20.
     """
@@ -37,7 +37,7 @@ class BubbleLayer:
         """Return the scattering coefficient of the bubbles at a point [1/m]."""
         return opaque(self.scattering) * dr.exp(dr.minimum(point.z, 0) / opaque(self.depth))
 
-    #: Scattering coefficient at the place of an event of bubbles [1/m].
+    #: Scattering coefficient at a bubble event [1/m].
     scattering_of_event = scattering_at
 
     def optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float) -> mi.Float:
@@ -62,7 +62,7 @@ class BubbleLayer:
         return dr.select(rises, rising, sinking)
 
     def _inclined(self, downward: mi.Float) -> mi.Float:
-        """Return the downward component of a direction, not 0."""
+        """Return a direction's downward component, not 0."""
         return dr.select(dr.abs(downward) > _LEVEL, downward, _LEVEL)
 
     def _below(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
@@ -77,7 +77,7 @@ class BubbleLayer:
         """Return the distance of an optical depth below the mean sea level [m], infinite if it is not reached."""
         density, scale = opaque(self.scattering), opaque(self.depth)
         start = dr.exp(-depth / scale)
-        # What is left of the density at the end, relative to that at the mean sea level.
+        # Density left at the end, relative to the density at the mean sea level.
         end = start - optical_depth * downward / (density * scale)
         change = optical_depth * downward / (density * scale * start)
         series = optical_depth / (density * start) * (1 + change * (0.5 + change / 3))

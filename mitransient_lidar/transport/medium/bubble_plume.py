@@ -16,19 +16,19 @@ from mitransient_lidar.transport.opaque import opaque, opaque_point
 class BubblePlume:
     """Bubbles of even density behind a ship, from the surface down.
 
-    They scatter and do not absorb. A flight ends at the event of bubbles or of the water layers that comes first, which
-    is exact for their sum.
+    They scatter and do not absorb. A flight ends at the first event by bubbles or water layers, which is exact for
+    their sum.
 
     Parameters
     ----------
     scattering
-        Scattering coefficient of the bubbles [1/m], 0 to 1000, added to that of the water.
+        Scattering coefficient of the bubbles [1/m], 0 to 1000, added to the water's.
     x, y
         Start of the plume, at the stern [m], -1e7 to 1e7.
     bearing
         Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
     length, width, depth
-        Extent of the plume [m].
+        Plume extent [m].
     """
 
     scattering: float
@@ -49,7 +49,7 @@ class BubblePlume:
         return self._frame(point - opaque_point((self.x, self.y, 0.0)))
 
     def _frame(self, vector: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Return the components of a vector astern and across."""
+        """Return a vector's components astern and across."""
         cos, sin = opaque(np.cos(self.bearing)), opaque(np.sin(self.bearing))
         return -(cos * vector.x + sin * vector.y), cos * vector.y - sin * vector.x
 
@@ -64,7 +64,7 @@ class BubblePlume:
         return dr.select(self.holds(point), opaque(self.scattering), 0)
 
     def scattering_of_event(self, point: mi.Point3f) -> mi.Float:
-        """Return the scattering coefficient at the place of an event of bubbles [1/m], which may be on the edge."""
+        """Return the scattering coefficient at a bubble event [1/m], which may be on the edge."""
         return opaque(self.scattering)
 
     def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

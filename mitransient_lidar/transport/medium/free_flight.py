@@ -14,10 +14,10 @@ _SMALLEST_OPTICAL_DEPTH = 1e-30
 
 
 class LayeredFlight:
-    """Free flights, optical depths and coefficients of a `WaterColumn`.
+    """Free flights, optical depths and coefficients in a `WaterColumn`.
 
-    Optical depths are exact in every direction: within the layer where a segment starts or ends they are the product
-    of attenuation and length (no division by the vertical component), between layers the difference of tabulated
+    Optical depths are exact in every direction. Within the layer where a segment starts or ends they are the product of
+    attenuation and length (no division by the vertical component), between layers the difference between tabulated
     vertical optical depths.
     """
 
@@ -41,7 +41,7 @@ class LayeredFlight:
         return self._look_up(self._attenuation, layer)
 
     def albedo(self, layer: mi.UInt32) -> mi.Float:
-        """Return the single-scattering albedo b/c of a layer."""
+        """Return a layer's single-scattering albedo b/c."""
         return self._look_up(self._albedo, layer)
 
     def _table(self, values: FloatArray) -> mi.Float:
@@ -90,7 +90,7 @@ class LayeredFlight:
         return dr.select(leaves, dr.maximum(to_edge, 0), dr.inf), edge
 
     def optical_depth(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
-        """Return the optical depth of a segment: depth of its start [m], downward component, length [m]."""
+        """Return a segment's optical depth from its starting depth [m], downward component, and length [m]."""
         layer = self.layer_at(depth)
         here = self.coefficient(layer)
         if self.count == 1:

@@ -10,7 +10,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.medium.snell import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque
 
-#: Largest number of index layers: connections are traced through each of them.
+#: Largest number of index layers: connections are traced through each.
 MOST_INDEX_LAYERS = 16
 
 #: Vertical distance within which solids and boundaries coincide: absolute [m], and over the length of a ray.
@@ -26,7 +26,7 @@ class IndexLayers:
     Parameters
     ----------
     layer_tops
-        Depths of the upper edges of the water layers [m], shape (layers,).
+        Upper edge depths of the water layers [m], shape (layers,).
     refractive_index, group_index
         Indices of the water layers, shape (layers,).
 
@@ -38,7 +38,7 @@ class IndexLayers:
 
     def __init__(self, layer_tops: np.ndarray, refractive_index: np.ndarray, group_index: np.ndarray) -> None:
         begins = np.append(True, (np.diff(refractive_index) != 0) | (np.diff(group_index) != 0))
-        #: Depths of the boundaries [m].
+        #: Boundary depths [m].
         self.boundaries = layer_tops[begins][1:]
         self.refractive_index, self.group_index = refractive_index[begins], group_index[begins]
         self.count = len(self.refractive_index)
@@ -59,7 +59,7 @@ class IndexLayers:
         return layer
 
     def group(self, layer: mi.UInt32) -> mi.Float:
-        """Return the group index of an index layer."""
+        """Return an index layer's group index."""
         return opaque(self.group_index[0]) if self.count == 1 else dr.gather(mi.Float, self._group, layer)
 
     def to_boundary(self, depth: mi.Float, downward: mi.Float, layer: mi.UInt32, active: mi.Bool) -> mi.Float:
@@ -93,5 +93,5 @@ class IndexLayers:
 
 
 def coinciding(length: mi.Float) -> mi.Float:
-    """Return the vertical distance [m] within which a solid lies in the plane of a boundary, for rays of a length."""
+    """Return the vertical distance [m] within which a solid lies in a boundary plane, for rays with a length."""
     return dr.fma(length, _SAME_PER_LENGTH, _SAME)

@@ -12,7 +12,7 @@ def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: mi.Float | float) 
     Parameters
     ----------
     direction
-        Unit direction from the facet to the source of the light, on the side of the normal.
+        Unit direction from the facet to the light source, on the side of the normal.
     normal
         Unit normal of the facet.
     eta
@@ -29,7 +29,7 @@ def refract_level(direction: mi.Vector3f, eta: mi.Float | float) -> tuple[mi.Vec
     Parameters
     ----------
     direction
-        Unit direction of propagation.
+        Unit propagation direction.
     eta
         Refractive index before the plane over the index behind it. Where it exceeds 1, light may be totally reflected.
     """

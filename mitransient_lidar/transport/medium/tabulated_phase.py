@@ -17,16 +17,16 @@ _SMALLEST_EXPONENT = 1e-3
 #: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
 _SMALLEST_S = 1e-14
 
-#: Largest spacing of the nodes in ln s, change of ln p between nodes, and first node for which a series replaces
-#: logarithm and exponential and the cap below the first node (2 microradian) is uniform: both are exact to float32.
+#: Largest node spacing in ln s, change in ln p between nodes, and first node for which a series replaces logarithm and
+#: exponential and the cap below the first node (2 microradian) is uniform: both are exact to float32.
 _SHORT_STEP, _SMALL_CHANGE, _SMALL_CAP = 0.02, 0.2, 1.1e-12
 
 
 class TabulatedPhase:
     """Evaluates and samples phase functions given as power laws in s = sin^2(theta/2).
 
-    A segment is drawn by Walker's alias method (two look-ups for any size of the table), and s within it by the inverse
-    of its power law, so that samples are accurate in the forward peak.
+    A segment is drawn by Walker's alias method (two look-ups for any table size), and s within it by the inverse of its
+    power law, so that samples are accurate in the forward peak.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class TabulatedPhase:
 
 @dataclass(frozen=True)
 class NumberedPhase:
-    """Phase functions of a `TabulatedPhase`, one a lane, with the methods of Mitsuba's phase functions."""
+    """Phase functions in a `TabulatedPhase`, one per lane, with the methods of Mitsuba's phase functions."""
 
     functions: TabulatedPhase
     number: mi.UInt32
@@ -110,7 +110,7 @@ def is_short(table: PowerLawTable) -> bool:
 
 
 def _within_short_segment(law: mi.Vector4f, v: mi.Float, step: float) -> tuple[mi.Float, mi.Float]:
-    """Map a uniform number to s and p of a cell, given its start, its p there, k = 1 - m and whether it is the cap.
+    """Map a uniform number to s and p in a cell, given its start, its p there, k = 1 - m and whether it is the cap.
 
     ln s grows by y = ln(1 + v (e^x - 1)) / k with x = k step, here to the third power of x in units of the step.
     """
@@ -125,7 +125,7 @@ def _within_short_segment(law: mi.Vector4f, v: mi.Float, step: float) -> tuple[m
 
 
 def _records(table: PowerLawTable, short: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (threshold, alias), the law as sampled, and (exponent, ln p) of each segment and, last, of the cap.
+    """Return (threshold, alias), the sampled law, and (exponent, ln p) for each segment and, last, for the cap.
 
     The law is (s, p, k, whether it is the cap) of short segments, and (s, p, growth, 1/k) otherwise.
     """
@@ -159,7 +159,7 @@ def deflect(frame: mi.Frame3f, s: mi.Float, azimuth: mi.Float) -> mi.Vector3f:
 
 
 def henyey_greenstein(cosine: mi.Float, g: float) -> mi.Float:
-    """Return the Henyey-Greenstein function [1/sr] of the cosine of the scattering angle."""
+    """Return the Henyey-Greenstein function [1/sr] of the scattering angle's cosine."""
     base = 1 + g * g - 2 * g * cosine
     return (1 - g * g) / (4 * np.pi) * dr.rcp(base * dr.sqrt(base))
 

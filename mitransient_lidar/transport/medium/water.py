@@ -1,4 +1,4 @@
-"""The water that paths meet: layers, bubbles, and what scatters in them."""
+"""The water that paths meet: layers, bubbles, and scatterers."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class Water:
     Attributes
     ----------
     column
-        Coefficients of the layers; neighbours of equal properties are joined.
+        Layer coefficients; equal neighbours are joined.
     layers
         The layers as given, and their phase functions for changed coefficients.
     phases
         Phase functions of the layers, and last of the bubbles.
     index_layers
-        Runs of layers of one refractive and one group index.
+        Runs of layers with one refractive and one group index.
     water_scattering
-        Scattering by water molecules of each layer, a part of b [1/m]; 0 where it is not known.
+        Scattering by water molecules in each layer, a part of b [1/m]; 0 where it is not known.
     plume
         Bubbles, or None.
     from_profile
@@ -40,7 +40,8 @@ class Water:
     wavelength_nm
         Wavelength of the water [nm]; None where its coefficients and indices are given as numbers without one.
     by_name
-        Whether the water is computed at this wavelength; one of numbers at a green wavelength stands for green lasers.
+        Whether the water is computed at this wavelength; a water by numbers at a green wavelength represents green
+        lasers.
     flight, scattering_flight, absorption_flight
         Free flights by attenuation, scattering and absorption.
     """
@@ -95,7 +96,7 @@ class Water:
         return None if self.plume is None else self.phases.phases[-1]
 
     def free_flight(self, flight: LayeredFlight, point: mi.Point3f, direction: mi.Vector3f, rng: mi.PCG32) -> mi.Float:
-        """Draw the distance to the next event of `flight`, or of the bubbles [m]."""
+        """Draw the distance to the next event in `flight`, or by bubbles [m]."""
         distance = flight.distance(-point.z, -direction.z, -dr.log(1 - rng.next_float32()))
         if self.plume is None:
             return distance
@@ -107,7 +108,7 @@ class Water:
         return through if self.plume is None else through + self.plume.optical_depth(point, direction, length)
 
     def scatterer_at(self, flight: LayeredFlight, point: mi.Point3f, rng: mi.PCG32) -> mi.UInt32:
-        """Draw the scatterer at the end of a flight: the number of the layer, or the number of layers for a bubble."""
+        """Draw the scatterer at the end of a flight: the layer number, or the number of layers for a bubble."""
         layer = flight.layer_at(-point.z)
         if self.plume is None:
             return layer
@@ -116,11 +117,11 @@ class Water:
         return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
 
     def is_water(self, scatterer: mi.UInt32) -> mi.Bool:
-        """Return whether scatterers are layers of water, not bubbles."""
+        """Return whether scatterers are water layers, not bubbles."""
         return scatterer < self.column.count
 
     def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32, point: mi.Point3f) -> mi.Float:
-        """Return the coefficient in `flight` of the scatterer of an event at a point [1/m]."""
+        """Return the coefficient in `flight` of an event's scatterer at a point [1/m]."""
         if self.plume is None:
             return flight.coefficient(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)

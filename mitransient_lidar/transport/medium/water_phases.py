@@ -1,4 +1,4 @@
-"""Phase functions of the layers of water: selection, mixture with pure water, and lookup by layer."""
+"""Phase functions of water layers: selection, mixture with pure water, and lookup by layer."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class HasTable(Protocol):
     tabulated: TabulatedPhase
 
 
-#: Beyond this number of different mixtures, bb/b and share of pure water are rounded to this step of their logarithms.
+#: Beyond this number of different mixtures, bb/b and pure water's share are rounded to this step in their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
 
 #: bb/b where there are no particles, without effect.
 _ANY_RATIO = 0.0183
 
-#: Share of the scattering below which that of pure water is left out.
+#: Share of the scattering below which pure water is left out.
 _SMALLEST_SHARE = 1e-4
 
 
@@ -74,7 +74,7 @@ class ScattererPhases:
 
 @dataclass(frozen=True)
 class LayerPhases:
-    """How the phase functions of layers follow from their coefficients.
+    """Phase functions of layers as they follow from their coefficients.
 
     Attributes
     ----------
@@ -83,15 +83,15 @@ class LayerPhases:
     nested
         Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     kind
-        Choice of the parameter ``phase_function``, used where none is nested.
+        Choice by the parameter ``phase_function``, used where none is nested.
     phase_g
         Mean cosine for ``hg``.
     water_scattering
-        Scattering of pure water [1/m], shape (layers,), a part of the column's scattering.
+        Scattering by pure water [1/m], shape (layers,), a part of the column's scattering.
     chi_p
-        bb/(2 pi p(pi) b) of the particles of each layer, shape (layers,), or None for that of their function.
+        bb/(2 pi p(pi) b) of the particles in each layer, shape (layers,), or None for their function's value.
     tabulated
-        Constructor of a phase function from a table.
+        Constructor that makes a phase function from a table.
     """
 
     column: WaterColumn
@@ -138,7 +138,7 @@ class LayerPhases:
         backscattering: float | None = None,
         phase_g: float | None = None,
     ) -> PowerLawTable:
-        """Return the phase function of a layer, with some of its coefficients [1/m] or its mean cosine changed."""
+        """Return a layer's phase function, with some of its coefficients [1/m] or its mean cosine changed."""
         column = self.column
         b = float(column.scattering[layer]) if scattering is None else scattering
         bb = float(column.backscattering[layer]) if backscattering is None else backscattering
@@ -170,7 +170,7 @@ def check_phases(phases: Mapping[str, mi.PhaseFunction]) -> None:
 def _fournier_forand(
     column: WaterColumn, water_scattering: np.ndarray, share: np.ndarray
 ) -> tuple[list[mi.PhaseFunction], np.ndarray]:
-    """Return phase functions of particles by their bb/b, and pure water's share of the scattering; both one a layer."""
+    """Return the particles' phase functions by their bb/b, and pure water's scattering share; both one per layer."""
     particles = column.scattering - water_scattering
     back = column.backscattering - water_scattering / 2
     for layer in np.flatnonzero((back < 0) & (particles > 0))[:1]:
@@ -198,7 +198,7 @@ def _mixed(
     chi_p: list[float | None],
     tabulated: Callable[[PowerLawTable], mi.PhaseFunction],
 ) -> list[mi.PhaseFunction]:
-    """Return phase functions of particles mixed with that of pure water, by its share of the scattering."""
+    """Return the particles' phase functions mixed with pure water's, by its share of the scattering."""
 
     @cache
     def mixed(number: int, part: float, chi: float | None) -> mi.PhaseFunction:
@@ -221,5 +221,5 @@ def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
     mei = dr.zeros(mi.MediumInteraction3f, len(s))
     mei.wi = mi.Vector3f(0, 0, -1)
     value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, deflect(mi.Frame3f(-mei.wi), mi.Float(s), mi.Float(0)))
-    # The value of an isotropic function is one number.
+    # An isotropic function's value is one number.
     return PowerLawTable.from_values(np.broadcast_to(np.array(value[0], dtype=np.float64), s.shape))

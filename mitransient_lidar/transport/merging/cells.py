@@ -15,32 +15,32 @@ from mitransient_lidar.transport.opaque import changed, opaque
 from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Logarithm to base 2 of the largest number of buckets of a shot.
+#: Base-2 logarithm of the largest number of buckets per shot.
 MOST_BUCKET_BITS = 20
 
-#: Largest growth of the width of cells with depth.
+#: Largest growth of cell width with depth.
 _MOST_GROWTH = 4.0
 
-#: Growth of the thickness of layers with depth, up to the final one: facets focus light in patterns that change with
-#: depth, and twice this growth loses 3 % of the column below waves of 15 cm.
+#: Growth of layer thickness with depth, up to the final one: facets focus light in patterns that change with depth, and
+#: twice this growth loses 3 % of the column below 15 cm waves.
 _THICKNESS_PER_DEPTH = 0.25
 
 #: Least thickness of the uppermost layer, over the final one.
 _LEAST_THICKNESS = 0.01
 
-#: Least vertical component of the directions along which points move to the plane of their layer.
+#: Least vertical component of the directions along which points move to their layer's plane.
 _LEAST_DESCENT = 0.5
 
-#: Least thickness of a cell that a solid cuts over that of a whole one, and in water that is no deeper than one cell.
+#: Least thickness of a cell that a solid cuts relative to a whole one, and in water that is no deeper than one cell.
 _LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
 
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
-#: Least slope of the sea, against division by zero.
+#: Least sea slope, against division by zero.
 _LEAST_SLOPE = 1e-9
 
-#: Halo of the profile of unscattered light over its core, and square of the distance from the axis, in standard
+#: Halo of the unscattered light's profile relative to its core, and squared distance from the axis, in standard
 #: deviations, that parts both.
 _HALO, _SQUARES_INSIDE = 0.02, 25.0
 
@@ -53,14 +53,14 @@ ORIGIN = 1 << 20
 
 @dataclass(frozen=True)
 class Cell:
-    """Cells of points.
+    """Cells that contain points.
 
     Attributes
     ----------
     bucket, tag
-        Number of the bucket, and what tells its cells apart.
+        Bucket number, and the tag that tells its cells apart.
     volume, volume_of_unscattered
-        Volume [m^3], and the one by which unscattered light is divided.
+        Volume [m^3], and the volume that divides unscattered light.
     """
 
     bucket: mi.UInt32
@@ -83,8 +83,8 @@ class RefractedProfile:
         cosine = math.sqrt(1 - (1 - down * down) / index**2)
         # The direction in water turns by so much for each radian by which the surface tilts.
         turn = max(abs(1 - down / (index * cosine)), _LEAST_SLOPE)
-        # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
-        # scale of `BeamRings.offset`.
+        # Displacement per metre of depth and unit slope, along and across the beam's azimuth, with the scale of
+        # `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
         ripples = 0.5 * max((sum(sea.sea.ripple_variance) for sea in scene.seas), default=0.0)
         self._own = [(spread, shift * math.sqrt(ripples)) for spread, shift in zip(spreads, shifts, strict=True)]
@@ -93,13 +93,13 @@ class RefractedProfile:
         #: Depth at which the sea's slopes double the variance [m].
         slopes = max(math.sqrt(0.5 * scene.slope_variance), _LEAST_SLOPE)
         self.depth = min(spread / (shift * slopes) for spread, shift in zip(spreads, shifts, strict=True))
-        #: Displacement for each metre of depth by the slopes of facets.
+        #: Displacement per metre of depth by facet slopes.
         of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
         self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
 
     @classmethod
     def of_scene(cls, scene: LidarScene, footprint: float) -> RefractedProfile:
-        """Return the profile of a scene's beam, of a standard deviation on the sea [m]."""
+        """Return the beam profile in a scene, from its standard deviation on the sea [m]."""
         beam = scene.transmitter.profile
         squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
         spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
@@ -107,12 +107,12 @@ class RefractedProfile:
         return cls(scene, (along, across))
 
     def growth(self, most: float) -> float:
-        """Return by how much ripples widen light of the beam or, if less, of a deviation `most`, for each metre."""
+        """Return how much ripples widen the beam's light or, if less, a deviation `most`, per metre."""
         return min(growth / min(spread, most) for spread, growth in self._own)
 
     @property
     def blur(self) -> float:
-        """Standard deviation by which ripples displace light for each metre of depth, the larger of both axes."""
+        """Standard deviation by which ripples displace light per metre of depth, the larger of both axes."""
         return max(growth for _, growth in self._own)
 
     def _axes(
@@ -145,31 +145,31 @@ class RefractedProfile:
 
 
 class WaterCells:
-    """Cells that follow the sea surface and are arranged about the refracted beam, of a scene or of one pass.
+    """Cells that follow the sea surface and are arranged about the refracted beam, for a scene or for one pass.
 
     Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
     above a solid ends there, and the first one behind a veil begins there. They are sheared along the beam in still
-    water, so that its light stays in one column of cells. Within a layer, light is counted on a common plane, and
-    looked up where the light at a point comes from if it is that of the beam, refracted and spread: narrow beams do not
+    water, so that its light stays in one column of cells. Within a layer, light is counted on a common plane. A point's
+    look-up goes to where its light would cross this plane along the beam, refracted and spread: narrow beams do not
     blur, however they are refracted.
 
     Parameters
     ----------
     profile
-        Profile of the beam, for what it changes between points and the plane.
+        Beam profile, for changes between points and the plane.
     width
-        Horizontal side of a cell on the axis at the surface, over the core radius of the rings.
+        Horizontal side of a cell on the axis at the surface, over the rings' core radius.
     growth
-        Growth of the width with depth [1/m], as light patterns of the waves blur with depth.
+        Growth of the width with depth [1/m], as the waves' light patterns blur with depth.
     thickness, uppermost
-        Thickness of a cell, and that of the uppermost ones, which may be thinner [m]: narrow beams spread fast there.
+        Thickness of a cell, and of the uppermost ones, which may be thinner [m]: narrow beams spread fast there.
     depth
         Depth within which different layers have different buckets [m].
     bits
-        Logarithm to base 2 of the number of buckets of a shot.
+        Base-2 logarithm of the number of buckets per shot.
     view_growth, widening
-        Further growth with depth [1/m] of cells that a narrow view limits at the surface, as ripples widen the light
-        that is seen, and the largest width that it reaches, over that at the surface.
+        Further growth with depth [1/m] of cells that a narrow view limits at the surface, as ripples widen the visible
+        light, and the largest width that it reaches relative to the surface.
     """
 
     OF_SHOTS = ("heights", "rings", "_shift", "_start")
@@ -200,7 +200,7 @@ class WaterCells:
         self.bits_z = int(np.clip(math.ceil(math.log2(layers + depth / thickness + 1)), 2, 8))
 
     def of_shots(self, heights: SurfaceHeights, rings: BeamRings, wider: float, bits: int) -> WaterCells:
-        """Return the cells of shots with heights and axes of their own.
+        """Return cells for shots with their own heights and axes.
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
@@ -216,12 +216,12 @@ class WaterCells:
 
     @property
     def bits_ring(self) -> int:
-        """Bits of the number of the ring in that of the bucket."""
+        """Bits for the ring's number in the bucket's number."""
         return (self.bits - self.bits_z) // 2
 
     @property
     def bits_sector(self) -> int:
-        """Bits of the number of the sector in that of the bucket."""
+        """Bits for the sector's number in the bucket's number."""
         return self.bits - self.bits_z - self.bits_ring
 
     def widths(self, depth: mi.Float) -> mi.Float:
@@ -231,7 +231,7 @@ class WaterCells:
         return width * dr.minimum(dr.fma(depth, self.growth, 1), _MOST_GROWTH)
 
     def thickness_at(self, depth: mi.Float) -> mi.Float:
-        """Return the thickness of layers at a depth of at least 0 [m]."""
+        """Return the layer thickness at a depth of at least 0 [m]."""
         return dr.minimum(dr.fma(depth, _THICKNESS_PER_DEPTH, self._uppermost), self.thickness)
 
     def layer_at(self, depth: mi.Float) -> mi.Float:
@@ -247,11 +247,11 @@ class WaterCells:
         return dr.fma(thin, self._uppermost / _THICKNESS_PER_DEPTH, even)
 
     def of_pass(self, shift: mi.Point4f) -> WaterCells:
-        """Return the cells of a pass, shifted by four uniform random numbers of each shot."""
+        """Return the cells of a pass, shifted by four uniform random numbers per shot."""
         return changed(self, _shift=shift, _start=starts(dr.width(shift), 1 << self.bits))
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
-        """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""
+        """Return the approximate cell volume at points, a smooth function, for merge weights [m^3]."""
         rings = self.rings
         depth = dr.maximum(rings.depth_at(point.z), 0)
         along, across = rings.offset(point.x, point.y, depth)
@@ -261,8 +261,8 @@ class WaterCells:
     def _depth_along_beam(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector2f, mi.Float]:
         """Return the depth of points below where the beam's direction leads up to the surface [m], and slopes there.
 
-        The last value is the volume of a cell there over that below a level surface: 1 + s . g with the slope g and the
-        horizontal displacement s of the beam for each metre of depth. Newton's method, exact below a single facet.
+        The last value is the cell volume there relative to below a level surface: 1 + s . g with the slope g and the
+        beam's horizontal displacement s per metre of depth. Newton's method, exact below a single facet.
         """
         shear = mi.Vector2f(*self.rings.shear)
         depth = dr.maximum(self.rings.depth_at(point.z), 0)
@@ -276,11 +276,11 @@ class WaterCells:
     def locate(
         self, point: mi.Point3f, direction: mi.Vector3f | None = None, unscattered: mi.Bool | None = None
     ) -> Cell:
-        """Return the cells of points.
+        """Return the cells that contain points.
 
-        Points of unscattered light are moved to the plane of their layer along their lines, of a `direction`, all
-        others along the beam as it is refracted there. The volume for unscattered light is corrected by the profile of
-        the beam on the plane over that at the point, so that it is light at the point.
+        Points of unscattered light move to their layer's plane along their lines in a `direction`, all others along the
+        beam as it is refracted there. The volume for unscattered light is corrected by the ratio of the beam profile on
+        the plane to the profile at the point, so that it represents light at the point.
         """
         rings = self.rings
         depth, slope, stretch = self._depth_along_beam(point)
@@ -339,5 +339,5 @@ class WaterCells:
 
 
 def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:
-    """Return the lowest bits of a number."""
+    """Return a number's lowest bits."""
     return number & ((1 << bits) - 1)

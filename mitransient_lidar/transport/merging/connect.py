@@ -36,16 +36,16 @@ _TOLERANCE, _RELATIVE_TOLERANCE = 1e-3, 1e-4
 
 @dataclass(frozen=True)
 class ConnectionRates:
-    """Rates with which merges and connections of a pass find the same path.
+    """Rates at which merges and connections in a pass find the same path.
 
     Attributes
     ----------
     cells
-        Cells, whose volumes are the rates of merges.
+        Cells, whose volumes are the merge rates.
     in_water, on_solids
-        Share of the pairs of points, and of points and photons on solids, that are connected.
+        Share of point pairs, and of pairs of points and photons on solids, that are connected.
     per_path
-        Number of connections of each path from the receiver, with points and with photons on solids; 0 for none.
+        Number of connections per receiver path, with points and with photons on solids; 0 for none.
     """
 
     OF_SHOTS = ("cells",)
@@ -71,7 +71,7 @@ class ConnectionRates:
         return cls(cells, opaque(rate / points_per_path), opaque(rate), per_path)
 
     def volume(self, point: mi.Point3f) -> mi.Float:
-        """Return the rate of merges at scattering events [m^3]."""
+        """Return the merge rate at scattering events [m^3]."""
         return self.cells.typical_volume(point)
 
 
@@ -86,19 +86,19 @@ class WaterConnections:
         self._group = self._water.index_layers.group(mi.UInt32(0))
 
     def _pairs(self, light: SegmentBuffer | int, stream: int) -> tuple[Lanes, PathPoint, mi.UInt32, mi.Float]:
-        """Draw points of the receiver's paths, and random partners among the light of their shots.
+        """Draw points on the receiver's paths, and random partners among the light of their shots.
 
-        Path and point are drawn one after the other, so that paths with other points, in a scene that differs a little,
-        change no other pairs. Partners are points of light paths, or a number of photons of a shot.
+        Path and point are drawn one after the other. Paths with other points, in a scene that differs a little, then
+        change no other pairs. Partners are points on light paths, or photon numbers in a shot.
 
         Returns
         -------
         lanes
-            Lanes of the pairs, whose numbers count them.
+            Lanes of the pairs, which their numbers count.
         point, partner
-            The points, and the numbers of their partners.
+            The points, and their partners' numbers.
         weight
-            Reciprocal of the expected number of pairs of the same point and partner; 0 where one does not exist.
+            Reciprocal of the expected number of pairs with the same point and partner; 0 where one does not exist.
         """
         points = self._points
         lanes = self._shots.paths(points.paths * self.rates.per_path)
@@ -118,7 +118,7 @@ class WaterConnections:
         return lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight
 
     def to_light(self, light: SegmentBuffer, stream: int) -> None:
-        """Connect some of the points of the receiver's paths with some points of light paths."""
+        """Connect some receiver points with some light points."""
         lanes, point, partner, weight = self._pairs(light, stream)
         other, exists = light.points(partner), weight > 0
         scene, rates = lanes.pick((self.scene, self.rates))
@@ -144,7 +144,7 @@ class WaterConnections:
         receive(self.received, point, other, 2, length, energy, active, sums, between=[direction])
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
-        """Connect some of the points of the receiver's paths with some photons on solids."""
+        """Connect some receiver points with some photons on solids."""
         lanes, point, partner, weight = self._pairs(light.photons, stream)
         scene, patches = lanes.pick((self.scene, patches))
         photon = light.connectable(partner)
@@ -174,7 +174,7 @@ class WaterConnections:
         receive(self.received, point, photon, 1, length, energy, active, sums, solid, [direction])
 
     def _segment(self, point: PathPoint, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
-        """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""
+        """Return segment direction, length [m] and absorption, and length^2 / transmittance by scattering."""
         offset = place - point.point
         distance = dr.norm(offset)
         direction = offset / distance

@@ -1,4 +1,4 @@
-"""Where light and paths of the receiver are merged: points along paths, cells of water, and patches of solids."""
+"""Where light and receiver paths are merged: points along paths, cells in the water, and patches on solids."""
 
 from __future__ import annotations
 
@@ -24,52 +24,49 @@ from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS
 #: points take a third less time and increase the water's variance by a half: more paths are better there.
 _POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 14, 10
 
-#: Number of photons of a full pass.
+#: Photons in a full pass.
 PHOTONS = 2**15
 
-#: Width of the cells at the surface, over the beam's standard deviation there, over the side of the sea's facets, and
-#: over the diameter of the field of view, which ripples widen with depth: of larger cells, few would hold the light
-#: that is seen.
+#: Cell width at the surface, relative to the beam's standard deviation there, to the sea's facet side, and to the
+#: field-of-view diameter, which ripples widen with depth: few larger cells would contain the visible light.
 _CELL_PER_FOOTPRINT, _CELL_PER_FACET, _CELL_PER_VIEW = 0.025, 0.05, 0.02
 
-_CELL_PER_BEAM = 0.05  # width of the cells of a lidar under water, over the beam's standard deviation
+_CELL_PER_BEAM = 0.05  # cell width for a lidar under water, over the beam's standard deviation
 
-#: Growth of the width with depth, over the width at the surface: per metre, for the blur of light patterns by ripples,
-#: and per scattering length, for that by scattering.
+#: Growth of the width with depth, relative to the width at the surface: per metre, as ripples blur light patterns, and
+#: per scattering length, as scattering blurs them.
 _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 
-PATCH_PER_CELL = 3.2  # width of the patches of solids, over that of the cells at the surface
+PATCH_PER_CELL = 3.2  # patch width on solids, over the cell width at the surface
 
-#: Thickness of the cells, over the distance of points and over the attenuation length.
+#: Cell thickness, over the point distance and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
-#: Thickness of the uppermost cells, over the depth at which the sea doubles the variance of the beam, over the depth at
-#: which neighbouring facets move light by their own side, and over the attenuation length; the last one for beams from
-#: whose width scattered light is lost within a cell.
+#: Thickness of the uppermost cells: over the depth at which the sea doubles the beam's variance, over the depth at
+#: which neighbouring facets move light by their own side, and over the attenuation length. The last one is for beams so
+#: narrow that scattered light leaves them within a cell.
 _UPPERMOST_PER_SPREAD, _UPPERMOST_PER_FACET, _UPPERMOST_PER_ATTENUATION = 0.25, 0.1, 0.05
 
-#: Distance on the sea from which light reaches the view in the water, over the standard deviation by which ripples
+#: Distance on the sea from which light reaches the view in the water: over the standard deviation by which ripples
 #: displace light, and over the depth, for scattering.
 _SPREAD_PER_BLUR, _SPREAD_PER_DEPTH = 3.0, 0.5
 
 _LEAST_ATTENUATION = 1e-6  # against division by zero [1/m]
 
-#: Least width of patches over the size of the largest solid, eight times the rounding of positions on it; and that of
-#: cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
+#: Least patch width over the largest solid's size, eight times the rounding of positions on it. Least cell width over
+#: the largest coordinate of the lidar's spot and of the water below, where a narrow view limits the cells.
 _PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
 
-#: Bits of the number of buckets of a shot above those of its number of photons: of cells, and of patches along both
-#: sides.
+#: Extra bits for a shot's buckets, beyond the bits for its photons: for cells, and for patches along both sides.
 _BITS_OF_CELLS, _SIDE_BITS_OF_PATCHES = 5, 3
 
-#: Largest width of the cells and patches of shots of few photons, over that of full passes: it halves their noise, and
-#: changes the water's signal by 0.3 % in the published geometry.
+#: Largest cell and patch width for shots with few photons, relative to full passes: it halves their noise, and changes
+#: the water's signal by 0.3 % in the published geometry.
 _WIDEST = 2.0
 
-#: For differences of scenes, width of cells over the least one of a scene, number of photons that are kept of full
-#: ones, and width of patches over that of a scene. The noise of differences is that of light that moves from cell to
-#: cell, and falls as cells grow. These ones change the signal of the water by 0.2 % in the published geometry, and by
-#: up to 2 % in narrow beams.
+#: For differences between scenes: cell width over a scene's least one, number of photons kept in full cells, and patch
+#: width over a scene's. Light that moves from cell to cell causes the noise of differences, which falls as cells grow.
+#: These cells change the water's signal by 0.2 % in the published geometry, and by up to 2 % in narrow beams.
 _COARSE, _PHOTONS_OF_COARSE, _COARSE_PATCHES = 8.0, 32, 2.0
 
 #: Largest capacity for segments of a path before a pass has needed more: light that is scattered more often is weak.
@@ -78,7 +75,7 @@ _MOST_SEGMENTS = 64.0
 
 @dataclass(frozen=True)
 class MergingOptions:
-    """Options of merging, documented in the plugin ``lidar_merging``; None or 0 selects the default."""
+    """Merging options, documented in the plugin ``lidar_merging``; None or 0 selects the default."""
 
     paths_per_pass: int | None = None
     photons_per_pass: int | None = None
@@ -89,27 +86,27 @@ class MergingOptions:
 
 @dataclass
 class MergingLayout:
-    """Points, cells and patches of a scene, and the capacity of buffers for each path.
+    """Points, cells and patches in a scene, and buffer capacities per path.
 
     Attributes
     ----------
     entry
         Where the beam meets the sea, relative to where it meets its mean level [m], shape (3,).
     cells, patches
-        Cells of the water, and patches of the solids.
+        Cells in the water, and patches on solids.
     spacing, reach
         Distance between points along a path [m], and mean distance in the water along the axis to a solid or to the
         record's end [m].
     light_segments, sensor_segments, hits
-        Capacities for segments and hits of solids of each path; they grow when a pass needs more.
+        Capacities for segments and solid hits per path; they grow when a pass needs more.
     least_segments
-        Segments of each path of light and of sensors that a pass has been found to need, or one.
+        Segments per path of light and of sensors that a pass has needed, or one.
     spread
         Distance from the view, on the sea, from which light reaches the view in the water [m].
     photons_of_cell
-        Number of photons that are kept of full cells.
+        Number of photons kept in full cells.
     widens
-        Whether cells and patches are wider for shots of few photons: their width is automatic.
+        Whether cells and patches are wider for shots with few photons: their width is automatic.
     """
 
     OF_SHOTS = ("cells", "patches")
@@ -128,7 +125,7 @@ class MergingLayout:
     widens: bool = True
 
     def of_shots(self, scene: LidarScene, shots: int, photons: int) -> MergingLayout:
-        """Return the layout of shots that meet a scene in parts, with a number of photons each."""
+        """Return the layout for shots that meet a scene in parts, each with a number of photons."""
         bits = math.ceil(math.log2(photons))
         wider = max(min((PHOTONS / photons) ** (1 / 3), _WIDEST), 1.0) if self.widens else 1.0
         cells, patches, rings = self.cells, self.patches, self.patches.rings
@@ -147,7 +144,7 @@ class MergingLayout:
             side_bits=min(MOST_SIDE_BITS, -(-(bits + _SIDE_BITS_OF_PATCHES) // 2)),
             width=patches.width * wider,
         )
-        # A copy has capacities of its own.
+        # A copy has its own capacities.
         return replace(self, cells=cells, patches=patches)
 
     def coarse(self) -> MergingLayout:
@@ -159,8 +156,8 @@ class MergingLayout:
     def of_scene_alike(self, scene: LidarScene) -> MergingLayout:
         """Return the same points and cells for a scene that differs a little, whose solids may be other objects.
 
-        Cells go with the beam, as the sea refracts it, with the sea surface and with the solids where they end: most
-        light of the same random numbers stays in its cell, and light near a surface that moves is right.
+        Cells follow the beam, as the sea refracts it, the sea surface, and the solids where they end. Most light from
+        the same random numbers thus stays in its cell, and light near a moving surface is right.
         """
         cells, region, rings = self.cells, self.patches.region, self.patches.rings
         if isinstance(cells, WaterCells):
@@ -203,7 +200,7 @@ class MergingLayout:
         footprint = scene.transmitter.angular_spread * pose.ground_range
         entries = beam_entries(scene)
         rings = BeamRings(pose, footprint, scene.refractive_index, tilt=scene.mean_slopes(1)).of_entries(entries)
-        # Cells are longer along the azimuth of the beam: the mean of their sides counts.
+        # Cells are longer along the beam's azimuth: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
         given, longest = cell_widths(options.cell_size, footprint, attenuation * bool(pose.axis[2] < 0))

@@ -1,4 +1,4 @@
-"""Merging of light from the laser with paths from the receiver, in cells of water and on patches of solids."""
+"""Merging of laser light with receiver paths, in cells in the water and on patches of solids."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def merge_in_water(
     photons: PhotonMap,
     connections: mi.Float,
 ) -> None:
-    """Merge points of the receiver's paths with the light in their cells.
+    """Merge points on the receiver's paths with the light in their cells.
 
-    A point represents a track of length s and throughput beta, a photon one of length s' and energy w. With the cell's
-    volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all merges
-    and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
+    A point represents a track with length s and throughput beta, a photon one with length s' and energy w. With the
+    cell's volume V each pair adds beta s w s' / V times scattering coefficient and phase function. The weight is among
+    all merges and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
     water, perturbations = scene.required_water, scene.perturbations
     cell = cells.locate(points.point)
@@ -83,9 +83,9 @@ def merge_on_solids(
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
-    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF, and times the
-    ratio of foreshortening at both places. They are weighted against `connections`, a share of all pairs, that make the
-    same path.
+    A path with throughput beta and a photon with energy w on a patch with area A add beta w / A times the BSDF, and
+    times the ratio of the foreshortening at both points. They are weighted against `connections`, a share of all pairs,
+    that make the same path.
     """
 
     def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
@@ -105,8 +105,8 @@ def merge_on_solids(
             photon, tag, connectable = photons.photon(index, within)
             within &= tag == patch.tag
             outgoing = si.to_local(-photon.direction)
-            # Mitsuba's BSDFs include the cosine of the shading normal. The photon's energy per area includes that of
-            # the true surface, which is divided out.
+            # Mitsuba's BSDFs include the cosine to the shading normal. The photon's energy per area includes the true
+            # surface's cosine, which is divided out.
             cosine = dr.abs(dr.dot(si.n, photon.direction))
             bsdf = si.bsdf().eval(mi.BSDFContext(), at_place, outgoing, within)[0] / cosine
             connected = dr.select(connectable > 0, connection, 0)
@@ -133,10 +133,10 @@ def receive(
     solid: mi.UInt32 | None = None,
     between: Sequence[mi.Vector3f] = (),
 ) -> None:
-    """Add the light of complete paths, of a part from the receiver up to a point and one from the laser.
+    """Add the light on complete paths, each from a receiver part up to a point and a laser part.
 
-    The parts meet with a number of scattering `events`, or on the `solid` of a number; `between` are the directions of
-    segments between them. `sums` are those of the perturbations of the complete paths. Paths with a lost part are lost.
+    The parts meet with a number of scattering `events`, or on the `solid` with a number; `between` are the directions
+    of segments between them. `sums` are the perturbation sums of the complete paths. Paths with a lost part are lost.
     """
     lost = point.lost | light.lost
     order, reversals = point.scatterings + events + light.scatterings, point.reversals

@@ -1,4 +1,4 @@
-"""Numbers of many points of paths, stored in packets that kernels read together."""
+"""Numbers for many path points, stored in packets that kernels read together."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import mitsuba as mi
 #: Numbers in a packet.
 _PACKET = 4
 
-#: Sign bit of a number, and all others.
+#: Sign bit of a number, and all other bits.
 _SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1
 
 
 class PackedStore:
-    """Stored numbers of points, one entry a point.
+    """Stored numbers for points, one entry per point.
 
     Parameters
     ----------
     size
         Number of entries.
     fields
-        What is stored of each, in the order of its packets of four numbers: by name a type of Mitsuba, or the length of
-        a list of numbers. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
+        Stored fields, in the order of their packets with four numbers: by name a Mitsuba type, or the length of a list
+        of numbers. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
     """
 
     def __init__(self, size: int, fields: Mapping[str, str | int]) -> None:
@@ -43,7 +43,7 @@ class PackedStore:
         for name, flag, kind in self._fields:
             stored = [*values[name]] if _count(kind) > 1 or isinstance(kind, int) else [values[name]]
             if flag:
-                # NaN may have a sign of its own.
+                # NaN may have its own sign.
                 bits = dr.reinterpret_array(mi.UInt32, stored[0]) & _MAGNITUDE
                 stored = [bits | dr.select(values[flag], mi.UInt32(_SIGN), 0)]
             numbers += [dr.reinterpret_array(mi.Float, number) for number in stored]
@@ -73,12 +73,12 @@ class PackedStore:
         return values
 
     def evaluate(self) -> None:
-        """Compute what is stored."""
+        """Compute the stored values."""
         dr.eval([packet for packet, _ in self._packets])
 
 
 def _count(kind: str | int) -> int:
-    """Return the number of numbers of a field."""
+    """Return how many numbers a field has."""
     return kind if isinstance(kind, int) else {"Float": 1, "UInt32": 1}.get(kind, 3)
 
 

@@ -20,33 +20,33 @@ from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import box_of, met_shape
 
-#: Logarithm to base 2 of the largest number of buckets of a shot along one side.
+#: Base-2 logarithm of the largest number of buckets per shot along one side.
 MOST_SIDE_BITS = 9
 
-#: Height of the levels into which patches of bounded solids are cut, over the width of each patch.
+#: Level height in the patches of bounded solids, over the patch width.
 _LEVEL_WIDTHS = 8
 
 #: Component of a normal along the beam, over the larger horizontal one, below which a surface counts as steep.
 _STEEP = 0.3
 
-#: Least foreshortening of surfaces: that of less light is not evened out between places of a patch.
+#: Least foreshortening of surfaces: below it, light is not evened out between points in a patch.
 _LEAST_FORESHORTENING = 0.02
 
-#: Number of rays at each of several places that find solids of several levels.
+#: Number of rays at each of several locations that find solids with several levels.
 _PROBE_RAYS_OF_SHOTS = 512
 
-#: Largest number of hits of a vertical ray in the search for solids of several levels.
+#: Largest number of hits per vertical ray in the search for solids with several levels.
 _MOST_LEVELS = 8
 
-#: Distance before a point at which rays to it end [m], and the same over its largest coordinate: half of that by which
-#: coincident faces are moved apart.
+#: Distance before a point at which rays to it end [m], and the same over its largest coordinate: half the distance by
+#: which coincident faces are moved apart.
 _JUST_BEFORE, _JUST_BEFORE_ROUNDING = 5e-5, 2.0**-21
 
-#: Margin of the probes beyond a level, and of their steps beyond a surface, over the height of the level.
+#: Margin of the probes beyond a level, and of their steps beyond a surface, over the level height.
 _PROBE_MARGIN = 1e-3
 
-#: Largest growth of the patches with depth, over that of unscattered light below ripples: in wider ones, narrow beams
-#: and views blur.
+#: Largest patch growth with depth, relative to unscattered light below ripples: in wider ones, narrow beams and views
+#: blur.
 _MOST_GROWTH = 2.0
 
 #: Largest number of coverage samples: rounding may hide a sliver of a patch from all of them.
@@ -60,18 +60,18 @@ class SolidPatch:
     Attributes
     ----------
     bucket, tag
-        Bucket of its photons; patches of one bucket differ in tag.
+        Bucket of its photons; patches in one bucket differ in tag.
     area
-        Area of the surface over the patch's projection, if it covers all of it [m^2].
+        Surface area over the patch's projection, if it covers all of it [m^2].
     corner
-        Corner of that square, and start of the level over it, in the coordinates (u, v, w) of the projection [m].
-        Along the beam, w is z.
+        Corner of that square, and start of the level over it, in the projection's coordinates (u, v, w) [m]. Along the
+        beam, w is z.
     height
-        Height of the level [m].
+        Level height [m].
     sector
-        Sector of rings that replaces the square in projections along the beam.
+        Ring sector that replaces the square in projections along the beam.
     axis
-        Direction of the projection: 0, 1 or 2 for x, y or the beam.
+        Projection direction: 0, 1 or 2 for x, y or the beam.
     faces
         Sign of the normal's component against that direction.
     cosine
@@ -90,10 +90,10 @@ class SolidPatch:
 
 
 def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
-    """Return the area of a surface across light over that across the projection of its patch, from both cosines.
+    """Return a surface's area across light over its area across its patch's projection, from both cosines.
 
-    At least 0.02: light is stored divided by this number at its place, and merged times that of another place of the
-    patch, so that the light of curved surfaces is right.
+    At least 0.02: light is stored divided by this number at its own point, and merged times the number at another point
+    in the patch, so that the light on curved surfaces is right.
     """
     return dr.maximum(light / projection, _LEAST_FORESHORTENING)
 
@@ -129,8 +129,8 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
 class SolidPatches:
     """Patches in projection along the beam, or along x or y where steep.
 
-    In projection along the refracted beam patches are sectors of rings about it, whatever their depth, along the others
-    squares. What arrives from one direction is even over areas across that direction, however curved the surface is
+    In projection along the refracted beam, patches are sectors of rings about it, whatever their depth; along x or y
+    they are squares. Light from one direction is even over areas across that direction, however curved the surface is
     (`foreshortening`).
 
     Parameters
@@ -148,13 +148,13 @@ class SolidPatches:
     uneven
         Solids that `solids_of_several_levels` found.
     side_bits
-        Logarithm to base 2 of the number of buckets of a shot along one side.
+        Base-2 logarithm of the number of buckets per shot along one side.
     least
         Least side of squares, and of sectors on the solids [m].
     growth
         Growth of unscattered light with depth by ripples [1/m]; None for patches that grow as the rings.
     widening
-        Largest further growth of sectors with depth, of those that a narrow view limits at the surface.
+        Largest further growth with depth of sectors that a narrow view limits at the surface.
     """
 
     OF_SHOTS = ("scene", "rings", "_shift", "_start")
@@ -186,16 +186,16 @@ class SolidPatches:
         if self.growth is not None:
             cores = dr.minimum(cores, _MOST_GROWTH * core * aligned(mi.Float, growths))
         cores = dr.maximum(cores, opaque(self.least) / ring_widths)
-        # Of each solid: core radius, and width of rings over it.
+        # For each solid: core radius, and ring width over it.
         self._sizes = dr.ravel(mi.Point2f(cores, ring_widths))
-        # Of each solid: whether others may cover it closely, and whether its patches may be cut by an edge.
+        # For each solid: whether others may cover it closely, and whether an edge may cut its patches.
         near, cut = np.zeros((2, depths.size), bool)
         near[numbers] = self._near_others(solids)
         cut[numbers] = [
             not self.region.is_below(solid.bbox(), self.scene) or any(solid is other for other in self.uneven)
             for solid in solids
         ]
-        # Land and other solids that rise through the sea here shade what is beside them.
+        # Land and other solids that rise through the sea here shade their surroundings.
         lowest, _ = self.scene.sea_heights or (np.inf, np.inf)
         self._has_shades = any(float(solid.bbox().max.z) > lowest for solid in self.uneven)
         cut[numbers] |= self._has_shades
@@ -203,16 +203,16 @@ class SolidPatches:
         self._near, self._cut = (aligned(mi.UInt32, one.astype(np.uint32)) for one in (near, near | cut))
 
     def of_pass(self, scene: LidarScene, shift: mi.Point2f) -> SolidPatches:
-        """Return the patches of a pass over a scene, shifted by two uniform random numbers of each shot."""
+        """Return the patches in a pass over a scene, shifted by two uniform random numbers per shot."""
         return changed(self, scene=scene, _shift=shift, _start=starts(dr.width(shift), self.buckets))
 
     @property
     def buckets(self) -> int:
-        """Number of buckets of a shot."""
+        """Number of buckets per shot."""
         return 1 << (2 * self.side_bits)
 
     def locate(self, si: mi.SurfaceInteraction3f) -> SolidPatch:
-        """Return the patches of points on solids."""
+        """Return the patches that contain points on solids."""
         axis, normal = self._projection(si)
         along_x, along_y = axis == 0, axis == 1
         u = dr.select(along_x, si.p.y, si.p.x)
@@ -277,14 +277,14 @@ class SolidPatches:
         return axis, dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, against))
 
     def _offset(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float, mi.Point2f]:
-        """Return offsets of points on solids from the beam [m], and core radius [m] and ring width of their solid."""
+        """Return offsets from the beam to points on solids [m], and their solid's core radius [m] and ring width."""
         x, y = self.rings.slant
         below = -si.p.z - self._plane
         along, across = self.rings.offset(si.p.x - x * below, si.p.y - y * below, self.rings.depth_at(-self._plane))
         return along, across, dr.gather(mi.Point2f, self._sizes, self._number(met_shape(si)))
 
     def _number(self, shape: mi.ShapePtr) -> mi.UInt32:
-        """Return the numbers of solids; one of them for other shapes."""
+        """Return the solids' numbers; one of them for other shapes."""
         return dr.minimum(dr.reinterpret_array(mi.UInt32, shape), opaque_index(dr.width(self._near) - 1))
 
     def _is(self, marks: mi.UInt32, shape: mi.ShapePtr) -> mi.Bool:
@@ -302,7 +302,8 @@ class SolidPatches:
     def _is_hidden(self, si: mi.SurfaceInteraction3f, axis: mi.UInt32, faces: mi.Float, height: mi.Float) -> mi.Bool:
         """Return whether another solid lies before points, in projection, within the height of a level [m].
 
-        Light that such a solid stops is not spread over what it hides, nor over shades of what rises through the sea.
+        Light that such a solid stops is not spread over hidden parts, nor over shades of solids that rise through the
+        sea.
         """
         shaded = (axis == 2) & self._is_shaded(si) if self._has_shades else mi.Bool(False)
         if not self._any_near:
@@ -334,7 +335,7 @@ class SolidPatches:
         return ~near | (above.is_valid() & self.scene.is_surface(above.shape))
 
     def _inwards(self, axis: mi.UInt32, faces: mi.Float) -> mi.Vector3f:
-        """Return the direction of a projection towards faces, of length 1 along x, y or z."""
+        """Return the direction of a projection towards faces, with length 1 along x, y or z."""
         x, y = self.rings.slant
         is_x, is_y, is_z = (axis == number for number in range(3))
         return -faces * mi.Vector3f(
@@ -346,8 +347,8 @@ class SolidPatches:
     def inverse_share(self, patch: SolidPatch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
         """Return an estimate of 1 / (covered share of the patch's square), for patches cut by edges.
 
-        The mean of the number of random points in the square up to the first one on the patch (Booth 2007,
-        Nucl. Sci. Eng. 156, 403).
+        The mean number of random points in the square up to the first one on the patch (Booth 2007, Nucl. Sci. Eng.
+        156, 403).
         """
         if not self._any_cut:
             return mi.Float(1)

@@ -16,22 +16,21 @@ from mitransient_lidar.transport.paths.random_walk import RandomWalkPath
 from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.rng import Lanes, Shots
 
-#: Number of photons that are kept of full buckets, of cells and of patches: more take time and reduce the variance
-#: little.
+#: Number of photons kept in full buckets, of cells and of patches: more take time and reduce the variance little.
 PHOTONS_OF_CELL, PHOTONS_OF_PATCH = 8, 32
 
-#: Numbers that tell the hits of a path apart; those of paths with more rays may be those of other paths.
+#: Numbers that tell a path's hits apart; paths with more rays may share numbers with other paths.
 _RAYS_PER_PATH = 509
 
 
-#: What is stored of the light in a bucket: the z component of its direction follows from the others and the flag `up`.
-#: `further` is the position of light in the water along its direction [m]; on solids, whether it can be connected (1).
+#: Stored light in a bucket: the z component of its direction follows from the others and the flag `up`. `further` is
+#: the position of light in the water along its direction [m]; on solids, whether it can be connected (1).
 _PHOTON = {
     **{"x": "Float", "y": "Float", "inverse_density": "Float", "length": "Float"},
     **{"throughput|lost": "Float", "mis_partial_sum|up": "Float", "tag": "UInt32", "further": "Float"},
 }
 
-#: What is stored of a hit of a solid.
+#: Stored solid hit.
 _HIT = {
     **{"bucket": "UInt32", "tag": "UInt32", "lane": "UInt32", "rays|connectable": "UInt32"},
     **{"direction": "Vector3f", "length": "Float"},
@@ -47,22 +46,22 @@ def _labelled(fields: dict[str, str], classes: PathClasses, perturbations: int) 
 class PhotonMap:
     """Light sorted by bucket, by counting.
 
-    Of full buckets only some photons are kept, at random, with larger weights of the same sum if all are equal.
+    Full buckets keep only some photons, at random, with larger weights that have the same sum if all are equal.
 
     Parameters
     ----------
     light
         The light.
     buckets, bucket, tag
-        Number of buckets; bucket of each photon, and what tells its cell or patch apart there.
+        Number of buckets; each photon's bucket, and the tag of its cell or patch there.
     further
-        A further number of each.
+        A further number for each.
     u
         Uniform random numbers that select photons.
     most
-        Expected number of photons that are kept of a bucket with more.
+        Expected number of photons kept in a bucket with more.
     classes
-        Classes of paths, which need the numbers of scattering events or not.
+        Path classes, which need the numbers of scattering events or not.
     """
 
     def __init__(
@@ -89,8 +88,8 @@ class PhotonMap:
         self._end = dr.cumsum(counts)
         self.count = int(self._end[buckets - 1])
         self._photons = PackedStore(self.count, _labelled(_PHOTON, classes, len(light.sums)))
-        # How many are kept of a full bucket is random: their weights add up to all of its light, and on average to that
-        # of the buckets of which nothing is kept, too.
+        # The number kept in a full bucket is random: their weights add up to all its light, and on average to the light
+        # of buckets that keep nothing, too.
         number, number_kept = mi.Float(found), mi.Float(dr.gather(mi.UInt32, counts, bucket, kept))
         some = 1 - dr.exp(number * dr.log(1 - most / number))
         scale = dr.select(number > most, number / (some * number_kept), 1)
@@ -101,7 +100,7 @@ class PhotonMap:
         self._photons.evaluate()
 
     def find(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return the first photon of a bucket and the end of its photons; nothing where inactive."""
+        """Return a bucket's first photon and the end of its photons; nothing where inactive."""
         end = dr.gather(mi.UInt32, self._end, bucket, active)
         return dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0)), end
 
@@ -115,9 +114,9 @@ class PhotonMap:
 
 
 class PhotonBuffer:
-    """Light of `photons` paths of each shot on solids; at most `capacity` hits are stored, but all are counted.
+    """Light on solids from `photons` paths per shot; at most `capacity` hits are stored, but all are counted.
 
-    One hit of each path is found by the number of the path, too, to be connected.
+    One hit per path is also found by the path's number, to be connected.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class PhotonBuffer:
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
         self._hits = PackedStore(capacity, _labelled(_HIT, classes, perturbations.count))
-        #: Number of the connectable hit of each path, counted from 1.
+        #: Number of each path's connectable hit, counted from 1.
         self._of_path = dr.zeros(mi.UInt32, photons * shots)
 
     def add(
@@ -140,9 +139,9 @@ class PhotonBuffer:
         active: mi.Bool,
         connectable: mi.Bool,
     ) -> None:
-        """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`.
+        """Store light that has met patches on solids at points [m]; at most one hit per path is `connectable`.
 
-        Its `throughput` is that of the path over the foreshortening of its place.
+        Its `throughput` is the path's throughput over the foreshortening at its point.
         """
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
         values = {**vars(path), "throughput": throughput, "point": place, "bucket": patch.bucket, "tag": patch.tag}
@@ -167,13 +166,13 @@ class PhotonBuffer:
         return PhotonMap(light, *place, connectable, u, PHOTONS_OF_PATCH, self._classes), wanted
 
     def connectable(self, index: mi.UInt32) -> PathPoint:
-        """Return the hits of paths by number that can be connected, of throughput 0 for none."""
+        """Return the hits by path number that can be connected, with throughput 0 for none."""
         number = dr.gather(mi.UInt32, self._of_path, index)
         return _light(self._hits.read(number - 1, number > 0), self._classes)
 
 
 def _light(stored: dict[str, Any], classes: PathClasses, **fields: Any) -> PathPoint:
-    """Return light from what is stored of it, and from further fields."""
+    """Return light from its stored values, and from further fields."""
     label = stored.get("label", mi.UInt32(0))
     known = {name: value for name, value in stored.items() if name in PathPoint.__dataclass_fields__}
     return PathPoint(**known, **classes.unpack(label), **fields)

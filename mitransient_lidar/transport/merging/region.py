@@ -16,7 +16,7 @@ from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
 from mitransient_lidar.transport.rng import Lanes, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Number of rays that find where the beam of each shot meets the sea.
+#: Number of rays that find where each shot's beam meets the sea.
 _ENTRY_RAYS = 64
 
 #: Share of rays that may fall outside the region on either side, and margin over its size.
@@ -25,14 +25,14 @@ _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 #: Least margin of a region under water [m].
 _LEAST_MARGIN = 1.0
 
-#: Distance beside the view within which light counts, over the size of the view and over the longest way in the water:
-#: tables of the heights below all of a very wide beam would not resolve its waves.
+#: Distance beside the view within which light counts, over the view size and over the longest way in the water: height
+#: tables below a whole very wide beam would not resolve its waves.
 _BESIDE_PER_VIEW, _BESIDE_PER_LENGTH = 2.0, 2.0
 
 #: Distance beside the beam within which light spreads, over the depth.
 _SPREAD_PER_DEPTH = 0.25
 
-#: Cells on each side of the tables of heights, of a single shot and of each of several.
+#: Cells per side of the height tables, for a single shot and for each of several.
 _HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 
 #: Largest number of times that a line through the mean sea level crosses the waves.
@@ -41,7 +41,7 @@ _MOST_CROSSINGS = 4
 #: Largest distance below the sea at which vertical rays to solids start [m].
 _MARGIN_BELOW_SEA = 1.0
 
-#: Height of the bed of columns without a solid below [m].
+#: Bed height in columns without a solid below [m].
 _NO_BED = -1e9
 
 
@@ -54,7 +54,7 @@ class Region:
 
     @classmethod
     def of_probe(cls, probe: Probe) -> Region:
-        """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
+        """Find the region with rays in the beam and in the field of view; raise UserError if none goes down."""
         places = [rays.sea_places for rays in (probe.view, probe.beam)]
         places = [place[np.isfinite(place[:, 0]), :2] for place in places]
         ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
@@ -86,7 +86,7 @@ class Region:
         return Region.between(low, high, _SPREAD_PER_DEPTH * depth)
 
     def probe_points(self, index: mi.UInt32 | None = None) -> tuple[mi.Float, mi.Float]:
-        """Return points (x, y) of the region [m] by number, by default all of 4096, evenly distributed."""
+        """Return points (x, y) in the region [m] by number, by default all 4096, evenly distributed."""
         x, y = unit_points(PROBE_RAYS, index)
         return dr.lerp(opaque(self.low[0]), opaque(self.high[0]), x), dr.lerp(
             opaque(self.low[1]), opaque(self.high[1]), y
@@ -106,7 +106,7 @@ class Region:
             at_sea &= si.is_valid() & scene.is_surface(si.shape)
             ray = si.spawn_ray(ray.d)
         length = dr.minimum(length, opaque(_longest_way(scene)))
-        # Without what lies below land.
+        # Without solids below land.
         above = scene.ray_intersect(mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), mi.Vector3f(0, 0, 1)))
         wet = ~above.is_valid() | scene.is_surface(above.shape) | met
         count = int(dr.count(wet)[0])
@@ -125,7 +125,7 @@ class Region:
 
 
 def reach_under_water(probe: Probe) -> tuple[Region, float, float]:
-    """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
+    """Return the region of beam and view, the beam rays' mean length [m], and the shortest ray length to solids.
 
     Rays end at the first surface, or where their light returns at the end of the record.
     """
@@ -170,18 +170,18 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Grids of equal cells over a region, one for each place of shots, and values in their cells.
+    """Grids with equal cells over a region, one per shot location, and values in their cells.
 
     Attributes
     ----------
     values, kind
-        Values of all cells, and their type.
+        Values in all cells, and their type.
     low, per_metre
-        Corner of the grid of each shot [m], and inverse sides of its cells [1/m].
+        Grid corner for each shot [m], and inverse cell sides [1/m].
     cells
-        Number of cells on each side.
+        Cells per side.
     start
-        Number of the first cell of each shot.
+        First cell number for each shot.
     """
 
     OF_SHOTS = ("low", "start")
@@ -194,7 +194,7 @@ class _Grid:
     start: mi.UInt32
 
     def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
-        """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
+        """Return values at (x, y) [m], or at the nearest point; and offsets from the cell centres [m]."""
         along, across = (x - self.low.x) * self.per_metre.x, (y - self.low.y) * self.per_metre.y
         i, j = (dr.clip(mi.Int32(dr.floor(number)), 0, self.cells - 1) for number in (along, across))
         values = dr.gather(self.kind, self.values, self.start + mi.UInt32(j * self.cells + i))
@@ -208,11 +208,11 @@ class SurfaceHeights:
     Parameters
     ----------
     region
-        Region of the sea.
+        Sea region.
     depth
-        Largest depth of light [m]: solids are found beside the region, too, where light of that depth is.
+        Largest depth of light [m]: solids are also found beside the region, where light at that depth is.
     moves
-        Displacements of the region (x, y) of each shot [m], shape (shots, 2).
+        Region displacements (x, y) per shot [m], shape (shots, 2).
     """
 
     OF_SHOTS = ("_surface", "_bed", "_veil")

@@ -31,28 +31,28 @@ from mitransient_lidar.transport.solids import met_shape
 _COMMON_STREAM, _LIGHT_STREAM, _SENSOR_STREAM = 0, 1, 2
 _MERGE_STREAM, _CONNECTION_STREAM, _SOLID_CONNECTION_STREAM, _TURN_STREAM = 4, 5, 6, 7
 
-#: Default numbers of paths and photons of a pass.
+#: Default numbers of paths and photons in a pass.
 _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
 _PHOTONS_FOR_IMAGES = 2**16
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
 
-_COMPLEMENT_PATHS = 1024  # least number of paths of the path tracer in a pass of all shots
+_COMPLEMENT_PATHS = 1024  # least number of path tracer paths in a pass over all shots
 
-#: Points of a light path that are expected, over those of a straight one, to scale the rate of connections.
+#: Expected points on a light path, relative to a straight one, to scale the connection rate.
 _POINTS_OF_LIGHT = 0.8
 
 #: Capacity for segments and hits over the need of the last pass.
 _CAPACITY_MARGIN = 1.25
 
-#: Of this many paths of an image, the points in the water of one are merged: half of its time was theirs, and bottoms
-#: and targets need more paths. Where they are few, passes have more, as their light takes time, too.
+#: One in this many image paths is merged at its points in the water: they took half the time, and bottoms and targets
+#: need more paths. Where paths are few, passes have more, as their light takes time, too.
 _EVERY_IN_IMAGES, _PATHS_PER_IMAGE_PIXEL, _PATHS_OF_IMAGE = 2, 32, 2**20
 
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
-    """Return the number of sensor paths of a pass for a number of pixels."""
+    """Return the number of sensor paths in a pass for a number of pixels."""
     paths = min(max(_PATHS, _PATHS_PER_PIXEL * pixels), _MOST_PATHS)
     if pixels >= IMAGE_PIXELS:
         paths = max(min(_PATHS_PER_IMAGE_PIXEL * pixels, _PATHS_OF_IMAGE), paths)
@@ -60,7 +60,7 @@ def paths_of_pass(options: MergingOptions, pixels: int) -> int:
 
 
 class MergingRenderer(PassRenderer):
-    """Renders passes of a scene with water by merging, with its own layout or that of another scene."""
+    """Renders passes of a scene with water by merging, with its own layout or another scene's."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class MergingRenderer(PassRenderer):
 
     @property
     def path_count(self) -> int:
-        """Number of paths of a pass from receiver and laser."""
+        """Number of paths in a pass from receiver and laser."""
         return self.paths + self.photons
 
     @property
@@ -90,7 +90,7 @@ class MergingRenderer(PassRenderer):
         return {"paths_per_pass": self.paths, "photons_per_pass": self.photons, **lengths}
 
     def scaled(self, share: float) -> MergingRenderer:
-        """Return a renderer of passes with a share of the paths, with the same layout and buffers."""
+        """Return a renderer for passes with a share of the paths, with the same layout and buffers."""
         paths, photons = (max(round(share * count), 1) for count in (self.paths, self.photons))
         return changed(self, paths=paths, photons=photons)
 
@@ -105,7 +105,7 @@ class MergingRenderer(PassRenderer):
         return changed(self, layout=self.layout.coarse())
 
     def of_shots(self, scene: LidarScene, shots: int) -> MergingRenderer:
-        """Return a renderer of a number of shots that meet a scene in parts."""
+        """Return a renderer for a number of shots that meet a scene in parts."""
         return changed(self, scene=scene, layout=self.layout.of_shots(scene, shots, self.photons))
 
     def repeated(self, scene: LidarScene, copies: int) -> MergingRenderer:
@@ -142,7 +142,7 @@ class MergingRenderer(PassRenderer):
         return True
 
     def _fit_segments(self, shots: Shots, paths: int) -> None:
-        """Cut the capacities for segments to the memory; raise `UserError` if it cannot hold what a pass needs."""
+        """Cut the segment capacities to the memory; raise `UserError` if it cannot hold what a pass needs."""
         layout, count, sums = self.layout, shots.count, self.scene.perturbations.count
         points = layout.reach / layout.spacing
 
@@ -159,7 +159,7 @@ class MergingRenderer(PassRenderer):
             layout.light_segments, layout.sensor_segments = np.add(needed, share * np.subtract(wanted, needed)).tolist()
 
     def _every(self, paths: int) -> int:
-        """Return of how many paths of the receiver one is merged in the water."""
+        """Return of how many receiver paths one is merged in the water."""
         is_imager = self.scene.receiver.is_imager
         return _EVERY_IN_IMAGES if is_imager and paths % (_EVERY_IN_IMAGES * PATHS_OF_GROUP) == 0 else 1
 
@@ -270,7 +270,7 @@ class MergingRenderer(PassRenderer):
         rates: ConnectionRates,
         light: _StoredLight,
     ) -> None:
-        """Merge the points of the receiver's paths with light in their cells, and connect some of them."""
+        """Merge the receiver's points with light in their cells, and connect some of them."""
         if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
             cells = segments.lanes(index).pick(rates.cells)
@@ -285,7 +285,7 @@ class MergingRenderer(PassRenderer):
 
 @dataclass(frozen=True)
 class _StoredLight:
-    """Light of a pass: its points in cells and by number, and its hits of solids on patches and by number."""
+    """Light in a pass: its points in cells and by number, and its hits on solids, on patches and by number."""
 
     in_cells: PhotonMap | None
     segments: SegmentBuffer

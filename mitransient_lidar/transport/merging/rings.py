@@ -32,20 +32,20 @@ CORE_PER_SPREAD = 2.0
 #: wider than the beam.
 _WIDTHS = 1e-6, 1.0
 
-#: Largest width of automatic cells at the surface, in attenuation lengths of the water, as level light of wider ones is
-#: wrong, and largest core radius: cells that narrow find no light in wider beams.
+#: Largest width of automatic cells at the surface, in attenuation lengths, as level light in wider ones is wrong, and
+#: largest core radius: cells that narrow find no light in wider beams.
 _LONGEST, _WIDEST_BEAM = 0.3, 500.0
 
 
 def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float, float]:
-    """Return the width of cells nearest to a given one that rings about a beam can have, and the largest one in water.
+    """Return the nearest possible cell width for rings about a beam, and the largest width in water.
 
     Parameters
     ----------
     given
         Width on the axis at the surface [m]; 0 for an automatic one, which then is 0.
     spread
-        Standard deviation of the beam there [m].
+        Beam standard deviation there [m].
     attenuation
         Beam attenuation of the water [1/m].
 
@@ -73,11 +73,11 @@ class RingSector:
     Attributes
     ----------
     ring, number
-        Number of the ring, counted outwards, and of the sector in it.
+        Ring number, counted outwards, and number of the sector in it.
     inner, outer
-        Radii of the ring [m].
+        Ring radii [m].
     share
-        Inverse of the number of sectors of the ring.
+        Inverse of the number of sectors in the ring.
     """
 
     ring: mi.UInt32
@@ -91,14 +91,14 @@ class BeamRings:
     """Rings about the refracted axis of the beam, cut into sectors that are about as long as wide.
 
     With the core radius q, rings have equal widths in arsinh(r / q): nearly equal ones in the core, and widths
-    proportional to the radius r far from it. On a sea that is lit obliquely rings are ellipses, as footprints are.
+    proportional to the radius r far from it. On an obliquely lit sea rings are ellipses, as footprints are.
 
     Parameters
     ----------
     pose
-        Pose of the laser.
+        Laser pose.
     spread
-        Standard deviation of the beam where its axis meets the sea, across the axis [m].
+        Beam standard deviation where its axis meets the sea, across the axis [m].
     index
         Refractive index of the water over that at the laser.
     growth
@@ -123,12 +123,12 @@ class BeamRings:
         self._entry = mi.Vector3f(opaque(0.0))
         #: -1 for an axis that rises in the water, else 1.
         self._sense = -1.0 if pose.submerged and pose.axis[2] > 0 else 1.0
-        #: Ratio of the axes of the ellipses.
+        #: Ratio of the ellipses' axes.
         self.cosine = opaque(max(-self._sense * float(pose.axis[2]), _SMALLEST_COSINE))
         self._aim(pose, np.zeros((1, 2)) if tilt is None else tilt)
 
     def _aim(self, pose: Pose, tilt: FloatArray) -> None:
-        """Lay the axis through that of a pose."""
+        """Lay the axis through a pose's axis."""
         horizontal, down = pose.axis[:2], max(-self._sense * float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (self._sense * float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
@@ -138,7 +138,7 @@ class BeamRings:
         self._set_axes(pose.axis[np.newaxis], tilt)
 
     def alike(self, pose: Pose, entries: FloatArray, tilt: FloatArray) -> BeamRings:
-        """Return the same rings about the axis of another pose, below a sea of other mean slopes."""
+        """Return the same rings about another pose's axis, below a sea with other mean slopes."""
         rings = changed(self)
         rings._aim(pose, tilt)
         return rings.of_entries(entries)
@@ -148,8 +148,8 @@ class BeamRings:
     ) -> BeamRings:
         """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3).
 
-        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own, below
-        seas of mean slopes `tilts`, shape (shots, 2).
+        Shots whose beams have their own directions in air, `axes` in the same shape, have their own axes, below seas
+        with mean slopes `tilts`, shape (shots, 2).
         """
         rings = changed(self, _entry=mi.Vector3f(*_columns(entries)))
         if axes is not None and tilts is not None:
@@ -157,7 +157,7 @@ class BeamRings:
         return rings
 
     def _set_axes(self, axes: FloatArray, tilts: FloatArray) -> None:
-        """Refract axes, unit directions in air of one or more shots, shape (shots, 3), by seas of mean slopes."""
+        """Refract axes, unit directions in air for one or more shots, shape (shots, 3), by seas with mean slopes."""
         index, horizontal = self._index, axes[:, :2]
         sine = np.hypot(*horizontal.T)
         cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / index) ** 2, 0)), _SMALLEST_COSINE)
@@ -166,13 +166,13 @@ class BeamRings:
             refracted = refract_at_facet(axes, np.column_stack([-tilts, np.ones(len(tilts))]), index)
             shear = refracted[:, :2] / np.maximum(-refracted[:, 2:], _SMALLEST_COSINE)
         is_steep = sine < _LARGEST_SLANT * index * cosine
-        #: Horizontal displacement of the axis for each metre of depth.
+        #: Horizontal axis displacement per metre of depth.
         self.shear = _columns(shear)
         #: The same where patches are projected along the axis, else 0: axes close to the horizon, or above it.
         self.slant = _columns(np.where(is_steep[:, None], shear, 0.0))
-        #: Horizontal displacement of the axis below level facets for each metre of depth.
+        #: Horizontal axis displacement below level facets per metre of depth.
         self._level = _columns(level)
-        #: Mean slopes of the sea along x and y.
+        #: Mean sea slopes along x and y.
         self.tilt = _columns(tilts)
 
     def depth_at(self, z: mi.Float) -> mi.Float:
@@ -191,7 +191,7 @@ class BeamRings:
         return along * self.cosine, across
 
     def refracted(self, slope: mi.Vector2f) -> mi.Vector3f:
-        """Return the unit direction of the axis below facets of a slope."""
+        """Return the unit direction of the axis below facets with a slope."""
         level = dr.normalize(mi.Vector3f(self._level[0], self._level[1], -1))
         index = opaque(self._index)
         x, y = index * level.x, index * level.y
@@ -200,7 +200,7 @@ class BeamRings:
         return -refract(to_laser, normal, dr.rcp(index))
 
     def along_and_across(self, horizontal: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
-        """Return the components of horizontal vectors along and across the azimuth of the axis."""
+        """Return the components of horizontal vectors along and across the axis azimuth."""
         (x, y), (ax, ay) = horizontal, self._azimuth
         return ax * x + ay * y, ax * y - ay * x
 
@@ -214,7 +214,7 @@ class BeamRings:
     def sector(
         self, along: mi.Float, across: mi.Float, core: mi.Float, width: mi.Float, shift: mi.Point2f
     ) -> RingSector:
-        """Return the sectors at offsets, of rings of a `width` over the core radius, shifted by random numbers."""
+        """Return the sectors at offsets, in rings with a `width` over the core radius, shifted by random numbers."""
         radius = dr.sqrt(along * along + across * across)
         ring = dr.floor(dr.asinh(radius / core) / width + shift.x)
         inner = core * dr.sinh(width * dr.maximum(ring - shift.x, 0))
@@ -236,7 +236,7 @@ class BeamRings:
 
 
 def _columns(values: FloatArray) -> list[mi.Float]:
-    """Return the columns of values of shots, shape (shots, n)."""
+    """Return the columns of shot values, shape (shots, n)."""
     if len(values) == 1:
         return [opaque(float(value)) for value in values[0]]
     return [aligned(mi.Float, column.astype(np.float32)) for column in values.T]

@@ -15,11 +15,11 @@ from mitransient_lidar.transport.paths.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
+#: Numbers that tell a path's points apart; paths with more points may share numbers with other paths.
 _KEYS_PER_PATH = 1021
 
-#: Memory of a path, of a segment, of a point, of light in a cell, of a hit of a solid, and of four of the sums of
-#: perturbations of any of these [bytes].
+#: Memory per path, segment, point, light in a cell and solid hit, and per four perturbation sums for any of these
+#: [bytes].
 _BYTES_PER_PATH, _BYTES_PER_SEGMENT, _BYTES_PER_POINT = 32, 60, 14
 _BYTES_IN_CELL, _BYTES_PER_HIT, _BYTES_PER_SUMS = 26, 64, 16
 
@@ -31,7 +31,7 @@ def memory_of_path(segments: float, points: float, perturbations: int, hits: flo
     return size if hits is None else size + points * (_BYTES_IN_CELL + sums) + hits * (_BYTES_PER_HIT + sums)
 
 
-#: What is stored of a segment: its start [m], and the path there (`RandomWalkPath`).
+#: Stored segment: its start [m], and the path there (`RandomWalkPath`).
 _FIELDS = {
     **{"point": "Point3f", "offset": "Float"},
     **{"direction": "Vector3f", "length": "Float"},
@@ -46,10 +46,10 @@ PATHS_OF_GROUP = 4
 
 
 class SegmentBuffer:
-    """Segments in the water of `paths` paths of each shot, with points at equal distances `spacing` [m] along them.
+    """Segments in the water from `paths` paths per shot, with points at equal distances `spacing` [m] along them.
 
     At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path. Of each
-    `every` neighbouring groups of paths, that of number `turn` is stored, and stands for all of them.
+    `every` neighbouring path groups, group number `turn` is stored, and represents them all.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class SegmentBuffer:
         self._slot = mi.UInt32()
 
     def add(self, path: RandomWalkPath, length: mi.Float, active: mi.Bool) -> mi.Float:
-        """Store the next segment of each path, of a length [m]; return the offset of the first point beyond it [m]."""
+        """Store each path's next segment, of a length [m]; return the offset of the first point beyond it [m]."""
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         lane, throughput = path.lane, mi.Float(path.throughput)
         if self._every > 1:
@@ -95,7 +95,7 @@ class SegmentBuffer:
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def finalize(self) -> tuple[int, int]:
-        """Assign numbers to the points; return their number and that of the segments, stored or not."""
+        """Assign numbers to the points; return how many points and segments there are, stored or not."""
         dr.eval(self._stored, self._of_path, self._place)
         self._segments.evaluate()
         self._end = dr.cumsum(self._of_path)
@@ -119,13 +119,13 @@ class SegmentBuffer:
         return Lanes.of_paths(dr.gather(mi.UInt32, self._place, 2 * segment), self._shots, self.paths)
 
     def pick(self, path: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return one of the points of each path by uniform random numbers, and how many points the path has."""
+        """Return one point on each path by uniform random numbers, and how many points the path has."""
         count = dr.gather(mi.UInt32, self._of_path, path)
         within = dr.minimum(mi.UInt32(u * mi.Float(count)), dr.maximum(count, 1) - 1)
         return dr.gather(mi.UInt32, self._end, path) - count + within, count
 
     def random(self, index: mi.UInt32, shots: Shots) -> mi.Float:
-        """Return uniform random numbers of points by number, which points of other paths do not change."""
+        """Return uniform random numbers for points by number, which points on other paths do not change."""
         first = dr.gather(mi.UInt32, self._first, index)
         lane, before = dr.gather(mi.Point2u, self._place, dr.gather(mi.UInt32, self._slot, first))
         lanes = Lanes.of_paths(lane, self._shots, self.paths)

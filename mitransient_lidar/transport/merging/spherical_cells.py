@@ -11,21 +11,21 @@ from mitransient_lidar.transport.opaque import changed, opaque, opaque_point
 from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Angular width of rings, over the beam's standard deviation within two of them, and over the angle farther outside.
+#: Angular ring width, over the beam's standard deviation within two of them, and over the angle farther outside.
 _RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
 
 #: Largest thickness of a shell over its radius: the light decreases by its square.
 _THICKNESS_PER_RADIUS = 0.04
 
-#: Smallest radius of shells [m].
+#: Smallest shell radius [m].
 _SMALLEST_RADIUS = 1e-3
 
-#: Logarithm to base 2 of the number of buckets, and bits of the number of ring and sector.
+#: Base-2 logarithm of the number of buckets, and bits for the numbers of ring and sector.
 _BUCKET_BITS, _RING_BITS, _SECTOR_BITS = 20, 11, 9
 
 
 class SphericalCells:
-    """Cells about the laser, small where its light is concentrated, of a scene or of one pass.
+    """Cells about the laser, small where its light is concentrated, for a scene or for one pass.
 
     Angles from the axis are measured by the tangent of their half, up to the opposite direction. Rings are of equal
     width in asinh(tan(theta / 2) / core), and shells in log(r) up to the radius where they have their final thickness.
@@ -35,12 +35,12 @@ class SphericalCells:
     scene
         Scene with laser and receiver under water.
     thickness
-        Largest thickness of a shell [m].
+        Largest shell thickness [m].
     """
 
     OF_SHOTS = ("_shift", "_start")
 
-    #: Logarithm to base 2 of the number of buckets of a shot.
+    #: Base-2 logarithm of the number of buckets per shot.
     bits = _BUCKET_BITS
 
     def __init__(self, scene: LidarScene, thickness: float) -> None:
@@ -54,17 +54,17 @@ class SphericalCells:
         self.even = opaque(thickness / _THICKNESS_PER_RADIUS)
 
     def of_pass(self, shift: mi.Point4f) -> SphericalCells:
-        """Return the cells of a pass, shifted by the first three of four uniform random numbers of each shot."""
+        """Return the cells in a pass, shifted by the first three of four uniform random numbers per shot."""
         return changed(self, _shift=shift, _start=starts(dr.width(shift), 1 << _BUCKET_BITS))
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
-        """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
+        """Return the cell volume [m^3] for the weights of merges, which are rare in small cells."""
         return self.locate(point).volume
 
     def locate(
         self, point: mi.Point3f, direction: mi.Vector3f | None = None, unscattered: mi.Bool | None = None
     ) -> Cell:
-        """Return the cells of points, which do not depend on the directions of their lines."""
+        """Return the cells that contain points; they do not depend on the directions of their lines."""
         offset = point - self.origin
         radius = dr.maximum(dr.norm(offset), _SMALLEST_RADIUS)
         x, y, along = (dr.dot(offset, side) for side in self.sides)
@@ -88,11 +88,11 @@ class SphericalCells:
         return Cell(self._start + ((tag * 2654435769) >> (32 - _BUCKET_BITS)), tag, volume, volume)
 
     def _shell_at(self, radius: mi.Float) -> mi.Float:
-        """Return the coordinate of shells at a radius [m]."""
+        """Return the shell coordinate at a radius [m]."""
         ratio = radius / self.even
         return dr.select(ratio < 1, dr.log(ratio), ratio - 1) / _THICKNESS_PER_RADIUS
 
     def _radius_of(self, shell: mi.Float) -> mi.Float:
-        """Return the radius [m] at a coordinate of shells."""
+        """Return the radius [m] at a shell coordinate."""
         along = shell * _THICKNESS_PER_RADIUS
         return self.even * dr.select(along < 0, dr.exp(along), 1 + along)

@@ -15,22 +15,22 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.perturbations import Perturbations, Sums
 
-#: Largest number of sums: more do not fit the memory of a laptop.
+#: Largest number of sums: more do not fit a laptop's memory.
 _LARGEST = 2**28
 
-#: Share of the largest weight of a gate below which others are neglected: 5 standard deviations of a Gaussian pulse.
+#: Share of a gate's largest weight below which others are neglected: 5 standard deviations of a Gaussian pulse.
 _SMALLEST_WEIGHT = 1e-7
 
-#: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below
-#: which energies go to the fine sums. Coarse sums hold 64 times the emitted energy, fine ones 2^23 of their largest
-#: terms.
+#: Bits of the coarse sums below the emitted energy, bits of the fine sums below those, and number of coarse units below
+#: which energies go to the fine sums. Coarse sums can reach 64 times the emitted energy, fine ones 2^23 of their
+#: largest terms.
 _COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
 
 
 class GateWeights:
     """Weights of an arrival in the gates that are open during its pulse.
 
-    `table` holds the weight of an arrival in the first gate of `train`, from `GateTrain.response_weights`. Path lengths
+    `table` contains an arrival's weight in the first gate of `train`, from `GateTrain.response_weights`. Path lengths
     are relative to `reference_length` [m].
     """
 
@@ -74,7 +74,7 @@ class GateWeights:
 
 
 class TransientHistogram:
-    """Energy of each pixel in each time bin, or in each gate, and its perturbations.
+    """Each pixel's energy in each time bin, or in each gate, and its perturbations.
 
     Energies are summed as integers of two units, so that the sums do not depend on their order.
 
@@ -96,10 +96,10 @@ class TransientHistogram:
     Raises
     ------
     UserError
-        When pixels times bins, or pixels times gates, exceed 2^28, with those of the perturbations.
+        When pixels times bins, or pixels times gates, with the perturbations exceed 2^28.
     """
 
-    #: Memory of a bin, or of a gate [bytes]: two sums and a mark.
+    #: Memory per bin, or per gate [bytes]: two sums and a mark.
     BYTES_PER_BIN = 20
 
     def __init__(
@@ -112,7 +112,7 @@ class TransientHistogram:
         perturbations: Perturbations | None = None,
     ) -> None:
         self.axis, self.gates, self.perturbations = axis, gates, perturbations or Perturbations()
-        #: Number of sums of a pixel: time bins, or gates.
+        #: Sums per pixel: time bins, or gates.
         self.record_length = axis.bin_count if gates is None else gates.count
         pixels = int(np.prod(shape))
         channels = 1 + self.perturbations.count
@@ -126,7 +126,7 @@ class TransientHistogram:
         self.shape = (*shape, self.record_length)
         self._each = pixels * self.record_length
         self._count = channels * self._each
-        # A last sum holds what is lost.
+        # A last sum contains the loss.
         sizes = self.record_length, self.record_length - 1, self._count, self._count + 1
         self._length, self._last, self._lost, self._fine_sums = map(opaque_index, sizes)
         self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
@@ -137,10 +137,10 @@ class TransientHistogram:
 
     def clear(self) -> None:
         """Set all sums to zero."""
-        # Kernels are compiled for the sizes of small arrays to which they add: records of similar length share them.
+        # Kernels are compiled for the sizes of small arrays to which they add: records with similar lengths share them.
         size = 2 * (self._count + 1)
         self._sums = dr.zeros(mi.Int64, 1 << (size - 1).bit_length() if size < dr.expand_threshold() else size)
-        # Marks of energies, and of perturbations that are not finite.
+        # Marks for energies and perturbations that are not finite.
         self._invalid = dr.zeros(mi.UInt32, self._each * (2 if self.perturbations.count else 1))
 
     def evaluate(self) -> None:
@@ -152,7 +152,7 @@ class TransientHistogram:
     ) -> None:
         """Add energy [J] that arrives after an optical path (group index included) of a relative length [m].
 
-        `sums` are those of the perturbations along the paths.
+        `sums` are the perturbation sums along the paths.
         """
         sums = sums or []
         if self.gates is not None:
@@ -197,7 +197,7 @@ class TransientHistogram:
         return np.asarray(self._channels(slice(0, 1))[0])
 
     def energy_of(self, pixels: slice) -> np.ndarray:
-        """Return `energy` of some pixels of a row of them, shape (pixels, bins), without other arrays of all."""
+        """Return `energy` of some pixels in a pixel row, shape (pixels, bins), without other arrays for all."""
         shape = (-1, self.record_length)
         coarse, fine = (
             self._sums.numpy()[first : first + self._each].reshape(shape)[pixels] * unit

@@ -23,12 +23,12 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class ReceivedLight:
-    """Received light of one pass: a histogram by pixel, or by class of a pixel, and time.
+    """Light received in one pass: a histogram by pixel, or by pixel class, and time.
 
     Attributes
     ----------
     rays
-        Number of rays traced.
+        Number of traced rays.
     gated
         Light in gates that is received beside the histogram, or None.
     """
@@ -58,11 +58,11 @@ class ReceivedLight:
         echo: Echo | None = None,
         sums: Sums | None = None,
     ) -> None:
-        """Add the energy [J] of paths by relative optical length [m] and by what their class depends on.
+        """Add the energy [J] of paths by relative optical length [m] and by the variables of their class.
 
-        That is the order of scattering, the number of reversals, and the number of the last solid that the light has
-        met, from 1 on, or 0 (`PathClasses`). An `echo` from under water is enhanced by ripples. `sums` are those of the
-        perturbations of the scene.
+        These are the scattering order, the number of reversals, and the number of the last solid that the light has
+        met, from 1 on, or 0 (`PathClasses`). Ripples enhance an `echo` from under water. `sums` are the perturbation
+        sums of the scene.
         """
         if self.focusing is not None and echo is not None:
             factor = self.focusing.of(echo, order, length)
@@ -100,7 +100,7 @@ class PassRenderer(ABC):
 
     @property
     def path_count(self) -> int:
-        """Number of paths of a pass from either end."""
+        """Number of paths in a pass from either end."""
         return self.paths
 
     @property
@@ -109,11 +109,11 @@ class PassRenderer(ABC):
         return {"paths_per_pass": self.paths}
 
     def scaled(self, share: float) -> PassRenderer:
-        """Return a renderer of passes with a share of the paths."""
+        """Return a renderer for passes with a share of the paths."""
         return changed(self, paths=max(round(share * self.paths), 1))
 
     def for_smoothing(self, share: float) -> PassRenderer:
-        """Return a renderer of images that are smoothed over pixels, with a share of the receiver's paths."""
+        """Return a renderer for images that are smoothed over pixels, with a share of the receiver's paths."""
         return self.scaled(share)
 
     def for_differences(self) -> PassRenderer:
@@ -132,7 +132,7 @@ class PassRenderer(ABC):
         return changed(self, scene=scene, focusing=focusing)
 
     def of_shots(self, scene: LidarScene, shots: int) -> PassRenderer:
-        """Return a renderer of a number of shots that meet a scene in parts."""
+        """Return a renderer for a number of shots that meet a scene in parts."""
         return changed(self, scene=scene)
 
     def repeated(self, scene: LidarScene, copies: int) -> PassRenderer:
@@ -147,11 +147,10 @@ class PassRenderer(ABC):
         gates: GateWeights | None = None,
         beside: bool = False,
     ) -> ReceivedLight:
-        """Render one pass, of one shot or, with several seeds, of several.
+        """Render one pass, for one shot or, with several seeds, for several.
 
-        Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given,
-        or `beside` them.
-        The pixels of several shots are one row, shot after shot.
+        Passes with different seeds are independent. Energy is summed over `gates` instead of time bins if they are
+        given, or `beside` them. The pixels of several shots are one row, shot after shot.
 
         Raises
         ------
@@ -173,7 +172,7 @@ class PassRenderer(ABC):
 
     @abstractmethod
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
-        """Trace a number of paths of one pass for each shot, and add their light."""
+        """Trace a number of paths in one pass for each shot, and add their light."""
 
 
 @runtime_checkable
@@ -194,4 +193,4 @@ class LidarIntegrator(Protocol):
         connections: bool = True,
         axis: TimeAxis | None = None,
     ) -> PassRenderer:
-        """Return the renderer of passes of a scene, as `LidarMerging.prepare`."""
+        """Return the pass renderer for a scene, as `LidarMerging.prepare`."""

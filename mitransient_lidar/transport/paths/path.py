@@ -1,4 +1,4 @@
-"""Paths of light, and one step of a path, shared by all integrators: flight, and change of medium and direction."""
+"""Light paths, and one path step, shared by all integrators: flight, and change of medium and direction."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ NO_SURFACE = 1e9
 
 @dataclass(kw_only=True)
 class PathPoint:
-    """A point of a path from the receiver or from the laser, and what the part of the path up to it carries.
+    """A point on a path from the receiver or from the laser, with the numbers of the path's part up to it.
 
     Attributes
     ----------
     point, direction
         Position [m], and unit direction in which the path passes it.
     length
-        Optical length up to it [m]: distance times group index, summed over the segments, less the distance from the
+        Optical length up to it [m]: distance times group index, summed over the segments, minus the distance from the
         start to the scene's reference point (`RelativePose`).
     throughput
-        Product of the factors of the part, 0 or more: energy of light from the laser [J]; of paths from the receiver,
-        received energy per radiance at their end [m^2 sr]. Of points along segments, times track length [m].
+        Product of the part's factors, 0 or more: light energy from the laser [J]; for paths from the receiver, received
+        energy per radiance at their end [m^2 sr]. At points along segments, times track length [m].
     lost
         Whether the part has entered the water outside the surface mesh, as if the sea were level there: its complete
         paths measure the loss, and are not received.
     sums
         Sums of the `Perturbations` along the part.
     pixel
-        Pixel of the path; of light from the laser 0.
+        Pixel of the path; 0 for light from the laser.
     scatterings, reversals
         Number of scattering events in the water, and of changes between going down and going up.
     surface_length
-        Optical length from the start by the point where the path first met the sea to the other end [m], as `length`;
-        far beyond any record if its first segment has ended elsewhere.
+        Optical length from the start, by the path's first point on the sea, to the other end [m], as `length`; far
+        beyond any record if its first segment has ended elsewhere.
     mis_partial_sum
-        Sum of the densities, up to a common factor, with which merges and connections of the part make the same path.
-        With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a merge
-        in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
-        transmittance T of scattering.
+        Sum of the densities, up to a common factor, with which the part's merges and connections make the same path.
+        With the scattering coefficient b [1/m] and the phase function p [1/sr] at events, it is V / (b p) for a merge
+        in cells with volume V. For a connection over the distance d with the scattering transmittance T, it is d^2 / (T
+        b p b' p') times a rate.
     inverse_density
-        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]:
-        1 / (b p) times the squared distance from it over the transmittance of scattering on the way; 0 if the segment
-        starts elsewhere.
+        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]: 1 /
+        (b p) times its squared distance, divided by the scattering transmittance on the way; 0 if the segment starts
+        elsewhere.
     """
 
     point: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
@@ -154,7 +154,7 @@ class ConnectedPath(Path):
     Attributes
     ----------
     emitter_ratio
-        Density of the sampled connection over that of the path's own sampling, for the direction of the next segment; 0
+        Density of the sampled connection over the path's own sampling density, for the direction of the next segment; 0
         where no connection was sampled.
     specular
         Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
@@ -173,20 +173,20 @@ class ConnectedPath(Path):
 
 @dataclass
 class Vertex:
-    """End of a segment.
+    """Segment end.
 
     Attributes
     ----------
     si
-        Intersection of the ray, valid or not.
+        Ray intersection, valid or not.
     reach
         Distance to the surface or to the boundary of index layers, whichever is nearer [m].
     length
-        Length of the segment [m]: `reach`, or less up to a scattering event.
+        Segment length [m]: `reach`, or less up to a scattering event.
     scattered
         Whether the segment ends with a scattering event.
     at_boundary
-        Whether it ends at a boundary of index layers.
+        Whether it ends at an index layer boundary.
     outside
         Whether it ends where it enters the water outside the surface mesh.
     in_water
@@ -244,7 +244,7 @@ def interaction_at(point: mi.Point3f, direction: mi.Vector3f) -> mi.MediumIntera
 
 
 class PathStep:
-    """Steps of paths through sea surface, water and solids.
+    """Path steps through sea surface, water and solids.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ class PathStep:
         layers = scene.water.index_layers
         if layers.count > 1:
             to_boundary = layers.to_boundary(path.depth, path.downward, path.index_layer, wet)
-            # A solid in the plane of the boundary is met first from both sides: what begins there stays in its layer.
+            # A solid in the boundary plane is met first from both sides: a path that begins there stays in its layer.
             same = (reach - to_boundary) * dr.abs(path.downward) < coinciding(reach)
             at_boundary = (to_boundary < reach) & ~same
             reach = dr.select(at_boundary, to_boundary, reach)
@@ -333,7 +333,7 @@ class PathStep:
     def perturb(
         self, path: Path, vertex: Vertex, event: ScatteringEvent, direction: mi.Vector3f, passes: mi.Bool
     ) -> None:
-        """Add what perturbations have at the last vertices of paths that continue in a direction."""
+        """Add the perturbations at the last vertices of paths that continue in a direction."""
         path.sums = self._sums_at_event(path, vertex.scattered, event, direction)
         path.sums = self.scene.perturbations.at_solid(path.sums, met_shape(vertex.si), vertex.on_solid & ~passes)
         path.sums = self.scene.perturbations.at_sea(path.sums, vertex.si, vertex.si.to_local(direction), vertex.at_sea)

@@ -1,4 +1,4 @@
-"""Classes of received light: by order of scattering and vertical reversals, or by origin."""
+"""Classes of received light: by scattering order and vertical reversals, or by origin."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from mitransient_lidar.core.errors import UserError
 if TYPE_CHECKING:
     from mitransient_lidar.transport.paths.path import PathPoint
 
-#: Bits of a label for the pixel, and for the number of scattering events; the others are for reversals.
+#: Label bits for the pixel, and for the number of scattering events; the others are for reversals.
 _PIXEL_BITS, _ORDER_BITS = 20, 6
 
-#: Bits of a label for the pixel where only scattering events are counted, and the largest number of these.
+#: Label bits for the pixel where only scattering events are counted, and their largest number.
 _MANY_PIXEL_BITS, _MOST_COUNTED = 28, 15
 
 _MOST = (1 << _ORDER_BITS) - 1
@@ -39,12 +39,11 @@ def check_solids(number: int) -> None:
 
 @dataclass(frozen=True)
 class PathClasses:
-    """Classes into which the light of each pixel is separated.
+    """Classes into which each pixel's light is separated.
 
-    Either orders of scattering below `orders`, and all higher ones together; or the origin of the light, that is the
-    last of the `solids` that it has met, else the water if that has scattered it, else the surface. With `orders` = 0
-    and without `solids` each pixel is one class. Labels have the number of scattering events, up to 15, if they are
-    `counted`.
+    Either scattering orders below `orders`, and all higher ones together; or the light's origin: the last of the
+    `solids` that it has met, else the water if that has scattered it, else the surface. With `orders` = 0 and without
+    `solids` each pixel is one class. Labels have the number of scattering events, up to 15, if they are `counted`.
     """
 
     orders: int = 0
@@ -59,7 +58,7 @@ class PathClasses:
 
     @property
     def by_order(self) -> bool:
-        """Whether there are classes by order of scattering."""
+        """Whether there are classes by scattering order."""
         return self.orders > 0
 
     @property
@@ -74,18 +73,18 @@ class PathClasses:
 
     @property
     def names(self) -> list[str]:
-        """Names of the origins."""
+        """Origin names."""
         return [*ORIGINS, *(str(solid.id()) for solid in self.solids or ())]
 
     @property
     def count(self) -> int:
-        """Number of classes of a pixel: origins; or orders, for one reversal and then for several."""
+        """Classes per pixel: origins; or orders, for one reversal and then for several."""
         if self.by_order:
             return 2 * (self.orders + 1)
         return 1 if self.solids is None else len(ORIGINS) + len(self.solids)
 
     def pack(self, point: PathPoint) -> mi.UInt32:
-        """Return the label of points: their pixels, with their numbers of scattering events and reversals."""
+        """Return point labels: their pixels, with their numbers of scattering events and reversals."""
         if not self.labels_orders:
             return point.pixel
         if not self.by_order:

@@ -21,7 +21,7 @@ _SMALLEST_DISTANCE = 1e-9
 
 @dataclass(kw_only=True)
 class RandomWalkPath(Path):
-    """A path of a random walk; `inverse_density` is that of the end of its last segment.
+    """A random-walk path; `inverse_density` belongs to the end of its last segment.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class RandomWalkPath(Path):
     def walking(
         cls, scene: LidarScene, pose: KernelPose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
     ) -> Self:
-        """Return paths from laser or receiver at tangent-plane angles, without those of throughput 0."""
+        """Return paths from laser or receiver at tangent-plane angles, without those whose throughput is 0."""
         count = dr.width(angles)
         active = (throughput > 0) & dr.full(mi.Bool, True, count)
         return cls.start(scene, pose, angles, throughput, active, lane=dr.arange(mi.UInt32, count), offset=offset)
@@ -52,7 +52,7 @@ class Segments(Protocol):
     """Store of the segments in the water, up to the first solid."""
 
     def add(self, path: Any, length: mi.Float, active: mi.Bool) -> mi.Float:
-        """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
+        """Store each path's next segment and return the offset of the first point beyond its end [m]."""
 
 
 #: Callback at solids and at first hits: paths, interaction, active lanes.
@@ -67,7 +67,7 @@ class EstimateRates(Protocol):
         """Rate of connections between two scattering events."""
 
     def volume(self, point: mi.Point3f) -> mi.Float:
-        """Return the rate of merges at scattering events [m^3]."""
+        """Return the merge rate at scattering events [m^3]."""
 
 
 class RandomWalk:
@@ -83,7 +83,7 @@ class RandomWalk:
     mode
         ``Importance`` for light from the laser, ``Radiance`` for paths from the receiver.
     destination
-        Pose of the receiver for light, of the laser for paths from the receiver.
+        Receiver pose for light, laser pose for paths from the receiver.
     path_end
         Optical path length at which the record ends [m]: paths that cannot arrive before end.
     rates
@@ -207,7 +207,7 @@ class RandomWalk:
 def _shading_correction(si: mi.SurfaceInteraction3f, incoming: mi.Vector3f, outgoing: mi.Vector3f) -> mi.Float:
     """Return the factor by which light differs from importance at interpolated normals.
 
-    Veach 1997, section 5.3 (thesis, Stanford University): the cosines of light are those of the true surface.
+    Veach 1997, section 5.3 (thesis, Stanford University): light has the cosines to the true surface.
     """
     shading = dr.abs(dr.dot(incoming, si.sh_frame.n) * dr.dot(outgoing, si.n))
     true = dr.abs(dr.dot(incoming, si.n) * dr.dot(outgoing, si.sh_frame.n))

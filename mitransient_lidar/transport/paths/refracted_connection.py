@@ -39,10 +39,10 @@ class EmitterDirection:
 
 
 class RefractedEmitterSampler(ABC):
-    """Samples directions in the water, from a point up to the surface, along which light of an emitter may arrive.
+    """Samples directions in the water, from a point up to the surface, along which an emitter's light may arrive.
 
-    Their distribution is that of a flat interface with Gaussian slopes that is lit from the direction of the emitter.
-    Its slope variance is that of ripples and waves together, so that it covers every facet of the real surface.
+    Their distribution belongs to a flat interface with Gaussian slopes that is lit from the emitter's direction. Its
+    slope variance includes ripples and waves, so that it covers every facet on the real surface.
     """
 
     def __init__(self, scene: WaterScene) -> None:
@@ -91,7 +91,7 @@ class RefractedEmitterSampler(ABC):
         return (direction, density) if self._layers is None else self._layers.from_top(direction, density, layer)
 
     def pdf_in_layer(self, emitter: EmitterDirection, direction: mi.Vector3f, layer: mi.UInt32) -> mi.Float:
-        """Return the density [1/sr] of a direction in the index layer of the point."""
+        """Return a direction's density [1/sr] in the index layer of the point."""
         if self._layers is None:
             return self.pdf(emitter, direction)
         top, factor = self._layers.to_top(direction, layer)
@@ -108,7 +108,7 @@ class RefractedLaserSampler(RefractedEmitterSampler):
     def direction_from(self, point: mi.Point3f) -> EmitterDirection:
         """Return the laser's direction from points under water.
 
-        Newton's method on Snell's law for the horizontal distance between the point and where the ray crosses z = 0. It
+        Newton's method on Snell's law for the horizontal distance between the point and the ray's crossing of z = 0. It
         starts below the root, at the refracted straight line; there the sine of the angle in water is concave in the
         distance, so that the steps approach the root from one side at any altitude and angle.
         """
@@ -174,11 +174,11 @@ class TopLayerRay:
     ray
         The ray where it enters the top index layer, or starts in it.
     optical_length, optical_depth, absorption_depth
-        Optical length [m], optical depth and that of absorption alone below the top index layer.
+        Optical length [m], optical depth, and absorption depth alone below the top index layer.
     factor
-        Factor of the radiance: square of the ratio of the refractive indices, times the share that no shape blocks.
+        Radiance factor: squared ratio between the refractive indices, times the share that no shape blocks.
     sums
-        Sums of the perturbations below the top index layer.
+        Perturbation sums below the top index layer.
     """
 
     ray: mi.Ray3f
@@ -199,7 +199,7 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         here = active & (layer == number) & (traced.ray.d.z > 0)
         segment = mi.Ray3f(traced.ray.o, traced.ray.d)
         distance = dr.maximum((-segment.o.z - opaque(layers.boundaries[number - 1])) / segment.d.z, 0)
-        # A solid in the plane of the boundary counts.
+        # A solid in the boundary plane counts.
         segment.maxt = distance + coinciding(distance) / segment.d.z
         share = scene.share_along(segment, here)
         optical_depth = water.optical_depth(segment.o, segment.d, distance)
@@ -238,7 +238,7 @@ class StraightConnection:
 
     @classmethod
     def to_laser(cls, scene: LidarScene, point: mi.Point3f) -> StraightConnection:
-        """Return the connections of points."""
+        """Return the points' connections."""
         relative = scene.relative(scene.transmitter_pose)
         offset = scene.transmitter_pose.point - point
         distance = dr.norm(offset)
@@ -287,8 +287,8 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
     Returns
     -------
     radiance
-        Energy per area and solid angle [J/(m^2 sr)] along ``si.wi``: intensity, BSDF with its cosine, and inverse
-        square of the distance, of the light that no shape blocks; 0 on the other side of the sea surface.
+        Energy per area and solid angle [J/(m^2 sr)] along ``si.wi`` by the light that no shape blocks: intensity, BSDF
+        with its cosine, and inverse square distance; 0 on the other side of the sea surface.
     length
         Length of the line [m], relative to the distance of the scene's reference point.
     """

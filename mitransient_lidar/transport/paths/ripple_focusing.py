@@ -1,4 +1,4 @@
-"""Mean enhancement of echoes by ripples that the mesh of the sea does not have."""
+"""Mean enhancement of echoes by ripples that the sea mesh lacks."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.perturbations import Perturbation, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest depth of the table [m], and its number of depths.
+#: Largest depth in the table [m], and its number of depths.
 _DEEPEST, _DEPTHS = 60.0, 20
 
-#: Largest number of forward scattering events that is told apart.
+#: Largest number of forward scattering events that is distinguished.
 _MOST_EVENTS = 7
 
-#: Samples of displacements.
+#: Displacement samples.
 _SAMPLES = 1000
 
 
@@ -53,24 +53,25 @@ class Echo:
 
 
 class RippleFocusing:
-    """Factors of the energy of paths that cross a sea with ripples twice.
+    """Energy factors for paths that cross a sea with ripples twice.
 
     Ripples are drawn anew on each way, so that they neither focus light nor return it through themselves. The factor is
-    the enhancement with correlated ripples over that without them, by the depth of the echo and the number of forward
-    scattering events, which move one way against the other (`physics.sea.double_passage`).
+    the ratio of the enhancements with and without correlated ripples. It depends on the echo's depth and the number of
+    forward scattering events, which move one way against the other (`physics.sea.double_passage`).
 
     Parameters
     ----------
     depths, factors
         Depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
     depth_per_length
-        Depth of an echo over the optical length of its path beyond that by the surface.
+        Echo depth over its path's optical length beyond the surface path.
     enhancement
-        Enhancement by all waves, of the shape of `factors`.
+        Enhancement by all waves, in the shape of `factors`.
     events
         Mean number of scattering events on both ways to each depth.
     enhancements
-        Returns the enhancements by all waves and by those drawn, of the shape of `factors` transposed, of other water.
+        Returns the enhancements in other water by all waves and by the drawn waves, in the shape of `factors`
+        transposed.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ class RippleFocusing:
         return cls(depths, (true / drawn).T, 0.5 * cos_water / scene.group_index, true.T, events, enhancements)
 
     def factors_of(self, column: WaterColumn, phases: Sequence[PowerLawTable]) -> FloatArray:
-        """Return the factors in other water, of the shape of `factors`: its layers and their phase functions."""
+        """Return the factors in other water, in the shape of `factors`: its layers and their phase functions."""
         true, drawn = self._enhancements(column, phases)
         return np.asarray((true / drawn).T)
 
@@ -152,7 +153,7 @@ class RippleFocusing:
     def describe(self) -> dict[str, list[float]]:
         """Return attributes of a result: mean enhancement by all waves by depth [m], linear and to 1 at 0 m.
 
-        The numbers of scattering events are Poisson-distributed, as those of light of which none is lost.
+        The numbers of scattering events are Poisson-distributed, as for light without loss.
         """
         number = np.arange(_MOST_EVENTS)
         log = number[:, None] * np.log(np.maximum(self.events, 1e-30)) - self.events
@@ -161,14 +162,14 @@ class RippleFocusing:
         return {"wave_focusing_depths": self.depths.tolist(), "wave_focusing": mean.tolist()}
 
     def of(self, echo: Echo, order: mi.UInt32, length: mi.Float) -> mi.Float:
-        """Return the factors of paths by number of scattering events and relative length [m].
+        """Return path factors by number of scattering events and relative length [m].
 
         One event turns light in the water. Light that the surface alone has reflected has the factor 1.
         """
         return self._look_up(self._table, 1.0, echo, order, length)
 
     def perturb(self, sums: Sums, factor: mi.Float, echo: Echo, order: mi.UInt32, length: mi.Float) -> Sums:
-        """Return the sums of perturbations with the derivatives of the factors."""
+        """Return the perturbation sums with the factors' derivatives."""
         found = []
         for total, table in zip(sums, self._changes, strict=True):
             if table is not None:

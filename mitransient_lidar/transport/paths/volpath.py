@@ -39,7 +39,7 @@ from mitransient_lidar.transport.solids import met_shape
 #: to 0.95 in clear and turbid water, with the default probability.
 _GUIDING_ASYMMETRY = 0.87
 
-#: Asymmetry of the lobe on solids where it has a probability of its own: closer to that of the sun's light under water.
+#: Lobe asymmetry on solids with their own lobe probability: closer to sunlight under water.
 _SOLID_GUIDING_ASYMMETRY = 0.95
 
 #: Radiance under water far from the emitter's direction, over the mean of all directions, that the roulette assumes.
@@ -48,25 +48,25 @@ _DIFFUSE_RADIANCE = 0.5
 #: Number of the random streams within a pass.
 _STREAM = 3
 
-BYTES_PER_PATH = 18  #: Memory of a path: the state of its random numbers [bytes].
+BYTES_PER_PATH = 18  #: Memory per path: the state of its random numbers [bytes].
 
 
 @dataclass(frozen=True)
 class VolpathOptions:
-    """Options of the path tracer; the plugins ``lidar_volpath`` and ``passive_volpath`` document most of them.
+    """Path tracer options; the plugins ``lidar_volpath`` and ``passive_volpath`` document most of them.
 
     Attributes
     ----------
     samples_emitter
         Whether directions towards the emitter are sampled, besides the path's own: the balance heuristic combines both.
     solid_guiding_probability
-        Guiding probability on solids below water that scatters all light; None is that of scattering events, with the
-        same lobe.
+        Guiding probability on solids below water that scatters all light; None is the probability at scattering events,
+        with the same lobe.
     expects_emitter
         Whether the roulette counts throughput times the radiance expected under water, which is largest about the
         emitter's direction, instead of throughput alone.
     weights_absorption
-        Whether absorption reduces the weight of paths, instead of the number of those that scatter or arrive.
+        Whether absorption reduces path weights, instead of the number of paths that scatter or arrive.
     connects_solids
         Whether `complement_only` has the paths whose first solid is under water, too.
     """
@@ -90,7 +90,7 @@ class PathLight:
     sampler
         Samples directions under water towards the emitter.
     weight
-        Weight of the light of each path.
+        Light weight of each path.
     """
 
     sampler: RefractedEmitterSampler
@@ -115,7 +115,7 @@ class PathLight:
     ) -> None:
         """Record light that arrives along paths of an optical length [m], connected from solids or elsewhere.
 
-        `sums` are those of the perturbations of the complete paths.
+        `sums` are the perturbation sums of the complete paths.
         """
 
     def perturbed(self, sums: Sums, point: mi.Point3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sums:
@@ -141,7 +141,7 @@ class PathLight:
         """Record light of emitters that paths meet when they leave the scene; there is none by default."""
 
     def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
-        """Record light of other emitters that the dry side of the sea surface reflects; there is none by default."""
+        """Record other emitters' light that the dry side of the sea surface reflects; there is none by default."""
 
     @abstractmethod
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
@@ -177,7 +177,7 @@ class LaserLight(PathLight):
         return path.length + self._to_laser.distance(path.point)
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
-        """Return the numbers of solids among the classes of the light."""
+        """Return the solids' numbers among the light classes."""
         return self.received.classes.solid(shape)
 
     def receive(
@@ -206,9 +206,9 @@ class LaserLight(PathLight):
 class PathTracer:
     """Traces paths from the receiver and connects their vertices to a light.
 
-    Each vertex under water samples a direction in which the emitter may appear through the surface, and traces it to
-    the real surface, where it is connected; so is the path itself where it reaches the surface unscattered.
-    Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
+    Each vertex under water samples a direction in which the emitter may appear through the surface. The direction is
+    traced to the real surface, where it is connected; a path that reaches the surface unscattered is connected there,
+    too. Both estimate the same paths; the balance heuristic combines them (Veach and Guibas 1995,
     doi:10.1145/218380.218498).
     """
 
@@ -320,7 +320,7 @@ class PathTracer:
         sums = light.perturbed(sums, crossing.p, crossing, met | direct)
         light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid, sums)
         light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
-        # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
+        # For the loss, the sampled direction's density replaces the density of the surface's BSDF.
         share = light.weight * path.throughput * connected * density
         light.lose(emitter, dr.select(lost, share, 0), top.ray(distance))
 
@@ -364,8 +364,8 @@ class PathTracer:
     def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> mi.Float | float:
         """Return the probability of the lobe towards the emitter.
 
-        On solids with a probability of their own it is that times the share of the emitter's light that is scattered
-        above them: what arrives unscattered is found by connections.
+        Solids with a probability of their own multiply it by the share of the emitter's light that is scattered above
+        them: connections find the unscattered light.
         """
         on_solids, water = self.options.solid_guiding_probability, self.scene.water
         if on_solids is None or water is None:

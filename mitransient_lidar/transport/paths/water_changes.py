@@ -1,4 +1,4 @@
-"""Derivatives by coefficients and phase functions of water, as perturbations of paths."""
+"""Derivatives by water coefficients and phase functions, as path perturbations."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from mitransient_lidar.transport.medium.water_phases import LayerPhases
 from mitransient_lidar.transport.paths.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
 
-#: Relative step of the numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
+#: Relative step for numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
 _STEP = 1e-4
 
-#: That of the factors of ripples, which are means of samples.
+#: Step for the ripple factors, which are sample means.
 _FOCUSING_STEP = 0.02
 
 #: Longest step of a mean cosine g over 1 - |g|.
 _COSINE_SHARE = 0.25
 
-#: Largest derivative of ln p by the logarithm of a parameter that counts as none: rounding of tables.
+#: Largest derivative of ln p by a logarithmic parameter that counts as none: table rounding.
 _NEGLIGIBLE = 1e-6
 
 
 def coefficient_derivative(water: Water, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:
-    """Return the derivative by a coefficient of a layer, with the other coefficients held fixed.
+    """Return the derivative by a layer's coefficient, with the other coefficients held fixed.
 
-    With lengths L and n scattering events in the layer, the derivative of the logarithm of a contribution is -L by c;
-    by b it is n / b, as absorption falls where scattering grows, and by bb 0; to the latter two every scattering event
-    adds the derivative of the logarithm of the phase function, which follows from b and bb, as does that of the factors
-    of ripples.
+    With lengths L and n scattering events in the layer, a contribution's logarithmic derivative is -L by c. By b it is
+    n / b, as absorption falls where scattering grows, and by bb it is 0. To the latter two every scattering event adds
+    the phase function's logarithmic derivative, which follows from b and bb; so does the derivative of the ripple
+    factors.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def coefficient_derivative(water: Water, name: str, layer: int, focusing: Ripple
 
 
 def mean_cosine_derivative(water: Water, focusing: RippleFocusing | None = None) -> Perturbation:
-    """Return the derivative by the mean cosine of the function ``hg`` of all layers; raise UserError for others."""
+    """Return the derivative by the mean cosine of the function ``hg`` in all layers; raise UserError for others."""
     layers = water.layers
     if layers.kind != "hg" or layers.nested:
         raise UserError("phase_g: the water has no phase function hg, the only one that depends on it")
@@ -129,7 +129,7 @@ def _of_phase(given: Mapping[str, float]) -> dict[str, float]:
 def _focusing_derivative(
     focusing: RippleFocusing | None, layers: LayerPhases, layer: int, name: str, value: float
 ) -> FloatArray | None:
-    """Return the derivative of the factors of ripples by a coefficient; None where there are none."""
+    """Return the derivative of the ripple factors by a coefficient; None where there are none."""
     if focusing is None or value == 0:
         return None
     step = _FOCUSING_STEP * value

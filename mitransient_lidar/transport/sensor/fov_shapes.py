@@ -1,4 +1,4 @@
-"""Shapes of a field of view in tangent-plane angles [rad]: area [rad^2], membership and uniform sampling."""
+"""Field-of-view shapes in tangent-plane angles [rad]: area [rad^2], membership and uniform sampling."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOT_SIMPLE = "polygon: its edges must not cross each other, nor touch or overla
 
 
 class FovShape(ABC):
-    """A region of the tangent plane."""
+    """A region in the tangent plane."""
 
     area: float
 
@@ -110,7 +110,7 @@ class Sector(FovShape):
         return dr.fma(r, cos, self.centre[0]), dr.fma(r, sin, self.centre[1])
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return the bounds of the circle."""
+        """Return the circle's bounds."""
         (x, y), r = self.centre, self.outer
         return x - r, x + r, y - r, y + r
 
@@ -183,7 +183,7 @@ class Strip(FovShape):
 
     @staticmethod
     def _half_disc(x: float) -> float:
-        """Area of the part of the unit disc with abscissa below x, minus half the disc."""
+        """Area of the unit disc's part with abscissa below x, minus half the disc."""
         return float(x * np.sqrt(max(0.0, 1 - x * x)) + np.arcsin(x))
 
     @property

@@ -20,8 +20,8 @@ _ROOT3 = math.sqrt(3.0)
 class HexPixels(PixelArray):
     """A hexagon and rings of hexagons around it, in rows along angle_y.
 
-    The field of view is the circumscribed circle about the axis: for N hexagons of side s its radius is sqrt(N) s, and
-    they fill 3 sqrt(3) / (2 pi) = 82.7 % of it for any N.
+    The field of view is the circumscribed circle about the axis. For N hexagons with side s its radius is sqrt(N) s,
+    and they fill 3 sqrt(3) / (2 pi) = 82.7 % of it for any N.
 
     The array without its central hexagon is three parallelograms of n x (n + 1) hexagons for n rings. Points are drawn
     in these and assigned to hexagons afterwards, at a cost that does not depend on N.
@@ -31,14 +31,14 @@ class HexPixels(PixelArray):
     layout
         ``hexN`` with N = 1, 7, 19, 37, ... hexagons.
     field_of_view
-        Diameter of the circle [rad], positive.
+        Circle diameter [rad], positive.
     fill_factor
         Share of each hexagon that receives light, 0.01 to 1: a smaller hexagon about the same centre.
 
     Notes
     -----
-    A hexagon has the axial coordinates (column, row) with its centre at angle_x = 1.5 s row and
-    angle_y = sqrt(3) s (column + row / 2).
+    A hexagon has the axial coordinates (column, row) with its centre at angle_x = 1.5 s row and angle_y = sqrt(3) s
+    (column + row / 2).
     """
 
     def __init__(self, layout: str, field_of_view: float, fill_factor: float = 1.0) -> None:
@@ -58,7 +58,7 @@ class HexPixels(PixelArray):
         self.names = names if count > 1 else ["single"]
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to uniform points of the hexagons."""
+        """Map uniform numbers to uniform points in the hexagons."""
         rings, count = self._rings, self.count
         of_centre = u.x * count < 1
         part = (u.x * count - 1) * (3 / max(count - 1, 1))
@@ -103,12 +103,12 @@ class HexPixels(PixelArray):
 
 
 def hexagon_count(layout: str) -> int:
-    """Return the number of hexagons of a layout such as ``hex7``.
+    """Return the number of hexagons in a layout such as ``hex7``.
 
     Raises
     ------
     UserError
-        When the number is not that of a hexagon and complete rings around it, or is above 2^20.
+        When the number is not one hexagon plus complete rings around it, or is above 2^20.
     """
     match = re.fullmatch(r"hex([1-9]\d*)", layout)
     count = int(match.group(1)) if match else 0
@@ -131,5 +131,5 @@ def _round(column: mi.Float, row: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 def _position(column: mi.Float, row: mi.Float, side: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Return (angle_x, angle_y) of axial coordinates, for the side of a hexagon."""
+    """Return (angle_x, angle_y) from axial coordinates, for a hexagon side."""
     return 1.5 * side * row, _ROOT3 * side * (column + 0.5 * row)

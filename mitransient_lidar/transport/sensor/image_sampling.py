@@ -43,7 +43,7 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
 
 
 def _read_png(path: Path) -> NDArray[Any]:
-    """Read a PNG file, unless its header says that it is too large."""
+    """Read a PNG file, unless its header states too large a size."""
     with damaged_file(f"{path} is damaged, or is not a PNG file."), open_file(path) as file:
         width, height = np.frombuffer(file.read(24)[16:], dtype=">u4").tolist()
         check_size(path, 8.0 * width * height)

@@ -20,7 +20,7 @@ class Octaves:
     centre
         (angle_x, angle_y) of the centre [rad], shape (2,).
     core, edge
-        Radius of the core and of all samples [rad], positive.
+        Radii of the core and of all samples [rad], positive.
     """
 
     def __init__(self, centre: FloatArray, core: float, edge: float) -> None:
@@ -37,7 +37,7 @@ class Octaves:
         return self.around(self._core * dr.sqrt(dr.maximum(dr.exp(u.x * self._log_range) - 1, 0)), u.y)
 
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
-        """Return the density of `sample` [1/rad^2]."""
+        """Return the density in `sample` [1/rad^2]."""
         radius2 = dr.square(angle_x - self._centre[0]) + dr.square(angle_y - self._centre[1])
         density = dr.inv_pi / (self._log_range * (radius2 + self._core * self._core))
         return dr.select(radius2 <= self._edge * self._edge, density, 0)

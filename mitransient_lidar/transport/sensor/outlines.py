@@ -1,4 +1,4 @@
-"""Outlines of pixels and of other regions of the tangent plane."""
+"""Outlines of pixels and other tangent-plane regions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.pixels import PixelArray, ShapedPixels
 
 #: Points along each side of the raster on which a region is traced, bisections that find its outline to 1/1000 of a
-#: cell, and largest distance of simplified lines from the points that they leave out, in cells.
+#: cell, and largest distance from simplified lines to omitted points, in cells.
 _RASTER, _BISECTIONS, _CELL_TOLERANCE = 128, 10, 0.05
 
 #: Points along each side of the raster that finds the pixels.
@@ -62,7 +62,7 @@ def _equal_to(pixel_at: Callable[..., NDArray[np.int64]], index: int) -> Region:
 
 
 def traced_outlines(inside: Region, bounds: tuple[float, float, float, float]) -> list[Outline]:
-    """Return the outlines of a region within some bounds: contours of a raster, moved onto the region's edge."""
+    """Return a region's outlines within some bounds: raster contours, moved onto the region's edge."""
     for _ in range(2):
         # Rows outside the region close its outlines. The second raster fits the region closely.
         steps = [(bounds[i + 1] - bounds[i]) / (_RASTER - 3) for i in (0, 2)]
@@ -92,7 +92,7 @@ def traced_outlines(inside: Region, bounds: tuple[float, float, float, float]) -
 
 
 def simplified(line: Outline, tolerance: float) -> Outline:
-    """Leave out points of a closed line that lie within `tolerance` of it without them (Douglas and Peucker 1973)."""
+    """Leave out points on a closed line that lie within `tolerance` of it without them (Douglas and Peucker 1973)."""
     keep = np.zeros(len(line), dtype=bool)
     # A closed line is cut at its first point and at the one farthest from it.
     far = int(np.argmax(np.hypot(*(line - line[0]).T)))

@@ -1,4 +1,4 @@
-"""Pixels drawn as an image of labels."""
+"""Pixels drawn as a label image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LARGEST_LABEL = 2**24
 
 
 class MappedPixels(PixelArray):
-    """A square field of view divided into pixels by an image of labels.
+    """A square field of view divided into pixels by a label image.
 
     All cells with one label are one pixel, named ``label`` and the number; those with the label 0 receive nothing.
     Points are drawn over all labelled cells, so that the pixels sum to the single pixel of the same cells path by path.

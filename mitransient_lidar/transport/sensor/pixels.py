@@ -1,4 +1,4 @@
-"""Arrays of pixels: sampling, and lookup of the pixel that sees a tangent-plane point."""
+"""Pixel arrays: sampling, and lookup of the pixel that sees a tangent-plane point."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Rectangle, S
 
 logger = logging.getLogger(__name__)
 
-#: Names of the four pixels of the published receivers, in pixel order.
+#: Names of the four pixels in the published receivers, in pixel order.
 PUBLISHED_NAMES = ("red", "green", "blue", "black")
 
 #: Layouts of more pixels than this are imagers by default.
 _LARGEST_LAYOUT = 16
 
-#: Largest number of pixels of a receiver, and of one of rows and columns.
+#: Largest number of pixels in a receiver, and in one with rows and columns.
 MOST_PIXELS, _MOST_OF_LAYOUT = 2**20, 2**22
 
 #: Points in each pixel that find overlaps.
@@ -37,7 +37,7 @@ _CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
 
 
 class PixelArray(ABC):
-    """The pixels of a receiver in tangent-plane angles [rad].
+    """A receiver's pixels in tangent-plane angles [rad].
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class PixelArray(ABC):
     field_of_view_shape
         ``circle``, ``square``, ``rectangle`` or ``nested``.
     sides
-        Full angles along angle_x and angle_y [rad] of rows and columns of pixels, else None.
+        Full angles along angle_x and angle_y [rad] for rows and columns of pixels, else None.
     """
 
     names: list[str]
@@ -72,7 +72,7 @@ class PixelArray(ABC):
 
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to points (angle_x, angle_y) of density: number of pixels there over `area`."""
+        """Map uniform numbers to points (angle_x, angle_y) with the density: number of pixels there over `area`."""
 
     @abstractmethod
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -86,8 +86,8 @@ class PixelArray(ABC):
 class LayoutPixels(PixelArray):
     """A circular, square or rectangular field of view cut into rows and columns.
 
-    Points are drawn over the field of view and then assigned to pixels, so that these sum to the single pixel of the
-    same field of view path by path.
+    Points are drawn over the field of view and then assigned to pixels. The pixels thus sum, path by path, to a single
+    pixel with the same field of view.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class LayoutPixels(PixelArray):
             self.names = [f"r{row}c{column}" for row in range(rows) for column in range(columns)]
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to uniform points of the field of view, or of its cells when they leave gaps."""
+        """Map uniform numbers to uniform points in the field of view, or in its cells when they leave gaps."""
         if self._shrink == 1:
             return self.field.sample(u)
         height, width = self.sides
@@ -159,7 +159,7 @@ class LayoutPixels(PixelArray):
         return mi.UInt32(row * self._columns + column), dr.select(inside, mi.Float(1), 0)
 
     def centres(self) -> NDArray[np.float64]:
-        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); of the uncut cells in imagers."""
+        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); in imagers of the uncut cells."""
         height, width = self.sides
         far = 0.5 * height - (np.arange(self._rows) + 0.5) * height / self._rows
         left = 0.5 * width - (np.arange(self._columns) + 0.5) * width / self._columns
@@ -276,7 +276,7 @@ class FovLookup:
     def _holder(
         self, angle_x: mi.Float, angle_y: mi.Float, first: mi.UInt32, end: mi.UInt32, wanted: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return field number `wanted` of those in a part of the list that contain a point, and how many do."""
+        """Return field number `wanted` among those in a part of the list that contain a point, and their number."""
 
         def step(index: mi.UInt32, chosen: mi.UInt32, count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
             field = dr.gather(mi.UInt32, self._fields, index)
@@ -290,7 +290,7 @@ class FovLookup:
 
 
 def parse_layout(layout: str) -> tuple[int, int]:
-    """Return (rows, columns) of a layout such as ``2x2``; ``1x4`` is the published receiver of four strips.
+    """Return (rows, columns) for a layout such as ``2x2``; ``1x4`` is the published receiver with four strips.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Optical blur of a receiver: the point-spread function of its optics."""
+"""A receiver's optical blur: the point-spread function of its optics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 
 
 class PointSpread(ABC):
-    """Displacement on the detector of the light of one direction, against the focus of sharp optics."""
+    """Displacement on the detector of light from one direction, against the focus of sharp optics."""
 
     #: Angle that contains all of the light but 4e-6 [rad].
     reach: float

@@ -1,4 +1,4 @@
-"""Pose, aperture and losses of a receiver, and the sampling of its field of view."""
+"""A receiver's pose, aperture and losses, and the sampling of its field of view."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SMALLEST_FOOTPRINT_SHARE = 0.05
 #: Radius of the core around the footprint's centre over the beam's standard deviation: samples are even within it.
 _CORE_PER_SPREAD = 2.0
 
-#: Of this many samples, those that are drawn over the field of view, of few pixels and of many.
+#: Of this many samples, the numbers that are drawn over the field of view: with few pixels, and in images.
 _SETS = 4
 _OF_VIEW, _OF_VIEW_IN_IMAGES = 1, 2
 
@@ -31,7 +31,7 @@ IMAGE_PIXELS = 4096
 
 @dataclass(frozen=True)
 class ReceiverOptics:
-    """Aperture and losses of a receiver.
+    """Receiver aperture and losses.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class ReceiverOptics:
 class Receiver:
     """The attribute ``receiver`` of a sensor plugin.
 
-    Pixels are places on the detector: light from the direction g falls on g + delta, with delta drawn from the
+    Pixels are regions on the detector: light from the direction g falls on g + delta, with delta drawn from the
     point-spread function `blur`; sharp optics (None) have delta = 0.
     """
 
@@ -87,7 +87,7 @@ class Receiver:
     def sensor_ray(
         self, time: mi.Float, position: mi.Point2f, spread: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Return a ray of the field of view and the factor from radiance to energy, for Mitsuba's own integrators."""
+        """Return a field-of-view ray and the factor from radiance to energy, for Mitsuba's own integrators."""
         angle_x, angle_y = self.pixels.sample(position)
         _, here = self.pixels.pixel_at(angle_x, angle_y, mi.Float(0))
         if self.blur is not None:
@@ -106,7 +106,7 @@ def solid_angle_factor(angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True)
 class SensorSample:
-    """One sample of the receiver's field of view for every path.
+    """One field-of-view sample for every path.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class SensorSample:
 
     @classmethod
     def at(cls, pose: KernelPose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
-        """Return samples at tangent-plane angles of a pose."""
+        """Return samples at a pose's tangent-plane angles."""
         return cls(mi.Point2f(x, y), pose.direction(x, y), pixel, weight)
 
 
@@ -133,8 +133,8 @@ class SensorSampler:
     Around the footprint, directions are distributed in `Octaves`, as scattering spreads the light of a narrow beam.
     Both parts are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 
-    With blur, directions over the view draw the place p on the detector and the direction p - delta, the others the
-    direction g and the place g + delta. Both draw delta from the point-spread function, whose density cancels.
+    With blur, directions over the view draw the point p on the detector and the direction p - delta, the others the
+    direction g and the point g + delta. Both draw delta from the point-spread function, whose density cancels.
     """
 
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
@@ -144,7 +144,7 @@ class SensorSampler:
         ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
         spread = transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges))
         self.sigma = opaque(spread)
-        # The edge of the field of view, at most as far from its centre as the corner of a square.
+        # The field of view's edge, at most as far from its centre as a square's corner.
         corner = 1.0 if pixels.field_of_view_shape == "circle" else float(np.sqrt(2))
         edge = 0.5 * corner * pixels.field_of_view + float(np.hypot(*self.centre))
         self._footprint = Octaves(self.centre, _CORE_PER_SPREAD * spread, edge)

@@ -147,7 +147,7 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     depths = ["--depths", "3"] if command == "beam-spread" else []
     done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
     assert done.stdout.splitlines() == [str(tmp_path / "out.nc"), "lines"]
-    assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept.\n")
+    assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept\n")
 
 
 def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
@@ -194,9 +194,9 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
 def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
     (tmp_path / "file").write_text("regular")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        assert_refused(run("render", scene, "-o", folder), f"cannot write to folder {folder}: Not a directory.")
+        assert_refused(run("render", scene, "-o", folder), f"cannot write to folder {folder}: Not a directory")
     (tmp_path / "fig09.nc").mkdir()
-    assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder.")
+    assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder")
     assert not calls.seen
 
 

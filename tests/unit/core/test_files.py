@@ -100,7 +100,7 @@ def test_a_failure_while_files_are_moved_restores_the_former_ones(tmp_path, monk
     with pytest.raises(KeyboardInterrupt if isinstance(failure, KeyboardInterrupt) else UserError) as caught:
         fail()
     assert moved[:2] == [tmp_path / "a", tmp_path / "b"]
-    assert str(caught.value) in ("", f"cannot write {tmp_path / 'c'}: Permission denied.")
+    assert str(caught.value) in ("", f"cannot write {tmp_path / 'c'}: Permission denied")
     assert contents(tmp_path) == {"b": "old"}
 
 
@@ -289,8 +289,8 @@ def test_a_full_disk_names_the_file_and_not_the_temporary_one(tmp_path):
     for error in (OSError(errno.ENOSPC, "full"), OSError(errno.ENOSPC, hdf5), openexr):
         with pytest.raises(UserError) as caught:
             fail(error)
-        assert str(caught.value) == f"cannot write {tmp_path / 'a.nc'}: No space left on device."
+        assert str(caught.value) == f"cannot write {tmp_path / 'a.nc'}: No space left on device"
     with pytest.raises(UserError) as caught:
         fail("cannot write {}")
-    assert str(caught.value) == f"cannot write {tmp_path / 'a.nc'}: cannot write {tmp_path / 'a.nc'}."
+    assert str(caught.value) == f"cannot write {tmp_path / 'a.nc'}: cannot write {tmp_path / 'a.nc'}"
     assert contents(tmp_path) == {}

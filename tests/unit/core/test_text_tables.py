@@ -70,8 +70,8 @@ def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
         ("0 0\n1 x\n", "line 2: '1 x' must be two numbers, time in ns and power"),
         ("0 x\n1 2\n3 4\n", "line 1: '0 x' must be two numbers"),
         ("0 0\ntime power\n", "line 2: 'time power' must be two numbers"),
-        ("t,power\n0,0\n1,x\n", r"line 3: power = 'x' must be a number\.$"),
-        ("t,power\n0,0\n1,2,3\n4,5\n", r"line 3 has 3 values but must have 2, one for each column\.$"),
+        ("t,power\n0,0\n1,x\n", r"line 3: power = 'x' must be a number$"),
+        ("t,power\n0,0\n1,2,3\n4,5\n", r"line 3 has 3 values but must have 2, one for each column$"),
         (
             "t [fs],power\n0,0\n1,2\n",
             r"unit in column 't \[fs\]' \(found: t \[fs\], power\): allowed are time \[ns, ps, us, ms, s\], power",

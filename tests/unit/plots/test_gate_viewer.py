@@ -157,7 +157,7 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
     [
         (
             lambda stack, result: (result[["waveform_stderr"]], "page.html"),
-            "the dataset is no gate stack: it has no variable gate_energy.",
+            "the dataset is no gate stack: it has no variable gate_energy",
         ),
         (lambda stack, result: (result, "page.html"), "the dataset has no coordinate row"),
         (
@@ -170,9 +170,9 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
         ),
         (
             lambda stack, result: (numbered(result), "page.html", None, 0.01),
-            "limit_mb = 0.01 is too small for this stack.",
+            "limit_mb = 0.01 is too small for this stack",
         ),
-        (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform."),
+        (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform"),
         (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
         (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),
         (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be greater than 0"),

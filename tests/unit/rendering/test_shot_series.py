@@ -244,7 +244,7 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
     done = run("shots", "fig09_2x2", *arguments)
     assert done.exit_code == 130
     assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept."
+    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept"
     assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 

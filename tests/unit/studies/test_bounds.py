@@ -146,7 +146,7 @@ def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
     small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
     done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
     assert done.exit_code == 130
-    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept.\n"
+    assert done.stderr == "interrupted after 0 of 4 renders, and none is kept\n"
     assert not list(tmp_path.iterdir())
 
 

@@ -254,7 +254,7 @@ def test_command(tmp_path):
     for options, sentence in (
         (["--slope-deviation", "0.1"], "--slope-deviation = '0.1' must be two numbers"),
         (["--efficiency", "2"], "efficiency = 2 must"),
-        (["-o", "found.txt"], "--output found.txt must end in .nc."),
+        (["-o", "found.txt"], "--output found.txt must end in .nc"),
     ):
         assert_refused(run("retrieve", tmp_path / "shot.nc", *options), sentence)
 

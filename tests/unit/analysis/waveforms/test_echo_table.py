@@ -187,7 +187,7 @@ def test_csv_and_command(tmp_path):
     ("options", "sentence"),
     [
         (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
-        (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv."),
+        (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv"),
         (["--no-table"], "--no-table leaves nothing to do"),
     ],
 )

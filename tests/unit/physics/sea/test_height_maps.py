@@ -106,15 +106,15 @@ def with_holes():
 @pytest.mark.parametrize(
     ("heights", "size", "message"),
     [
-        (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres."),
+        (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres"),
         (HEIGHTS, 0, "size = 0 must be greater than 0"),
         (HEIGHTS, np.nan, "size = nan must be finite"),
-        (HEIGHTS[0], 1, "has heights of shape (4,), but must have at least 2 rows and 2 columns."),
-        (HEIGHTS[:1], 1, "has heights of shape (1, 4), but must have at least 2 rows and 2 columns."),
-        (HEIGHTS[:, :1], 1, "has heights of shape (3, 1), but must have at least 2 rows and 2 columns."),
-        (HEIGHTS[None], 1, "has heights of shape (1, 3, 4), but must have at least 2 rows and 2 columns."),
-        (HEIGHTS + 0j, 1, "has heights of type complex128, but they must be real numbers."),
-        (HEIGHTS.astype(str), 1, "has heights of type <U32, but they must be real numbers."),
+        (HEIGHTS[0], 1, "has heights of shape (4,), but must have at least 2 rows and 2 columns"),
+        (HEIGHTS[:1], 1, "has heights of shape (1, 4), but must have at least 2 rows and 2 columns"),
+        (HEIGHTS[:, :1], 1, "has heights of shape (3, 1), but must have at least 2 rows and 2 columns"),
+        (HEIGHTS[None], 1, "has heights of shape (1, 3, 4), but must have at least 2 rows and 2 columns"),
+        (HEIGHTS + 0j, 1, "has heights of type complex128, but they must be real numbers"),
+        (HEIGHTS.astype(str), 1, "has heights of type <U32, but they must be real numbers"),
         (with_holes(), 1, "has holes, 2 of 12 heights, the first in row 1 and column 3 counted from 0"),
     ],
 )
@@ -129,14 +129,14 @@ def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
 @each_row(
     ("positions", "message"),
     [
-        ({"x": X}, "has positions x only: it must have both x and y, or none."),
-        ({"x": X[1:], "y": Y}, "has x of shape (3,), but its heights need (4,)."),
-        ({"x": X, "y": np.stack([Y] * 4)}, "has y of shape (4, 3), but its heights need (3,)."),
-        ({"x": X, "y": Y[::-1]}, "has y[0] = 6 and y[1] = 5.5: positions must increase."),
-        ({"x": [0, np.nan, 2, 3], "y": Y}, "has x[1] = nan: positions must be finite."),
-        ({"x": [0, 1, 2, np.inf], "y": Y}, "has x[3] = inf: positions must be finite."),
+        ({"x": X}, "has positions x only: it must have both x and y, or none"),
+        ({"x": X[1:], "y": Y}, "has x of shape (3,), but its heights need (4,)"),
+        ({"x": X, "y": np.stack([Y] * 4)}, "has y of shape (4, 3), but its heights need (3,)"),
+        ({"x": X, "y": Y[::-1]}, "has y[0] = 6 and y[1] = 5.5: positions must increase"),
+        ({"x": [0, np.nan, 2, 3], "y": Y}, "has x[1] = nan: positions must be finite"),
+        ({"x": [0, 1, 2, np.inf], "y": Y}, "has x[3] = inf: positions must be finite"),
         ({"x": [0, 1, 2, 3.01], "y": Y}, "has x[2] and x[3] 1.01 apart, but 1.00333 on average: positions must"),
-        ({"x": ["a", "b", "c", "d"], "y": Y}, "has x of type <U1, but they must be real numbers."),
+        ({"x": ["a", "b", "c", "d"], "y": Y}, "has x of type <U1, but they must be real numbers"),
     ],
 )
 def test_invalid_positions_are_rejected(tmp_path, positions, message):
