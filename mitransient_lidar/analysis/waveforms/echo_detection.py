@@ -209,9 +209,9 @@ class Echoes:
         error = np.where(lacking, error_ns, self.time_stderr)
         return replace(self, time_ns=np.where(lacking, time_ns, self.time_ns), time_stderr=error)
 
-    def delayed(self, delay_ns: float) -> Echoes:
-        """Return the echoes with a delay [ns] added to their times."""
-        return replace(self, time_ns=self.time_ns + delay_ns)
+    def delayed(self, delay_ns: float | FloatArray, error_ns: float | FloatArray = 0.0) -> Echoes:
+        """Return the echoes with a delay added to their times, and its standard error [ns]."""
+        return replace(self, time_ns=self.time_ns + delay_ns, time_stderr=np.hypot(self.time_stderr, error_ns))
 
 
 def smooth(records: Records, width_ns: float) -> tuple[FloatArray, FloatArray]:

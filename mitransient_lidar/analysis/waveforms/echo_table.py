@@ -31,10 +31,10 @@ from mitransient_lidar.results.variables import flagged, label
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
-_TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
 _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
+_IN_ECHO = 0.01  # error of shape and level of a column in its surface's echo, over the peak
 _UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
@@ -253,12 +253,12 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         rows,
         records,
         waveforms.surface_level(rows) if settings.level is None else settings.level.part(rows),
-        _TYPICAL_DECAY,
+        waveforms.fading.typical_rate,
         Detection(settings.threshold, settings.contrast, settings.targets),
     )
     found = decision.found
     time, surface = records.time_ns, found.surface
-    start = np.where(surface >= 0, time[surface] + waveforms.tail_ns, np.nan)
+    start = np.where(surface >= 0, time[surface] + waveforms.column_from_ns, np.nan)
     later = np.where(found.bins[1:] > surface, found.bins[1:], time.size).min(axis=0)
     following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
@@ -278,7 +278,9 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     for estimator in settings.estimators:
         usable = clear if estimator == "gaussian" else records
         echoes = _estimate(estimator, waveforms, usable, found, column, sharp, settings)
-        echoes = decision.fitted(echoes) if estimator == "gaussian" else echoes
+        if estimator == "gaussian":
+            early, spread = waveforms.fading.delay(echoes[0].energy, waveforms.column_signal(rows))
+            echoes = decision.fitted([echoes[0].delayed(-early, spread), *echoes[1:]])
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
         quantities.append([echoes[0], column_echoes(records, column, start, end, surface_ns - reference), *echoes[1:]])
@@ -447,7 +449,7 @@ def _estimate(
 ) -> list[Echoes]:
     """Return surface, target and bottom of one estimator."""
     width, template = waveforms.echo_fwhm_ns, waveforms.template
-    decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), _TYPICAL_DECAY)
+    decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), waveforms.fading.typical_rate)
     places = list(zip(found.bins, found.flags, strict=True))
     if sharp is not None and estimator == "deconvolution":
         bias = deconvolution.deconvolution_offset(
@@ -471,6 +473,9 @@ def _estimate(
     if estimator == "gaussian":
         shape = waveforms.echo_shape
         level = column.level, np.hypot(column.level_stderr, _LEVEL * column.level)
+        if waveforms.fading.opaque:
+            error = _IN_ECHO * records.power.max(axis=1)
+            level, records = (0 * error, error), replace(records, noise=np.hypot(records.noise, error[:, np.newaxis]))
         surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
         reflects = waveforms.geometry.off_nadir < GRAZING
         fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
