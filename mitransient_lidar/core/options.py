@@ -140,6 +140,9 @@ FewerPasses = Annotated[float | None, positive_option("Stop before this many sec
 TargetId = Annotated[str, Option("Id of the shape that is the target")]
 BackgroundPower = Annotated[float, Option("Power of the daylight on each pixel", 0, unit="W")]
 Instrument = Annotated[str | None, Option("Instrument instead of the scene's lidar, from the list of instruments")]
+Infrared = Annotated[
+    bool, Option("Also render the infrared channel of the instrument, whose -D parameters begin with infrared.")
+]
 Sensor = Annotated[str | None, Option("Receiver of a scene that has several, by its id, instead of the first one")]
 
 #: Beginning of the meaning of a receiver.

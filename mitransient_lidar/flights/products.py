@@ -14,8 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
-from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError

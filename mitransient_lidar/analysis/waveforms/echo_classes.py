@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     Records,
     error_of_sums,
     find_echoes,
+)
+from mitransient_lidar.analysis.waveforms.echo_detection import (
+    EchoClass as EchoClass,
 )
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE, FirstEchoes, Priors, first_echoes
@@ -41,19 +43,6 @@ _COLUMN, _COLUMN_NS = 5.0, 20.0
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
 _CLEAR = 8.0  # least height over the noise of one of the echoes that are decided upon
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
-
-
-class EchoClass(IntEnum):
-    """What an echo is. Land and objects above the water are timed in air, bottoms and objects in it in the water."""
-
-    NONE = 0
-    SURFACE = 1  # of the sea
-    COLUMN = 2
-    BOTTOM = 3
-    MERGED = 4  # a bottom less than 1.8 echo widths behind its surface
-    OBJECT = 5  # in the water, before the bottom
-    LAND = 6
-    ABOVE = 7  # an object above the water, before other echoes
 
 
 class Detection(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntFlag
+from enum import IntEnum, IntFlag
 from itertools import combinations
 
 import numpy as np
@@ -45,6 +45,19 @@ class EchoFlag(IntFlag):
     FEW_EVENTS = 128  # no higher than single events of the detector, such as dark counts: may be noise
     COLUMN_ONSET = 256  # a surface without an echo of its own, whose time is that of the column's onset
     NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's
+
+
+class EchoClass(IntEnum):
+    """What an echo is. Land and objects above the water are timed in air, bottoms and objects in it in the water."""
+
+    NONE = 0
+    SURFACE = 1  # of the sea
+    COLUMN = 2
+    BOTTOM = 3
+    MERGED = 4  # a bottom less than 1.8 echo widths behind its surface
+    OBJECT = 5  # in the water, before the bottom
+    LAND = 6
+    ABOVE = 7  # an object above the water, before other echoes
 
 
 def has_echo(flags: IntArray) -> BoolArray:

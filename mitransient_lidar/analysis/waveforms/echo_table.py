@@ -17,14 +17,15 @@ from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection,
 from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, Echoes, EchoFlag, Records, has_echo
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans
-from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, SurfaceLevel, surface_times
+from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans, widen
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, SurfaceLevel, infrared_level, surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.companions import split
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import flagged, label
@@ -32,7 +33,6 @@ from mitransient_lidar.results.variables import flagged, label
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
-_OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _IN_ECHO = 0.01  # error of shape and level of a column in its surface's echo, over the peak
 _UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
@@ -103,8 +103,9 @@ def extract(
     depth_from : {'echo', 'mean'}
         Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
     level : SurfaceLevel, optional
-        Arrival of the surface in each waveform as known without it, for land and very shallow water; by default that of
-        the mean sea level, with an error of 0.15 m and the waves.
+        Arrival of the surface in each waveform as known without it, NaN where it is not, for land and very shallow
+        water, and for depths as far as it is known better than by the waveform. By default that of the infrared channel
+        (`surface_times.infrared_level`), or else the mean sea level, with an error of 0.15 m and the waves.
     iterations : int
         Iterations of the deconvolution, 1 to 10 000.
     block : int
@@ -198,7 +199,7 @@ def extract(
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
     attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
-    dataset = dataset_of("dataset", dataset, "waveforms", "signals")
+    dataset, infrared = split(dataset_of("dataset", dataset, "waveforms", "signals"))
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
     if not names or (unknown := [name for name in names if name not in ESTIMATORS]):
@@ -207,6 +208,8 @@ def extract(
         raise UserError(f"depth_from = {depth_from!r} must be 'echo' or 'mean'")
     layers, block = integer("layers", layers, 0, 8), integer("block", block, 1, 10**9)
     waveforms = Waveforms.from_dataset(dataset, pulse, noise, echo_fwhm_ns, saturation_level)
+    if infrared is not None and level is None:
+        level = infrared_level(extract(infrared), infrared, dataset, waveforms.lines, waveforms.count)
     wanted = None if targets is None else integer("targets", targets, 1, 100)
     settings = _Settings(names, threshold, contrast, layers, depth_from, level, iterations, wanted)
     starts = range(0, waveforms.count, block)
@@ -247,12 +250,12 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
-    records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
+    records, width, level = waveforms.records(rows), waveforms.echo_fwhm_ns, waveforms.surface_level(rows)
     decision = decide(
         waveforms,
         rows,
         records,
-        waveforms.surface_level(rows) if settings.level is None else settings.level.part(rows),
+        level if settings.level is None else settings.level.part(rows).or_else(level),
         waveforms.fading.typical_rate,
         Detection(settings.threshold, settings.contrast, settings.targets),
     )
@@ -289,10 +292,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         for name in vars(quantities[0][0])
     }
     table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
-    # The peak may be anywhere in the time that is clipped.
-    for echo, span in zip((0, *range(2, len(spans) + 1)), spans[:, :, np.newaxis], strict=True):
-        error = table["time_ns_stderr"][..., echo]
-        error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
+    widen(table["time_ns_stderr"], spans)
     table["class"] = np.insert(decision.classes(width), 1, np.where(np.isfinite(column.level), EchoClass.COLUMN, 0), 1)
     table["class_probability"] = decision.probability
     table["near_ns"], table["near_stderr"] = decision.surfaces()
@@ -363,6 +363,8 @@ def _with_depths(
     near, near_error = (table.pop(name)[:, np.newaxis] for name in ("near_ns", "near_stderr"))
     near_error = np.hypot(near_error, errors.of_surface(np.isfinite(near[:, 0]))[:, np.newaxis])
     zero, zero_error = (np.where(np.isfinite(near), *pair) for pair in ((near, zero), (near_error, zero_error)))
+    if settings.level is not None:
+        zero, zero_error, by_light = settings.level.combined(zero, zero_error, by_light)
     half = 0.5 * (time - lines.surface_time[:, np.newaxis, np.newaxis])
     second = may_be_second_return(time, half, table.pop("clipped_ns"), waveforms.echo_fwhm_ns)
     table["flags"] |= np.where(second, int(EchoFlag.SATURATED), 0)
@@ -433,9 +435,8 @@ def _label(
         "merged_below_m": SEPARATE * waveforms.echo_fwhm_ns * waveforms.geometry.depth_per_ns,
     }
     energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
-    kind = "mean" if settings.depth_from == "mean" else ""
     found = xr.Dataset(data, coords, {**dataset.attrs, **provenance})
-    return label(found, kind, amplitude=waveforms.unit, energy=energy)
+    return label(found, "mean" if settings.depth_from == "mean" else "", amplitude=waveforms.unit, energy=energy)
 
 
 def _estimate(
@@ -477,8 +478,7 @@ def _estimate(
             error = _IN_ECHO * records.power.max(axis=1)
             level, records = (0 * error, error), replace(records, noise=np.hypot(records.noise, error[:, np.newaxis]))
         surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
-        reflects = waveforms.geometry.off_nadir < GRAZING
-        fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
+        fits = [echo_fits.gaussian_surface(records, *surface, reflects=waveforms.reflects)]
         for number, (place, flag) in enumerate(places[1:], 1):
             around = found.neighbours(number)
             fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)

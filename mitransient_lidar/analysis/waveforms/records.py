@@ -16,7 +16,7 @@ from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Fadin
 from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, LEVEL, SurfaceLevel
+from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -209,6 +209,11 @@ class Waveforms:
         """Time from the peak of a surface echo to where its tail has ended and the column begins [ns]."""
         width, template = self.echo_fwhm_ns, self.template
         return max(1.75 * width, template.tail_ns(_TAIL) + width - template.fwhm_ns)
+
+    @property
+    def reflects(self) -> bool:
+        """Whether facets of the sea may send light back."""
+        return bool(self.geometry.off_nadir < GRAZING)
 
     @property
     def column_from_ns(self) -> float:

@@ -44,6 +44,9 @@ LAYERED_WATER = plugin(
         "Wavelength of these waters: 532, or 400 to 700 for ``chlorophyll`` and ``pure``, 514 to 533 for ``petzold``, "
         "700 to 1100 for all but a profile; or of the columns of a profile that has several, as ``a488, a532``",
         otherwise="``532``, or that of the only columns"),
+    number("coefficients_nm", None, "nm", 531, 533,
+        "Wavelength of coefficients given as numbers, or of a profile, 532: above 700 nm, water that absorbs as pure "
+        "water does there is made of them", otherwise="``wavelength_nm``"),
     file("profile",
         "A file instead of the above, with ``depth`` or ``z``, two of ``a``, ``b``, ``c``, ``omega``, and ``bb`` or "
         "``bb_ratio``: a table with units in its heading (.csv, .txt, .dat, .tsv) or .nc (`physics.water.profiles`)",

@@ -10,6 +10,7 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
+from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel, infrared_level
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -97,3 +98,28 @@ def test_the_surface_is_found_in_recorded_noise():
     z = (found[:200] - 0.1) / error[:200]
     assert abs(found[:200].mean() - 0.1) < 2e-3
     assert np.mean(z**2) == pytest.approx(1, abs=4 * np.sqrt(2 / 200))
+
+
+def test_the_surface_of_the_infrared_is_the_level_of_green_waveforms():
+    """At 20 degrees a height h comes 2 h/(c cos(20 deg)) earlier, as the level sea does; land gives no level."""
+    infrared = shots([echo(0.2, 0.1), echo(-0.1, 0.1), echo(3.0, 0.3)])
+    table = echo_table.extract(infrared, noise=1e-3 * infrared["waveform"].max().item())
+    angle, two = np.radians(20.0), np.ones(2)
+    lines = LinesOfSight(0 * two, np.array([0.0, 1e-3]), angle * two, 4260 * two, 0 * two, 0.11 * two, 0.5 * two)
+    green = xr.Dataset(attrs={"divergence_mrad": 0.0, "surface_heights_m": [-0.3, 0.3]})
+    level = infrared_level(table, infrared, green, lines, 6)
+    expected = 4260 - np.array([0.2, -0.1]) / (C / 2 * np.cos(angle))
+    np.testing.assert_allclose(level.time_ns[:4], np.repeat(expected, 2), atol=0.04)
+    assert np.isnan(level.time_ns[4:]).all()
+    # The second pixel is 0.64 m away, over which waves rise.
+    assert level.stderr_ns[1] * C / 2 > 0.02 > level.stderr_ns[0] * C / 2
+
+
+def test_a_level_counts_by_its_error():
+    """Weights are inverse variances, 1 to 4 here; each of both alone is what it is."""
+    level = SurfaceLevel(np.array([10.0, 10.0, np.nan, np.nan]), np.array([0.2, 0.2, np.nan, np.nan]))
+    time, noise, method = np.array([[11.0], [np.nan], [11.0], [np.nan]]), 0.24, 0.32
+    mean, by_noise, by_method = level.combined(time, np.full((4, 1), noise), np.full((4, 1), method))
+    np.testing.assert_allclose(mean[:, 0], [10 + 0.04 / 0.2, 10, 11, np.nan])
+    total = np.hypot(by_noise, by_method)[:, 0]
+    np.testing.assert_allclose(total[:3], [np.sqrt(0.032), 0.2, 0.4])
