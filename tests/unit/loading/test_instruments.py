@@ -12,8 +12,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, instruments, scenes
 
 NAMES = (
-    *("icesat2_atlas", "leica_chiroptera4x", "leica_hawkeye4x_deep", "published_airborne", "published_mast"),
-    *("riegl_vq840g", "riegl_vq840gl", "riegl_vq880g2", "riegl_vq880g2_infrared", "teledyne_czmil", "usgs_eaarl_b"),
+    *("icesat2_atlas", "leica_chiroptera4x", "leica_chiroptera4x_infrared", "leica_hawkeye4x_deep", "optech_titan"),
+    *("optech_titan_infrared", "published_airborne", "published_mast", "riegl_vq840g", "riegl_vq840gl"),
+    *("riegl_vq880g2", "riegl_vq880g2_infrared", "teledyne_czmil", "teledyne_czmil_infrared", "usgs_eaarl_b"),
 )
 
 #: Parameters that every instrument has; beam and view may be given in several ways.
