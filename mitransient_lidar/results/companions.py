@@ -35,12 +35,14 @@ def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
 
 def split(dataset: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Return the green and the infrared channel of a dataset, the latter None where it has none."""
-    if INFRARED not in dataset.attrs:
-        return dataset, None
-    attributes = parse_json(str(dataset.attrs[INFRARED]), f"the attribute {INFRARED}")
     own = [name for name in dataset.variables if str(name).startswith(_PREFIX)]
-    if not isinstance(attributes, dict) or not own:
-        raise UserError(f"the attribute {INFRARED} must be the attributes of variables {_PREFIX}...")
+    green = dataset.drop_vars(own)
+    green.attrs = {name: value for name, value in dataset.attrs.items() if name != INFRARED}
+    if INFRARED not in dataset.attrs or not own:
+        return green, None
+    attributes = parse_json(str(dataset.attrs[INFRARED]), f"the attribute {INFRARED}")
+    if not isinstance(attributes, dict):
+        raise UserError(f"the attribute {INFRARED} must be an object of JSON")
     kept = own + [name for name in (_SHARED,) if name in dataset.coords]
     infrared = dataset[[name for name in kept if name not in dataset.coords]]
     infrared = infrared.assign_coords({name: dataset.coords[name] for name in kept if name in dataset.coords})
@@ -49,6 +51,4 @@ def split(dataset: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset | None]:
     names = {name: str(name).removeprefix(_PREFIX) for name in listed if str(name).startswith(_PREFIX)}
     infrared = infrared.rename(names)
     infrared.attrs = attributes
-    green = dataset.drop_vars(own)
-    green.attrs = {name: value for name, value in dataset.attrs.items() if name != INFRARED}
     return green, infrared

@@ -29,7 +29,11 @@ def test_both_channels_are_what_they_were(tmp_path):
     for dataset in (both, _saved(both, tmp_path / "both.nc")):
         for own, expected in zip(split(dataset), (green, infrared), strict=True):
             xr.testing.assert_identical(own, expected)
-    assert split(green) == (green, None)
+    own, none = split(green)
+    xr.testing.assert_identical(own, green)
+    assert none is None
+    # Waveforms alone, as a program takes from both.
+    assert "infrared" not in split(both[["waveform"]])[0].attrs
 
 
 def _saved(dataset, path):
@@ -48,6 +52,7 @@ def test_series_share_their_shots():
     assert split(both)[1]["waveform"].dims == series[1]["waveform"].dims
 
 
-def test_an_attribute_without_variables_is_refused():
-    with pytest.raises(UserError, match="infrared"):
-        split(result(9, 532.0).assign_attrs(infrared="{}"))
+@pytest.mark.parametrize("attribute", ["[]", "{"])
+def test_another_attribute_is_refused(attribute):
+    with pytest.raises(UserError, match="the attribute infrared"):
+        split(join(result(9, 532.0), result(9, 1064.0)).assign_attrs(infrared=attribute))
