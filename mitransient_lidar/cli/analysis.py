@@ -75,11 +75,14 @@ def _echoes(
     if wind_speed is not None and correct is None:
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
     from mitransient_lidar import results
-    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, surface_times
+    from mitransient_lidar.results.companions import INFRARED
 
     dataset = results.dataset_of("FILE", file, "waveforms", "signals")
     instrument = str(dataset.attrs.get("instrument", ""))
     corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
+    if corrections is not None:
+        surface_times.check_surface(corrections, INFRARED in dataset.attrs)
     estimators = call.arguments["estimators"] or ["gaussian"]
     found = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
     if corrections is not None:

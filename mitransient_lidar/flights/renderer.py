@@ -16,6 +16,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
+from mitransient_lidar.analysis.waveforms.surface_times import check_surface
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array, Renderer, plain
 from mitransient_lidar.core.constants import C0
@@ -97,7 +98,9 @@ class FlightRenderer(Renderer):
         columns = input_columns(poses)
         other = plan.of_infrared() if plan.infrared else None
         if plan.corrections != "none":
-            warn_of_angles(columns["group_angle_deg"], corrections_for(scene.instrument or "", plan.corrections))
+            table = corrections_for(scene.instrument or "", plan.corrections)
+            check_surface(table, plan.infrared)
+            warn_of_angles(columns["group_angle_deg"], table)
         longest, start, beyond = None, np.empty(len(poses.time_s)), 0
         infrared = np.empty((2, start.size))
         groups = np.unique(columns["group"])

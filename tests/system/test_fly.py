@@ -190,6 +190,10 @@ def assert_files(folder, points, flown):
         ({"parameters": {"bottom_dept": 3}}, "parameter 'bottom_dept' is not one of scene flight"),
         ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
         ({"instrument": "published_mast", "corrections": "auto"}, "no shipped corrections of the instrument"),
+        (
+            {"instrument": "riegl_vq880g2", "infrared": True, "corrections": "auto"},
+            "corrections are of surfaces from green light",
+        ),
         ({"infrared": True}, "instrument = 'published_airborne' has no infrared channel; instruments with one are"),
         (
             {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},

@@ -10,6 +10,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, EchoClass, IntArray
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.geometry import LinesOfSight
@@ -116,6 +117,14 @@ def infrared_level(
     down = half * np.cos(lines.off_nadir)
     time = lines.surface_time - np.repeat(height, pixels) / down
     return SurfaceLevel(time, np.hypot(np.hypot(np.repeat(error, pixels), by_waves) / down, timing) + 0 * time)
+
+
+def check_surface(corrections: xr.Dataset, infrared: bool) -> None:
+    """Raise `UserError` for a table of depth errors from surfaces of another channel than depths count from."""
+    if bool(corrections.attrs.get("infrared_surface", 0)) != infrared:
+        kinds = ("green light, but depths", "infrared") if infrared else ("infrared light, but depths", "green")
+        advice = ": take one of depth-bias --infrared" if infrared else ""
+        raise UserError(f"corrections are of surfaces from {kinds[0]} count from {kinds[1]} light{advice}")
 
 
 def _aim(dataset: xr.Dataset) -> FloatArray:

@@ -10,8 +10,9 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel, infrared_level
+from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel, check_surface, infrared_level
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.geometry import LinesOfSight
@@ -123,3 +124,15 @@ def test_a_level_counts_by_its_error():
     np.testing.assert_allclose(mean[:, 0], [10 + 0.04 / 0.2, 10, 11, np.nan])
     total = np.hypot(by_noise, by_method)[:, 0]
     np.testing.assert_allclose(total[:3], [np.sqrt(0.032), 0.2, 0.4])
+
+
+def test_corrections_of_another_surface_are_refused():
+    green, infrared = (xr.Dataset(attrs=attributes) for attributes in ({}, {"infrared_surface": 1}))
+    check_surface(green, infrared=False)
+    check_surface(infrared, infrared=True)
+    with pytest.raises(
+        UserError, match="from green light, but depths count from infrared light: take one of depth-bias"
+    ):
+        check_surface(green, infrared=True)
+    with pytest.raises(UserError, match="from infrared light, but depths count from green light"):
+        check_surface(infrared, infrared=False)
