@@ -29,6 +29,8 @@ def test_both_channels_are_what_they_were(tmp_path):
     for dataset in (both, _saved(both, tmp_path / "both.nc")):
         for own, expected in zip(split(dataset), (green, infrared), strict=True):
             xr.testing.assert_identical(own, expected)
+    with pytest.raises(UserError, match=r"an EXR file holds no infrared channel; use a .nc file"):
+        results.save(both, tmp_path / "both.exr")
     own, none = split(green)
     xr.testing.assert_identical(own, green)
     assert none is None
