@@ -18,8 +18,8 @@ from mitransient_lidar.core.validation import number_list
 from mitransient_lidar.physics.water.bubbles import WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption
-from mitransient_lidar.physics.water.water_types import default_water, water_of
+from mitransient_lidar.physics.water.seawater import VISIBLE_RANGE, WAVELENGTH_RANGE, water_absorption
+from mitransient_lidar.physics.water.water_types import default_water, near_infrared_column, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
@@ -52,7 +52,8 @@ class LayeredWater(mi.Medium):
 
     At a ``wavelength_nm`` above 700, a named or default water absorbs like pure water (14.4 1/m at 1064 nm), and its
     particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay unchanged, with a warning where
-    they absorb less than pure water.
+    they absorb less than pure water; with
+    ``coefficients_nm`` = 532 they are taken there likewise.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -190,17 +191,22 @@ def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, 
     read = props.read
     tolerance, wavelength, layer_tops = map(read, ("profile_tolerance", "wavelength_nm", "layer_tops"))
     way = next((name for name in (*WATER_KINDS, "profile") if _is_given(props, name)), None)
+    at = read("coefficients_nm")
+    if wavelength is None or wavelength <= VISIBLE_RANGE[1]:
+        at = None
     if way is None:
-        values = {name: _chosen(props, name, wavelength) for name in COEFFICIENTS}
+        values = {name: _chosen(props, name, at or wavelength) for name in COEFFICIENTS}
         if is_of_phase:
             back = number_list("backscattering", values["backscattering"])
             scattering = number_list("scattering", values["scattering"])
             values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
         column = WaterColumn.from_text(layer_tops, **values)
+        column = column if at is None else near_infrared_column(column, wavelength)
         _warn_of_absorption(column, wavelength)
         return column, np.zeros(1), wavelength
     if way == "profile":
-        return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
+        column = read_profile(props[way], at or wavelength).layers(tolerance)
+        return column if at is None else near_infrared_column(column, wavelength), np.zeros(1), wavelength
     tops = number_list("layer_tops", layer_tops)
     wavelength = wavelength or read("wavelength_nm", 532.0)
     texts = str(props[way]).replace(",", " ").split()

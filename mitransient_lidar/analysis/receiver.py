@@ -31,6 +31,7 @@ from mitransient_lidar.physics.receiver.receiver_files import (
 from mitransient_lidar.physics.receiver.receiver_files import camera as camera_of
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.companions import join, split
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import label
 
@@ -140,9 +141,14 @@ def detect_waveforms(
     -----
     If the result includes a response (``response_time_ns``), an amplifier's bandwidth smooths it again, and the shot
     noise lacks that response's correlation. Render with a response time of 0 for a chain with a bandwidth. Dead times
-    of counters and cells lose light without being marked as saturated.
+    of counters and cells lose light without being marked as saturated. A result's infrared channel has its
+    instrument's receiver, without daylight.
     """
-    dataset = results.dataset_of("dataset", dataset, "waveforms", "gates")
+    dataset, infrared = split(results.dataset_of("dataset", dataset, "waveforms", "gates"))
+    if infrared is not None:
+        given: dict[str, Any] = {"gain": gain, "optical_density": optical_density}
+        own = detect_waveforms(dataset, chain, shots, seed, background_power, **given)
+        return join(own, detect_waveforms(infrared, None, shots, seed + 1))
     if (camera := _camera_of(dataset, chain)) is not None:
         return record_gates(dataset, camera, shots, seed, background_power, (gain, optical_density))
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)

@@ -89,7 +89,8 @@ def _echoes(
     if wind_speed is not None and correct is None:
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct")
     from mitransient_lidar import results
-    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, surface_times
+    from mitransient_lidar.results.companions import INFRARED
     from mitransient_lidar.results.waveform_files import waveform_chunks
 
     selection = waveform_selection(file, waveforms, channel, lidar)
@@ -100,6 +101,8 @@ def _echoes(
         dataset = results.dataset_of("FILE", part, "waveforms", "signals")
         instrument = str(dataset.attrs.get("instrument", ""))
         corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
+        if corrections is not None:
+            surface_times.check_surface(corrections, INFRARED in dataset.attrs)
         found: xr.Dataset = call(dataset, estimators=estimators, depth_from="mean" if mean_surface else "echo")
         if corrections is not None:
             found = depth_correction.correct_depths(found, corrections, wind_speed)

@@ -77,7 +77,10 @@ _DRAWINGS = {
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or its figure, but no EXR file beyond the memory, and no layout of pixels that miss the sea."""
     from mitransient_lidar import results
+    from mitransient_lidar.results.companions import split
 
+    if target.suffix != ".nc":
+        dataset, _ = split(dataset)
     dispensable = {".exr": "EXR file"}.get(target.suffix, "drawing of the pixels" * target.stem.endswith("_layout"))
     try:
         if target.suffix == ".exr":

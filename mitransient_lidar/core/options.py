@@ -140,6 +140,9 @@ FewerPasses = Annotated[float | None, positive_option("Stop before this many sec
 TargetId = Annotated[str, Option("Id of the target's shape")]
 BackgroundPower = Annotated[float, Option("Daylight power on each pixel", 0, unit="W")]
 Instrument = Annotated[str | None, Option("Instrument that replaces the scene's lidar, as listed by instruments")]
+Infrared = Annotated[
+    bool, Option("Also render the instrument's infrared channel, whose -D parameters begin with infrared.")
+]
 Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
 
 #: Beginning of a receiver's meaning.

@@ -186,7 +186,7 @@ def _notes(first: xr.Dataset) -> str:
         "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
         "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections, "
-        "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable. "
+        "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable, 128 surface from infrared. "
         "Points of saturated echoes and poor fits are withheld. "
         "Depths and uncertainties (1 sigma) are NaN where unknown."
     )

@@ -6,7 +6,7 @@ import importlib.resources
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +26,7 @@ from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse
 from mitransient_lidar.flights.poses.platforms import XYZ, Platform, SbetFile, TrajectoryFile, platform_of
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
+from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 from mitransient_lidar.rendering.options import LIGHT, LightOption
 
@@ -76,6 +77,9 @@ class FlightPlan(Plan):
 
     scene: Annotated[str, Option("Scene, whose lidar takes the poses of the pulses")]
     instrument: Annotated[str | None, Option("Instrument instead of the scene's lidar")] = None
+    infrared: Annotated[
+        bool, Option("Whether the infrared channel of the instrument sends a pulse with each green one")
+    ] = False
     parameters: Annotated[Mapping[str, Any], Option("Parameters of the scene, but those of the pose")] = field(
         default_factory=dict
     )
@@ -118,6 +122,11 @@ class FlightPlan(Plan):
                 raise UserError(
                     f"parameter {name!r} follows from the poses of the pulses: leave it out of [parameters]"
                 )
+
+    def of_infrared(self) -> FlightPlan:
+        """Return the flight of the infrared channel; raise `UserError` if the instrument has none."""
+        _, (channel, parameters) = with_infrared(self.instrument, self.parameters)
+        return replace(self, instrument=channel, parameters=parameters, receiver=FlightReceiver(), infrared=False)
 
     @classmethod
     def read(cls, flight: str | os.PathLike[str]) -> FlightPlan:

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
-from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, has_echo
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray, finite_array, in_range

@@ -14,8 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
-from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
@@ -58,6 +57,7 @@ class Quality(IntFlag):
     MERGED = 16  # a bottom and its surface are less than 1.8 echo widths apart
     ABOVE_WATER = 32  # an object that stands above the water, such as a pier
     UNCERTAIN = 64  # its class has a probability below 90 %
+    INFRARED = 128  # its surface is that of the infrared channel
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,8 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot])
     points["line"] = ("point", flown.values("line")[shot])
-    points = points.assign(_quality(points, echoes)).assign(_of_light(flown, points, echoes))
+    infrared = flown.values("infrared_surface") if plan.infrared else np.zeros(len(time_s), dtype=bool)
+    points = points.assign(_quality(points, echoes, infrared)).assign(_of_light(flown, points, echoes))
     points.attrs["merged_below_m"] = float(attributes["merged_below_m"])
     return label(points.assign(_truth(flown, plan, points)), "points")
 
@@ -223,8 +224,11 @@ def read_points(path: Path) -> xr.Dataset:
     return points
 
 
-def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
-    """Return the quality of points, and whether they are withheld from maps."""
+def _quality(points: xr.Dataset, echoes: xr.Dataset, infrared: npt.NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the quality of points, and whether they are withheld from maps.
+
+    Pulses in `infrared` have their surface from the infrared channel.
+    """
     place = points["shot"].values, points["pixel"].values
     flags, kind = points["flags"].values, points["kind"].values
     silent = kind == PointClass.NO_ECHO
@@ -238,6 +242,8 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
     poor = ((flags & int(EchoFlag.POOR_FIT)) > 0) & ~silent
     quality = np.where(clipped | ((of_surface & int(EchoFlag.SATURATED)) > 0), int(Quality.SATURATED), 0)
     quality |= np.where(poor, int(Quality.POOR_FIT), 0)
+    wet = ~silent & ~np.isin(kind, [*IN_AIR.values()])
+    quality |= np.where(infrared[place[0]] & wet, int(Quality.INFRARED), 0)
     quality |= np.where(kind == PointClass.UNCLASSIFIED, int(Quality.ABOVE_WATER), 0)
     if "class" in echoes:
         quality |= np.where(of_echo("class") == EchoClass.MERGED, int(Quality.MERGED), 0)

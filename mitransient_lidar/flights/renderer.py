@@ -14,7 +14,9 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
+from mitransient_lidar.analysis.waveforms.surface_times import check_surface
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array, Renderer, plain
 from mitransient_lidar.core.constants import C0
@@ -47,6 +49,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.results.companions import join
 from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.results.variables import described
 
@@ -56,6 +59,9 @@ if TYPE_CHECKING:
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
+
+#: Inputs of pulses: start of the record of the infrared channel [ns], and its time bins.
+_OF_INFRARED = ("infrared_start_ns", "infrared_bins")
 
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
@@ -93,16 +99,24 @@ class FlightRenderer(Renderer):
         tell_time_system(plan.time_system(poses.time_s), poses.time_s)
         scene = scene_of(plan)
         columns = input_columns(poses)
+        other = plan.of_infrared() if plan.infrared else None
         if plan.corrections != "none":
-            warn_of_angles(columns["group_angle_deg"], corrections_for(scene.instrument or "", plan.corrections))
+            table = corrections_for(scene.instrument or "", plan.corrections)
+            check_surface(table, plan.infrared)
+            warn_of_angles(columns["group_angle_deg"], table)
         longest, start, beyond = None, np.empty(len(poses.time_s)), 0
+        infrared = np.empty((2, start.size))
         groups = np.unique(columns["group"])
         with contextlib.ExitStack() as quiet:
             for number, group in enumerate(groups):
                 rows = np.flatnonzero(columns["group"] == group)
-                own, missed = axis_of(plan, scene, {name: column[rows] for name, column in columns.items()})
+                pulses = {name: column[rows] for name, column in columns.items()}
+                own, missed = axis_of(plan, scene, pulses)
                 beyond += missed
                 start[rows] = own.start_ns
+                if other is not None:
+                    beside, _ = axis_of(other, scene_of(other), pulses)
+                    infrared[0, rows], infrared[1, rows] = beside.start_ns, beside.bin_count
                 if longest is None or own.bin_count > longest.bin_count:
                     longest = own
                 if number == 0:
@@ -113,6 +127,8 @@ class FlightRenderer(Renderer):
         with telling_errors_alone():
             renderer = cls(plan, scene, longest)
             columns["record_start_ns"] = start
+            if other is not None:
+                columns |= dict(zip(_OF_INFRARED, (infrared[0], np.full(start.size, infrared[1].max())), strict=True))
             is_automatic = has_automatic_settings(plan, scene.instrument)
             probes = renderer._probes(columns, _PROBES if is_automatic else _SAMPLED, progress)
             settings = chosen_settings((series for series, _ in probes), plan) if is_automatic else {}
@@ -165,9 +181,11 @@ class FlightRenderer(Renderer):
         series, later, _ = self._render(inputs, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         recorded = record(series, self.plan, inputs)
-        echoes = extract(
-            self._with_turned_pixels(recorded, inputs) if turned else recorded, self.plan.estimator, targets=1
-        )
+        measured = self._with_turned_pixels(recorded, inputs) if turned else recorded
+        infrared = self._infrared_record(inputs, later) if self.plan.infrared else None
+        if infrared is not None:
+            measured = join(measured, infrared)
+        echoes = extract(measured, self.plan.estimator, targets=1)
         pixels = recorded.sizes["pixel"]
         start = float(recorded.attrs["time_start_ns"]) + later
         found = {
@@ -181,6 +199,9 @@ class FlightRenderer(Renderer):
                 described("receiver_sensitivity"),
             ),
         }
+        if infrared is not None:
+            seen = (extract(infrared)["class"].sel(echo="surface") == EchoClass.SURFACE).any("pixel")
+            found["infrared_surface"] = Array((), seen.values, described("infrared_surface"))
         for name, values in series.coords.items():
             if str(name).startswith("true_"):
                 found[str(name)] = _single(values)
@@ -189,6 +210,20 @@ class FlightRenderer(Renderer):
             dtype = np.int16 if name in ("flags", "class") else of_time
             found[f"echo_{name}"] = _single(values, dtype)
         return found, echoes
+
+    def _infrared_record(self, inputs: Mapping[str, Column], later: FloatArray) -> xr.Dataset:
+        """Return the records of the infrared pulses, with times of the level sea for those of the green ones.
+
+        `later` is how much later than its times each green shot is [ns].
+        """
+        start, bins = (inputs[name] for name in _OF_INFRARED)
+        own = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
+        renderer = _infrared(self, int(bins[0]))
+        series, own_later, _ = renderer._render({**own, "record_start_ns": start}, self._passes(until_error=True))
+        series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
+        recorded = record(series, renderer.plan, own)
+        apart = xr.DataArray(later - own_later, dims="shot")
+        return recorded.assign_coords(surface_time=recorded["surface_time"] + apart)
 
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
@@ -299,6 +334,14 @@ def scene_of(plan: FlightPlan) -> SceneSource:
         if name not in source.values:
             raise UserError(f"scene {plan.scene} has no parameter {name}, which the flight sets")
     return source
+
+
+@functools.lru_cache(maxsize=2)
+def _infrared(renderer: FlightRenderer, bins: int) -> FlightRenderer:
+    """Return the renderer of the infrared pulses of a flight, with so many time bins."""
+    plan = renderer.plan.of_infrared()
+    scene = scene_of(plan)
+    return FlightRenderer(plan, scene, TimeAxis(0.0, float(scene.values["bin_width_ns"]), bins))
 
 
 @functools.lru_cache(maxsize=4)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
@@ -28,6 +29,9 @@ from mitransient_lidar.loading.document import (
     text_of,
 )
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
+
+#: End of the name of an instrument's infrared channel, beginning of the names of its parameters, and those of both.
+_INFRARED, _OF_INFRARED, _OF_BOTH = "_infrared", "infrared.", ("altitude", "aim_x", "aim_y")
 
 #: Scene parameters that fit its own lidar: the limits of the time axis, and the resolution of the sea.
 _TIME_AXIS = ("time_start_ns", "bin_count")
@@ -87,6 +91,33 @@ def read_instrument(name: str) -> Instrument:
         parameters=parameters,
         channels=tuple(names),
     )
+
+
+def with_infrared(
+    name: str | None, params: Mapping[str, Any] | None
+) -> tuple[tuple[str, dict[str, Any]], tuple[str, dict[str, Any]]]:
+    """Return names and parameters of the green and of the infrared channel of an instrument.
+
+    The infrared channel is an instrument of the same name with the end ``_infrared``. Parameters of the scene, the
+    altitude and the aim are those of both channels, ``infrared.NAME`` is the parameter ``NAME`` of the infrared one
+    alone, and others of the lidar are those of the green one. Coefficients of the water are at 532 nm.
+
+    Raises
+    ------
+    UserError
+        If there is no such instrument, or it has no infrared channel.
+    """
+    known = [one.removesuffix(_INFRARED) for one in instrument_names() if one.endswith(_INFRARED)]
+    if name is None or f"{_path(name).stem}{_INFRARED}" not in instrument_names():
+        raise UserError(
+            f"instrument = {shown(name)} has no infrared channel; instruments with one are {', '.join(known)}"
+        )
+    given, channel = dict(params or {}), name + _INFRARED
+    own = {key: value for key, value in given.items() if not str(key).startswith(_OF_INFRARED)}
+    of_lidar = parameters_of(read_document(_path(channel)).root).keys() - {*_OF_BOTH}
+    other = {key: value for key, value in own.items() if key not in of_lidar}
+    other |= {key.removeprefix(_OF_INFRARED): value for key, value in given.items() if key not in own}
+    return (name, own), (channel, {"coefficients_nm": 532, **other})
 
 
 def instrument_text(name: str) -> str:

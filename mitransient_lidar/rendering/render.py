@@ -7,8 +7,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
@@ -29,6 +32,7 @@ from mitransient_lidar.rendering.options import (
     Variant,
 )
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.companions import join, split
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -50,6 +54,7 @@ def render(
     params: Mapping[str, Any] | None = None,
     *,
     instrument: Instrument = None,
+    infrared: Infrared = False,
     sensor: Sensor = None,
     integrator: Annotated[Any, Option("Integrator, by default the scene's")] = None,
     target_error: TargetError = None,
@@ -79,6 +84,9 @@ def render(
         Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
     instrument
         Name of the instrument whose laser and receiver replace an XML scene's, as `loading.instruments` lists them.
+    infrared
+        Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
+        `loading.instruments.with_infrared` for the parameters, and `results.companions`.
     sensor
         Id of a receiver in the scene, by default the first one.
     integrator
@@ -155,6 +163,14 @@ def render(
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
+    if infrared:
+        if again.is_result(scene):
+            raise UserError("infrared = True needs a scene: a result of both channels is rendered again with both")
+        more: dict[str, Any] = {"sensor": sensor, "integrator": integrator, "progress": progress, **options, **others}
+        (_, own), (channel, of_channel) = with_infrared(instrument, params)
+        # The cheaper one first, so that its refusals come early.
+        beside = render(scene, of_channel, instrument=channel, **more)
+        return join(render(scene, own, instrument=instrument, **more), beside)
     if again.is_result(scene):
         result: Any = scene
         given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
@@ -188,6 +204,8 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         If the result does not contain its scene, a file of the scene has changed, shots were selected or reordered, or
         an option is invalid.
     """
+    import xarray
+
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.rendering.shots.frames import render_frames
     from mitransient_lidar.rendering.shots.series import render_shots
@@ -199,7 +217,9 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         "frames": render_frames,
     }
     kind, chosen = again.recall(result, options)
-    return functions[kind](**chosen)
+    rendered = functions[kind](**chosen)
+    _, infrared = split(result if isinstance(result, xarray.Dataset) else results.open(result))
+    return rendered if infrared is None else join(rendered, render_again(infrared, **options))
 
 
 def _render(

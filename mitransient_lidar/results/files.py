@@ -18,6 +18,7 @@ from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, image_files, netcdf, sum_errors, waveform_files
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates
+from mitransient_lidar.results.companions import INFRARED
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack, has_frames
 
@@ -120,6 +121,8 @@ def _exr_parts(dataset: xr.Dataset, path: Path) -> list[exr.Part]:
     found = kinds_of(dataset)
     if "shot" in dataset.dims:
         raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file")
+    if INFRARED in dataset.attrs:
+        raise UserError(f"cannot write {path}: an EXR file holds no infrared channel; use a .nc file")
     if "result" in found:
         # The attributes have the curve of sum errors in its place.
         return exr.parts_of(dataset.drop_dims(sum_errors.DIMS, errors="ignore"), path, "waveforms")

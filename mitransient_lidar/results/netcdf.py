@@ -1,6 +1,7 @@
 """NetCDF files for labelled datasets.
 
-A file has at most 40 attributes of its own, numbers and texts. The attribute ``mitransient_lidar`` is a text of JSON
+A file has at most 40 attributes of its own, numbers and texts, and so has the group ``infrared`` of a result with two
+channels (`results.companions`). The attribute ``mitransient_lidar`` is a text of JSON
 with all others, lists among them, which `read` restores.
 """
 
@@ -23,6 +24,7 @@ from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.results.attributes import attribute, shown
+from mitransient_lidar.results.companions import INFRARED, join, split
 
 #: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
@@ -50,6 +52,21 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
+    green, infrared = split(dataset)
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        for group, one in ((file, green), (INFRARED, infrared)):
+            if one is not None:
+                own = file.create_group(group) if isinstance(group, str) else group
+                stored, encoding = _stored(one)
+                stored.dump_to_store(H5NetCDFStore(own), encoding=encoding)
+    with Path(path).open("wb") as output:
+        output.write(buffer.getbuffer())
+        output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+
+
+def _stored(dataset: xr.Dataset) -> tuple[xr.Dataset, dict[str, dict[str, Any]]]:
+    """Return a dataset as it is stored in a file or a group, and the encoding of its variables."""
     dataset = dataset.drop_encoding()
     attributes = {str(name): attribute(str(name), value) for name, value in dataset.attrs.items()}
     dataset.attrs = shown(attributes)
@@ -63,12 +80,7 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
             encoding[str(name)] |= {"zlib": True, "complevel": 4, "shuffle": True}
     if "signal" in dataset:
         encoding["signal"] |= _codes(dataset["signal"].values, attributes)
-    buffer = io.BytesIO()
-    with h5netcdf.File(buffer, "w") as file:
-        dataset.dump_to_store(H5NetCDFStore(file), encoding=encoding)
-    with Path(path).open("wb") as output:
-        output.write(buffer.getbuffer())
-        output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+    return dataset, encoding
 
 
 def _codes(signal: np.ndarray[Any, Any], attributes: dict[str, Any]) -> dict[str, Any]:
@@ -122,7 +134,23 @@ def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
     check_sum(path)
     with damaged_file(damaged):
         check_hdf5(path)
-    with damaged_file(damaged), xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file:
+    dataset, foreign = _group(path, None, damaged)
+    if not foreign and _has_infrared(path):
+        dataset = join(dataset, _group(path, INFRARED, damaged)[0])
+    return dataset, foreign
+
+
+def _has_infrared(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file has a group of the infrared channel."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return isinstance(file.get(INFRARED), h5py.Group)
+
+
+def _group(path: str | os.PathLike[str], group: str | None, damaged: str) -> tuple[xr.Dataset, bool]:
+    """Return the dataset of a file, or of a group in it, and whether another program has written it."""
+    with damaged_file(damaged), xr.open_dataset(path, group=group, engine="h5netcdf", decode_times=False) as file:
         check_size(path, file.nbytes, largest_result())
         dataset = file.load().drop_encoding()
         foreign = OTHERS not in dataset.attrs

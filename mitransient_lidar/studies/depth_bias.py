@@ -23,8 +23,9 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
 )
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
+from mitransient_lidar.analysis.waveforms.surface_times import check_surface
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import RECEIVERS, Numbers, Option, checked, positive_option
+from mitransient_lidar.core.options import RECEIVERS, Infrared, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
@@ -102,6 +103,7 @@ def depth_bias(
     scene: SeaScene = "table1",
     estimators: Sequence[str] = ESTIMATORS,
     receiver: OwnReceiver = None,
+    infrared: Infrared = False,
     shots: Places = 12,
     records: Records = 5,
     target_error: Annotated[
@@ -133,6 +135,8 @@ def depth_bias(
         NaN.
     estimators
         Estimators in `echo_table.extract`.
+    infrared
+        Whether the surface is that of the instrument's infrared channel, as far as it is known better.
     target_error
         Relative standard error of each location's render, above 0; 0.6 times this over a level sea. Bottoms in faint
         pixels have larger errors than the median, and are not found where these could be mistaken for echoes: see
@@ -166,6 +170,8 @@ def depth_bias(
     """
     own = read_instrument(instrument)
     former = None if corrections is None else corrections_for(instrument, corrections)
+    if former is not None:
+        check_surface(former, infrared)
     values = {one.name: one.value for one in own.parameters}
     if not is_green(laser := float(values["wavelength_nm"])):
         raise UserError(f"instrument = {instrument!r} has wavelength_nm = {laser:g}: depth errors are of green light")
@@ -204,7 +210,14 @@ def depth_bias(
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
             error = target_error * (1 if wind else _LEVEL)
             rendered = render_shots(
-                scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
+                scene,
+                given,
+                instrument=instrument,
+                infrared=infrared,
+                target_error=error,
+                seed=seed,
+                first_seed=seed,
+                **options,
             )
             seas.keep(rendered)
             # Troughs may leave a shallow bottom dry.
@@ -225,6 +238,7 @@ def depth_bias(
         "source": f"mitransient-lidar {__version__}",
         "instrument": instrument,
         "receiver": receiver or instrument,
+        "infrared_surface": int(infrared),
         "scene": scene,
         "parameters": json.dumps({name: str(value) for name, value in (params or {}).items()}),
         "shots": shots,

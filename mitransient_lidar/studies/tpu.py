@@ -13,7 +13,7 @@ from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS, Trajecto
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES, corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Numbers, Option, checked
+from mitransient_lidar.core.options import Infrared, Numbers, Option, checked
 from mitransient_lidar.core.validation import finite
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -58,6 +58,7 @@ def tpu(
     depths: Depths = DEPTHS,
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
+    infrared: Infrared = False,
     estimator: Annotated[str, Option("Depth estimator, as for echoes")] = "gaussian",
     shots: Places = 12,
     records: Records = 4,
@@ -80,6 +81,8 @@ def tpu(
         As for `depth_bias.depth_bias`.
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
+    infrared
+        As of `depth_bias.depth_bias`; ``auto`` corrections then are none.
     pointing_mrad, position_m, height_m
         Trajectory errors of the survey; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
@@ -105,7 +108,8 @@ def tpu(
     own = [finite("altitude", given.get("altitude", usual["altitude"]))]
     heights = np.asarray(own if altitudes is None else altitudes, float)
     if corrections is not None:
-        unwanted = isinstance(corrections, str) and corrections == "none"
+        # Shipped tables are of surfaces from green light.
+        unwanted = isinstance(corrections, str) and corrections in ("none", "auto" if infrared else "none")
         corrections = None if unwanted else corrections_for(instrument, corrections)
     trajectory = TrajectoryErrors(pointing_mrad, position_m, height_m)
     angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
@@ -117,6 +121,7 @@ def tpu(
             {**given, "altitude": height},
             scene=scene,
             receiver=receiver,
+            infrared=infrared,
             angles_deg=angles,
             winds=winds,
             ripples=[RIPPLES],

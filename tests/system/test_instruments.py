@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 from rows import each_row
+from significance import variance_limits
 
 import mitransient_lidar
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
+from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import instruments
+from mitransient_lidar.results.companions import split
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 #: Its energies in 12 ns of an echo or of the water vary by 1 % from seed to seed.
@@ -82,9 +87,47 @@ def test_a_result_names_its_instrument_and_gives_the_same_bits():
     assert first.attrs["scene.altitude"] == again.attrs["scene.altitude"] == "380"
 
 
+@pytest.mark.slow
+def test_the_infrared_channel_gives_the_surface_above_shallow_bottoms():
+    """Green echoes of surface and bottom merge in half a metre, 5 cm too shallow; both channels see the same waves."""
+    params = {"wind_speed": 3, "bottom_depth": 0.5, "bottom_reflectance": 0.15, "infrared.off_nadir_deg": 0}
+    series = mitransient_lidar.render_shots(
+        "table1", params, instrument="riegl_vq880g2", infrared=True, count=10, passes=3, seed=3
+    )
+    heights = series["true_surface_height"].values
+    np.testing.assert_allclose(series["infrared_true_surface_height"], heights, atol=0.02)
+    recorded = detect_waveforms(series, seed=5)
+    green, infrared = split(recorded)
+    assert green.attrs["receiver"] != infrared.attrs["receiver"] == "riegl_vq880g2_infrared"
+    errors, stated = {}, {}
+    for name, record in (("green", green), ("both", recorded)):
+        bottom = extract(record).sel(echo="bottom").isel(pixel=0)
+        assert (bottom["class"] == EchoClass.MERGED).sum() + (bottom["class"] == EchoClass.BOTTOM).sum() == 10
+        errors[name] = bottom["depth_m"].values - series["true_bottom_depth_below_surface"].values
+        stated[name] = np.hypot(bottom["depth_m_stderr"], bottom["depth_m_method_error"]).values
+    assert np.sqrt(np.mean(errors["both"] ** 2)) < 0.5 * np.sqrt(np.mean(errors["green"] ** 2))
+    assert np.median(stated["both"]) < 0.5 * np.median(stated["green"])
+    assert np.mean((errors["both"] / stated["both"]) ** 2) < variance_limits(10)[1]
+    again = mitransient_lidar.render(series)
+    assert again["infrared_waveform"].values.tobytes() == series["infrared_waveform"].values.tobytes()
+
+
 @each_row(
     ("arguments", "sentence"),
     [
+        (["render", "table1", "--infrared"], "--instrument = None has no infrared channel; instruments with one are"),
+        (
+            ["render", "table1", "--instrument", "riegl_vq840g", "--infrared"],
+            "--instrument = 'riegl_vq840g' has no infrared channel; instruments with one are",
+        ),
+        (
+            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.wavelength_nm=1550"],
+            "wavelength_nm = 1550 must lie between 300 and 1100",
+        ),
+        (
+            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.pulse_fwhm_ns="],
+            "pulse_fwhm_ns = '' is empty",
+        ),
         (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
         (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
         (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),

@@ -1,4 +1,4 @@
-"""Onset of the water column's signal behind the surface, with the mean focusing of light by waves."""
+"""Onset of the water column's signal behind the surface: mean focusing of light by waves, and absorption."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption, water_scattering
 from mitransient_lidar.results.geometry import Attributes
 
 _STEP, _BEFORE, _BEHIND = 0.02, 8.0, 64.0  # spacing and range of times in tables, in standard deviations of the blur
 _SIGMAS = 24  # blurs of a table, up to the largest one
 _SMALLEST = 0.01  # blur of a table over the largest one
+_TYPICAL = 0.03  # rate of decay of a column in the green that is too short for a fit [1/ns]
+_SHORT = 2.0  # widths of an echo in units of the column's decay from which on the column is part of the echo
+_CLEAREST = 1e-3  # backscattering coefficient of the clearest sea water at 532 nm, that of its molecules [1/m]
+_TURBID = 0.02  # that of turbid water in the near infrared [1/m]
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,59 @@ class Focusing:
     def at(self, depth: npt.ArrayLike) -> FloatArray:
         """Return the factor at depths below the surface [m]; 1 above it."""
         return np.asarray(np.interp(np.asarray(depth, dtype=np.float64), self.depths, self.factors))
+
+
+@dataclass(frozen=True)
+class Fading:
+    """How the signal of a column fades by the absorption of pure water alone, as it does in the near infrared.
+
+    Attributes
+    ----------
+    rate
+        Least rate of decay [1/ns].
+    clearest
+        Backscattering coefficient of the clearest sea water [1/m].
+    opaque
+        Whether a column has faded within an echo of its surface.
+    """
+
+    rate: float
+    clearest: float
+    opaque: bool
+
+    @classmethod
+    def of(cls, wavelength_nm: float, metres_per_ns: float, echo_fwhm_ns: float) -> Fading:
+        """Return the fading at a wavelength, for a path in the water per time [m/ns] and a width of echoes [ns]."""
+        wavelength = float(np.clip(wavelength_nm, *WAVELENGTH_RANGE))
+        rate = 2 * metres_per_ns * float(water_absorption(wavelength))
+        opaque = rate * echo_fwhm_ns > _SHORT
+        return cls(rate, 0.5 * float(water_scattering(wavelength)) if opaque else _CLEAREST, opaque)
+
+    @property
+    def typical_rate(self) -> float:
+        """Typical rate of decay [1/ns]."""
+        return max(self.rate, _TYPICAL)
+
+    def delay(self, energy: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the light of an opaque column delays an echo that includes it, and its standard deviation [ns].
+
+        The column has a share of the light between that of the clearest water and that of turbid water of a
+        backscattering coefficient of 0.02 1/m, uniformly distributed, and is as late as it decays on average.
+
+        Parameters
+        ----------
+        energy
+            That of the echo [unit of the record times s].
+        column
+            Signal of the column at the surface per backscattering coefficient [unit m], 0 where it is not known.
+        """
+        if not self.opaque:
+            return np.zeros(energy.shape), np.zeros(energy.shape)
+        per_backscattering = np.nan_to_num(1e-9 * column / (self.rate * np.where(energy > 0, energy, np.nan)))
+        known = per_backscattering > 0
+        least, most = (np.minimum(per_backscattering * one, 1.0) for one in (self.clearest, _TURBID))
+        most = np.where(known, most, 1.0)
+        return 0.5 * (least + most) / self.rate, (most - least) / (np.sqrt(12) * self.rate)
 
 
 @dataclass(frozen=True)

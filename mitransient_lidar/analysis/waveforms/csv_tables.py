@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoFlag
 from mitransient_lidar.core.tables.written import aligned_lines, write_csv
 
 if TYPE_CHECKING:

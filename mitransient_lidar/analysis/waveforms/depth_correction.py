@@ -12,8 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import rendered_bin_ns, rounding_ns
-from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_echo
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoFlag, has_echo
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk

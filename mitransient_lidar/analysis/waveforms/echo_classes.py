@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     Records,
     error_of_sums,
     find_echoes,
+)
+from mitransient_lidar.analysis.waveforms.echo_detection import (
+    EchoClass as EchoClass,
 )
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE, FirstEchoes, Priors, first_echoes
@@ -41,19 +43,6 @@ _COLUMN, _COLUMN_NS = 5.0, 20.0
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
 _CLEAR = 8.0  # least height over the noise of one of the echoes that are decided upon
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
-
-
-class EchoClass(IntEnum):
-    """What an echo is. Land and objects above the water are timed in air, bottoms and objects in it in the water."""
-
-    NONE = 0
-    SURFACE = 1  # of the sea
-    COLUMN = 2
-    BOTTOM = 3
-    MERGED = 4  # a bottom less than 1.8 echo widths behind its surface
-    OBJECT = 5  # in the water, before the bottom
-    LAND = 6
-    ABOVE = 7  # an object above the water, before other echoes
 
 
 class Detection(NamedTuple):
@@ -141,7 +130,8 @@ def decide(
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
-    column needs a probability of 60 %.
+    column needs a probability of 60 %. In the near infrared, where column and bottom are part of the surface's echo, a
+    first echo is land or the surface, and nothing follows the surface.
 
     Of 150 drawn records each (VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to five times
     the bottom's echo, reflectances 0.05 to 0.4), all land from 0.2 to 4 m is land, and 99 % of the bottoms from 0.3 to
@@ -220,13 +210,19 @@ def decide(
     behind = np.minimum(following, last - 1)
     is_clear = ~_is_weak(records, found.surface, _CLEAR) | (near & ~_is_weak(records, behind, _CLEAR))
     is_clear &= left > waveforms.tail_ns + _COLUMN_NS
-    tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)) & is_shallow & is_clear)
-    at_level = np.abs(deviation()[tested]) < _FAR
-    # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
-    beyond = waveforms.tail_ns + np.clip(left[tested] - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
-    has_column = _has_column(records.part(tested), found.surface[tested], beyond[:, np.newaxis])
-    has_column &= at_level & ~near[tested]
-    tested = tested[~has_column]
+    opaque = waveforms.fading.opaque
+    if opaque:
+        # Land or water; what follows a surface is in its echo.
+        found, near = _surface_alone(found, above), np.zeros_like(near)
+        tested = np.flatnonzero((found.surface >= 0) & np.isfinite(shallow))
+    else:
+        tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)) & is_shallow & is_clear)
+        at_level = np.abs(deviation()[tested]) < _FAR
+        # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
+        beyond = waveforms.tail_ns + np.clip(left[tested] - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
+        has_column = _has_column(records.part(tested), found.surface[tested], beyond[:, np.newaxis])
+        has_column &= at_level & ~near[tested]
+        tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
     if not tested.size:
         return Decision(found, above, probability, tested)
@@ -235,9 +231,10 @@ def decide(
         level.part(tested),
         IN_AIR * np.cos(lines.off_nadir),
         lines.depth_per_ns,
-        waveforms.least_column(part)[tested],
+        waveforms.fading.clearest * waveforms.column_signal(part)[tested],
         decay,
         waveforms.onset,
+        opaque,
     )
     pulse, shape = waveforms.blurred_pulse, waveforms.echo_shape
     # The strongest of the first two.
@@ -267,6 +264,15 @@ def _decided(one: Decision, records: Records, shape: EchoShape, width: float) ->
         bins[place, rows] = np.where(exists, np.clip(at, 0, records.time_ns.size - 1), -1)
         flags[place, rows] = np.where(exists, of_merged * merged, none)
     return replace(one, found=DetectedEchoes(bins, flags))
+
+
+def _surface_alone(found: DetectedEchoes, above: BoolArray) -> DetectedEchoes:
+    """Return surfaces, and objects above the water, without echoes behind a surface."""
+    kept = above.copy()
+    kept[0] = True
+    kept |= found.surface < 0
+    flags = np.where(kept, found.flags & ~int(EchoFlag.MERGED), int(EchoFlag.NO_ECHO))
+    return DetectedEchoes(np.where(kept, found.bins, -1), flags)
 
 
 def _following(found: DetectedEchoes, last: int) -> IntArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntFlag
+from enum import IntEnum, IntFlag
 from itertools import combinations
 
 import numpy as np
@@ -45,6 +45,19 @@ class EchoFlag(IntFlag):
     FEW_EVENTS = 128  # no higher than single events of the detector, such as dark counts: may be noise
     COLUMN_ONSET = 256  # a surface without an echo of its own, whose time is that of the column's onset
     NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's
+
+
+class EchoClass(IntEnum):
+    """What an echo is. Land and objects above the water are timed in air, bottoms and objects in it in the water."""
+
+    NONE = 0
+    SURFACE = 1  # of the sea
+    COLUMN = 2
+    BOTTOM = 3
+    MERGED = 4  # a bottom less than 1.8 echo widths behind its surface
+    OBJECT = 5  # in the water, before the bottom
+    LAND = 6
+    ABOVE = 7  # an object above the water, before other echoes
 
 
 def has_echo(flags: IntArray) -> BoolArray:
@@ -209,9 +222,9 @@ class Echoes:
         error = np.where(lacking, error_ns, self.time_stderr)
         return replace(self, time_ns=np.where(lacking, time_ns, self.time_ns), time_stderr=error)
 
-    def delayed(self, delay_ns: float) -> Echoes:
-        """Return the echoes with a delay [ns] added to their times."""
-        return replace(self, time_ns=self.time_ns + delay_ns)
+    def delayed(self, delay_ns: float | FloatArray, error_ns: float | FloatArray = 0.0) -> Echoes:
+        """Return the echoes with a delay added to their times, and its standard error [ns]."""
+        return replace(self, time_ns=self.time_ns + delay_ns, time_stderr=np.hypot(self.time_stderr, error_ns))
 
 
 def smooth(records: Records, width_ns: float) -> tuple[FloatArray, FloatArray]:

@@ -17,14 +17,15 @@ from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection,
 from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, Echoes, EchoFlag, Records, has_echo
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans
-from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, SurfaceLevel, surface_times
+from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans, widen
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, SurfaceLevel, infrared_level, surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.companions import split
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import flagged, label
@@ -32,10 +33,9 @@ from mitransient_lidar.results.waveform_files import check_measurable
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
-_TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
-_OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
+_IN_ECHO = 0.01  # error of shape and level of a column in its surface's echo, over the peak
 _UNFITTED = 0.25  # error of the time of an echo that cannot be fitted, in echo widths
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
@@ -104,8 +104,9 @@ def extract(
     depth_from : {'echo', 'mean'}
         Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
     level : SurfaceLevel, optional
-        Arrival of the surface in each waveform as known without it, for land and very shallow water; by default that of
-        the mean sea level, with an error of 0.15 m and the waves.
+        Arrival of the surface in each waveform as known without it, NaN where it is not, for land and very shallow
+        water, and for depths as far as it is known better than by the waveform. By default that of the infrared channel
+        (`surface_times.infrared_level`), or else the mean sea level, with an error of 0.15 m and the waves.
     iterations : int
         Iterations of the deconvolution, 1 to 10 000.
     block : int
@@ -199,7 +200,7 @@ def extract(
     than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
     attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
-    dataset = dataset_of("dataset", dataset, "waveforms", "signals")
+    dataset, infrared = split(dataset_of("dataset", dataset, "waveforms", "signals"))
     check_measurable(dataset)
     several = not isinstance(estimators, str)
     names = tuple(estimators) if several else (str(estimators),)
@@ -209,6 +210,8 @@ def extract(
         raise UserError(f"depth_from = {depth_from!r} must be 'echo' or 'mean'")
     layers, block = integer("layers", layers, 0, 8), integer("block", block, 1, 10**9)
     waveforms = Waveforms.from_dataset(dataset, pulse, noise, echo_fwhm_ns, saturation_level)
+    if infrared is not None and level is None:
+        level = infrared_level(extract(infrared), infrared, dataset, waveforms.lines, waveforms.count)
     wanted = None if targets is None else integer("targets", targets, 1, 100)
     settings = _Settings(names, threshold, contrast, layers, depth_from, level, iterations, wanted)
     starts = range(0, waveforms.count, block)
@@ -249,18 +252,18 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
-    records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
+    records, width, level = waveforms.records(rows), waveforms.echo_fwhm_ns, waveforms.surface_level(rows)
     decision = decide(
         waveforms,
         rows,
         records,
-        waveforms.surface_level(rows) if settings.level is None else settings.level.part(rows),
-        _TYPICAL_DECAY,
+        level if settings.level is None else settings.level.part(rows).or_else(level),
+        waveforms.fading.typical_rate,
         Detection(settings.threshold, settings.contrast, settings.targets),
     )
     found = decision.found
     time, surface = records.time_ns, found.surface
-    start = np.where(surface >= 0, time[surface] + waveforms.tail_ns, np.nan)
+    start = np.where(surface >= 0, time[surface] + waveforms.column_from_ns, np.nan)
     later = np.where(found.bins[1:] > surface, found.bins[1:], time.size).min(axis=0)
     following = np.where(later < time.size, later, -1)
     # The last bins lack the rising edges of pulses after the end of the record.
@@ -280,7 +283,9 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     for estimator in settings.estimators:
         usable = clear if estimator == "gaussian" else records
         echoes = _estimate(estimator, waveforms, usable, found, column, sharp, settings)
-        echoes = decision.fitted(echoes) if estimator == "gaussian" else echoes
+        if estimator == "gaussian":
+            early, spread = waveforms.fading.delay(echoes[0].energy, waveforms.column_signal(rows))
+            echoes = decision.fitted([echoes[0].delayed(-early, spread), *echoes[1:]])
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
         quantities.append([echoes[0], column_echoes(records, column, start, end, surface_ns - reference), *echoes[1:]])
@@ -289,10 +294,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         for name in vars(quantities[0][0])
     }
     table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
-    # The peak may be anywhere in the time that is clipped.
-    for echo, span in zip((0, *range(2, len(spans) + 1)), spans[:, :, np.newaxis], strict=True):
-        error = table["time_ns_stderr"][..., echo]
-        error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
+    widen(table["time_ns_stderr"], spans)
     table["class"] = np.insert(decision.classes(width), 1, np.where(np.isfinite(column.level), EchoClass.COLUMN, 0), 1)
     table["class_probability"] = decision.probability
     table["near_ns"], table["near_stderr"] = decision.surfaces()
@@ -363,6 +365,8 @@ def _with_depths(
     near, near_error = (table.pop(name)[:, np.newaxis] for name in ("near_ns", "near_stderr"))
     near_error = np.hypot(near_error, errors.of_surface(np.isfinite(near[:, 0]))[:, np.newaxis])
     zero, zero_error = (np.where(np.isfinite(near), *pair) for pair in ((near, zero), (near_error, zero_error)))
+    if settings.level is not None:
+        zero, zero_error, by_light = settings.level.combined(zero, zero_error, by_light)
     half = 0.5 * (time - lines.surface_time[:, np.newaxis, np.newaxis])
     second = may_be_second_return(time, half, table.pop("clipped_ns"), waveforms.echo_fwhm_ns)
     table["flags"] |= np.where(second, int(EchoFlag.SATURATED), 0)
@@ -433,9 +437,8 @@ def _label(
         "merged_below_m": SEPARATE * waveforms.echo_fwhm_ns * waveforms.geometry.depth_per_ns,
     }
     energy = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
-    kind = "mean" if settings.depth_from == "mean" else ""
     found = xr.Dataset(data, coords, {**dataset.attrs, **provenance})
-    return label(found, kind, amplitude=waveforms.unit, energy=energy)
+    return label(found, "mean" if settings.depth_from == "mean" else "", amplitude=waveforms.unit, energy=energy)
 
 
 def _estimate(
@@ -449,7 +452,7 @@ def _estimate(
 ) -> list[Echoes]:
     """Return surface, target and bottom of one estimator."""
     width, template = waveforms.echo_fwhm_ns, waveforms.template
-    decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), _TYPICAL_DECAY)
+    decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), waveforms.fading.typical_rate)
     places = list(zip(found.bins, found.flags, strict=True))
     if sharp is not None and estimator == "deconvolution":
         bias = deconvolution.deconvolution_offset(
@@ -473,9 +476,11 @@ def _estimate(
     if estimator == "gaussian":
         shape = waveforms.echo_shape
         level = column.level, np.hypot(column.level_stderr, _LEVEL * column.level)
+        if waveforms.fading.opaque:
+            error = _IN_ECHO * records.power.max(axis=1)
+            level, records = (0 * error, error), replace(records, noise=np.hypot(records.noise, error[:, np.newaxis]))
         surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
-        reflects = waveforms.geometry.off_nadir < GRAZING
-        fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
+        fits = [echo_fits.gaussian_surface(records, *surface, reflects=waveforms.reflects)]
         for number, (place, flag) in enumerate(places[1:], 1):
             around = found.neighbours(number)
             fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)

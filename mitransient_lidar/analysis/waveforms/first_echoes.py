@@ -84,6 +84,8 @@ class Priors:
         Typical rate of decay of a column [1/ns].
     onset
         Mean focusing of the column's light by waves.
+    opaque
+        Whether light of column and bottom is part of the surface's echo.
     """
 
     level: SurfaceLevel
@@ -92,6 +94,7 @@ class Priors:
     least_column: FloatArray
     decay: float
     onset: ColumnOnset
+    opaque: bool
 
     def column(self, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the signal of a column at delays from the surface, over that at the surface, and its derivative."""
@@ -156,6 +159,12 @@ def first_echoes(
     land_ns = arrival + land.values[:, 0]
     log_land = np.log(_OF_LAND * priors.metres_per_ns / _HIGHEST) - 0.5 * land.cost
     log_land += log_ndtr((level.time_ns - land_ns) / spread)
+    own = _echo(land, pulse.area_ns, shape, 0, land_ns, _error(land, 0))
+    if priors.opaque:
+        log_sea = np.log(1 - _OF_LAND) - 0.5 * land.cost + _log_normal(land_ns, level.time_ns, spread)
+        chance = np.exp([log_land, log_sea] - np.logaddexp(log_land, log_sea))
+        none = np.full(count, np.nan)
+        return FirstEchoes(np.stack([*chance, zero]), own, own.known_only(zero > 0), none, none)
 
     sea = fits.surface()
     log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
@@ -198,7 +207,6 @@ def first_echoes(
     bottom = _echo(_chosen([land, fit], np.where(dry, 0, 1)), area, shape, 0, time, time_error)
     # The height of an echo that may include a surface is that of both, whose error is that of one.
     bottom = replace(bottom, amplitude_stderr=_error(land, 2))
-    own = _echo(land, area, shape, 0, land_ns, _error(land, 0))
     distinct_bottom = _echo(free, area, shape, 0, own_ns, _error(free, 0))
     bottom = _where(distinct, distinct_bottom, _where(dry, own, bottom))
     own_error = np.sqrt(np.maximum(_error(free, 0) ** 2 + error**2 - 2 * free.covariance[:, 0, 6], 0))

@@ -12,11 +12,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
+from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Fading, Focusing
 from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, LEVEL, SurfaceLevel
+from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -35,7 +35,6 @@ _UNKNOWN = 10.0  # noise of samples that are not stored, over the threshold of b
 _LAND = 30.0  # height of an echo before the sea's, in typical deviations of samples or heights of single events
 _TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
 _BLUR = 1.0  # largest standard deviation of an echo's blur, in echo widths
-_CLEAREST = 1e-3  # backscattering coefficient of the clearest sea water at 532 nm, that of its molecules [1/m]
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
@@ -61,6 +60,8 @@ class Waveforms:
         Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
     focusing, onset
         Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
+    fading
+        How the column fades by absorption.
     echo_fwhm_ns, quiet_until_ns
         Expected width of an echo, and end of the part of the record without echoes [ns].
     geometry
@@ -92,6 +93,7 @@ class Waveforms:
     echo_shape: EchoShape
     focusing: Focusing | None
     onset: ColumnOnset
+    fading: Fading
     echo_fwhm_ns: float
     quiet_until_ns: float
     geometry: LidarGeometry
@@ -142,7 +144,10 @@ class Waveforms:
         ns_per_mrad = 1e-3 * geometry.surface_ns_per_rad
         given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
         width = given or _echo_width(dataset, template, ns_per_mrad)
-        echo_shape, focusing = EchoShape.of(template), Focusing.from_attributes(dataset.attrs)
+        echo_shape = EchoShape.of(template)
+        wavelength = float(dataset.attrs.get("wavelength_nm", 532.0))
+        fading = Fading.of(wavelength, geometry.metres_per_ns, template.fwhm_ns)
+        focusing = None if fading.opaque else Focusing.from_attributes(dataset.attrs)
         half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         # Crests are earlier than the mean sea level.
@@ -186,6 +191,7 @@ class Waveforms:
             echo_shape,
             focusing,
             ColumnOnset.of(focusing, geometry.depth_per_ns, echo_shape.sigma_of(3 * width)),
+            fading,
             width,
             quiet_until,
             geometry,
@@ -203,6 +209,16 @@ class Waveforms:
         """Time from the peak of a surface echo to where its tail has ended and the column begins [ns]."""
         width, template = self.echo_fwhm_ns, self.template
         return max(1.75 * width, template.tail_ns(_TAIL) + width - template.fwhm_ns)
+
+    @property
+    def reflects(self) -> bool:
+        """Whether facets of the sea may send light back."""
+        return bool(self.geometry.off_nadir < GRAZING)
+
+    @property
+    def column_from_ns(self) -> float:
+        """Time from the peak of a surface echo from which on the column is fitted [ns], NaN where it has faded."""
+        return math.nan if self.fading.opaque else self.tail_ns
 
     @cached_property
     def blurred_pulse(self) -> BlurredPulse:
@@ -236,11 +252,11 @@ class Waveforms:
         waves = (self.highest_m - self.lowest_m) / HEIGHTS
         return SurfaceLevel(lines.surface_time, np.hypot(math.hypot(waves, LEVEL) * per_metre, lines.surface_spread))
 
-    def least_column(self, rows: slice) -> FloatArray:
-        """Return the signal of the column of the clearest water at the surface, 0 where it is not known."""
+    def column_signal(self, rows: slice) -> FloatArray:
+        """Return the signal of a column at the surface per backscattering coefficient, 0 where it is not known."""
         share = np.nan_to_num(self.lines_of(rows).beam_share)
         pixel = np.arange(rows.start, rows.stop) % self.sensitivity.size
-        return np.asarray(share * self.sensitivity[pixel] * _CLEAREST * np.nan_to_num(self.column_gain))
+        return np.asarray(share * self.sensitivity[pixel] * np.nan_to_num(self.column_gain))
 
     def events(self, rows: slice) -> FloatArray:
         """Return the heights that single events of the detector reach, shape (waveforms,)."""

@@ -7,6 +7,8 @@ import numpy as np
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray
 from mitransient_lidar.core.validation import FloatArray
 
+_OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
+
 
 def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:
     """Return how many bins are clipped about echoes, 0 of those without a saturated sample within an echo width.
@@ -35,6 +37,16 @@ def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> Float
     found = (bins >= 0) & (left <= right)
     ends = last[lines, np.maximum(right, 0)] - first[lines, np.minimum(left, count - 1)] + 1
     return np.where(found, ends, 0).astype(np.float64)
+
+
+def widen(errors: FloatArray, spans: FloatArray) -> None:
+    """Add to the errors of times [ns], shape (n, ..., echo), that a peak may be anywhere in the time that is clipped.
+
+    `spans` are these times about surface, targets and bottom [ns], shape (echo, n); the second echo is the column.
+    """
+    for echo, clipped in zip((0, *range(2, len(spans) + 1)), spans, strict=True):
+        error, span = errors[..., echo], clipped.reshape(-1, *[1] * (errors.ndim - 2))
+        error[:] = np.where(span > 0, np.hypot(np.minimum(error, span), _OF_UNIFORM * span), error)
 
 
 def longest_run(saturated: BoolArray) -> tuple[IntArray, IntArray]:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 
-from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray
+from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, EchoClass, IntArray
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.geometry import LinesOfSight
 
 #: Least share of the beam in a pixel with direct light, relative to the brightest pixel.
@@ -32,6 +36,26 @@ class SurfaceLevel(NamedTuple):
         """Return those of some records."""
         return SurfaceLevel(self.time_ns[rows], self.stderr_ns[rows])
 
+    def or_else(self, other: SurfaceLevel) -> SurfaceLevel:
+        """Return these arrivals, and others where they are not known (NaN)."""
+        known = np.isfinite(self.time_ns)
+        return SurfaceLevel(*(np.where(known, own, one) for own, one in zip(self, other, strict=True)))
+
+    def combined(
+        self, time_ns: FloatArray, noise_ns: FloatArray, method_ns: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return weighted means of measured arrivals and these, and their errors by noise and method [ns].
+
+        Each of shape (n, ...), NaN where neither is known. Weights are the inverse squares of both errors together.
+        """
+        level, error = (one.reshape(-1, *[1] * (time_ns.ndim - 1)) for one in self)
+        variance = noise_ns**2 + method_ns**2
+        share = np.where(np.isfinite(time_ns), variance / np.maximum(variance + error**2, 1e-300), 1.0)
+        share = np.where(np.isfinite(level), share, 0.0)
+        known, noise, method, level, error = map(np.nan_to_num, (time_ns, noise_ns, method_ns, level, error))
+        mean = np.where(np.isfinite(time_ns) | (share > 0), known + share * (level - known), np.nan)
+        return mean, np.hypot((1 - share) * noise, share * error) + 0 * mean, (1 - share) * method
+
 
 class SurfaceTimes(NamedTuple):
     """Arrival of the surface in every pixel, shape (shots, pixels)."""
@@ -40,6 +64,73 @@ class SurfaceTimes(NamedTuple):
     stderr_ns: FloatArray  #: Error by noise; of a time that is inferred from other pixels, the whole error.
     method_ns: FloatArray  #: Error by the few places that return light, 0 where it is inferred.
     own: BoolArray  #: Whether the pixel's own echo is a surface echo.
+
+
+def infrared_level(
+    table: xr.Dataset, infrared: xr.Dataset, green: xr.Dataset, lines: LinesOfSight, count: int
+) -> SurfaceLevel:
+    """Return the arrival of the surface in green waveforms as the infrared channel has measured it.
+
+    Parameters
+    ----------
+    table
+        Echoes of the infrared channel, of one estimator.
+    infrared, green
+        Results or records of both.
+    lines
+        Lines of sight of the green pixels of a shot, shape (pixels,), or of all waveforms.
+    count
+        Number of green waveforms.
+
+    Notes
+    -----
+    The height of the surface in the infrared pixel with most of the beam, over the mean sea level, is that in the green
+    pixels. Its error is that of the infrared time and of the triggers and clocks of both records. The waves add the
+    standard deviation of slopes averaged over the green beam times the distance of the pixel from the infrared beam,
+    and times a quarter of the green beam's diameter for its own mean height. Where it is not
+    known, the level is NaN.
+    """
+    dims = tuple(str(dim) for dim in table["surface_time_ns"].dims)
+    own = LinesOfSight.from_dataset(infrared, dims)
+    shots = table.sizes.get("shot", 1)
+    pixel = int(np.argmax(np.nan_to_num(own.beam_share).reshape(shots, -1).sum(axis=0)))
+
+    def in_pixel(values: FloatArray) -> FloatArray:
+        return np.asarray(values.reshape(shots, -1)[:, pixel])
+
+    errors = (table[f"surface_time_ns_{name}"].values for name in ("stderr", "method_error"))
+    half = 0.5e-9 * C0
+    per_ns = half * np.cos(in_pixel(own.off_nadir))
+    late = table["surface_time_ns"].values.ravel() - own.surface_time
+    known = (table["class"].sel(echo="surface") == EchoClass.SURFACE).values
+    height = np.where(in_pixel(known), -per_ns * in_pixel(late), np.nan)
+    error = per_ns * in_pixel(np.hypot(*errors))
+    pixels = count // shots
+    lines = lines.at(np.arange(count) % lines.off_nadir.size)
+    away = lines.surface_time * half
+    x, y = away * lines.sight_x / np.cos(lines.off_nadir), away * lines.sight_y
+    apart = _aim(green) - _aim(infrared)
+    width = 2e-3 * float(green.attrs.get("divergence_mrad", 0.0)) * float(np.mean(away))
+    slope = mean_slope(green.attrs, width)
+    by_waves = slope * np.hypot(np.hypot(x + apart[0], y + apart[1]), 0.25 * width)
+    timing = np.hypot(*(np.hypot(*timing_jitter(one.attrs)) for one in (green, infrared)))
+    down = half * np.cos(lines.off_nadir)
+    time = lines.surface_time - np.repeat(height, pixels) / down
+    return SurfaceLevel(time, np.hypot(np.hypot(np.repeat(error, pixels), by_waves) / down, timing) + 0 * time)
+
+
+def check_surface(corrections: xr.Dataset, infrared: bool) -> None:
+    """Raise `UserError` for a table of depth errors from surfaces of another channel than depths count from."""
+    if bool(corrections.attrs.get("infrared_surface", 0)) != infrared:
+        kinds = ("green light, but depths", "infrared") if infrared else ("infrared light, but depths", "green")
+        advice = ": take one of depth-bias --infrared" if infrared else ""
+        raise UserError(f"corrections are of surfaces from {kinds[0]} count from {kinds[1]} light{advice}")
+
+
+def _aim(dataset: xr.Dataset) -> FloatArray:
+    """Return where the axis of the laser meets the mean sea level [m], shape (2,)."""
+    pose = np.asarray(dataset.attrs.get("transmitter_pose", (0.0,) * 5 + (-1.0,)), dtype=np.float64)
+    return np.asarray(pose[:2] - pose[3:5] * pose[2] / pose[5])
 
 
 def surface_times(

@@ -45,6 +45,9 @@ LAYERED_WATER = plugin(
         "``petzold``, 700 to 1100 for all but a profile; or of the columns in a profile that has several, such as "
         "``a488, a532``",
         otherwise="``532``, or the wavelength of the only columns"),
+    number("coefficients_nm", None, "nm", 531, 533,
+        "Wavelength of coefficients given as numbers, or of a profile, 532: above 700 nm, water that absorbs like pure "
+        "water there is made of them", otherwise="``wavelength_nm``"),
     file("profile",
         "A file instead of the above, with ``depth`` or ``z``, two of ``a``, ``b``, ``c``, ``omega``, and ``bb`` or "
         "``bb_ratio``: a table with units in its heading (.csv, .txt, .dat, .tsv) or .nc (`physics.water.profiles`)",

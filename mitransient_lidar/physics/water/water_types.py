@@ -16,6 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
 from mitransient_lidar.physics.water.data_tables import read_columns
+from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import (
@@ -249,6 +250,13 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
         found.backscattering + ratio * back,
         found.water_scattering,
     )
+
+
+def near_infrared_column(green: WaterColumn, wavelength_nm: float) -> WaterColumn:
+    """Return the layers of a water of 532 nm at a wavelength in the near infrared [nm]; see `near_infrared`."""
+    rows = zip(green.attenuation, green.scattering, green.backscattering, strict=True)
+    found = [near_infrared(InherentProperties(c - b, b, bb), wavelength_nm) for c, b, bb in rows]
+    return WaterColumn(green.layer_tops, *np.array([[getattr(one, name) for one in found] for name in COEFFICIENTS]))
 
 
 def default_water(wavelength_nm: float) -> dict[str, float]:

@@ -16,7 +16,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
+from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.tables.headings import Column
@@ -25,12 +25,14 @@ from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import LIGHT, Components, LightOption, RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
+from mitransient_lidar.results.companions import join
 from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
@@ -100,6 +102,7 @@ def render_shots(
     components: Components = None,
     derivatives: Sequence[str] | str | None = None,
     instrument: Instrument = None,
+    infrared: Infrared = False,
     sensor: Sensor = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
@@ -145,6 +148,8 @@ def render_shots(
         again.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
+    infrared
+        Whether to render the infrared channel of the instrument at the same places, too, as for `render`.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     progress
@@ -172,6 +177,7 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random locations, or lacks a parameter, or a number is out of range.
     """
+    options_given = {**locals(), "infrared": False}
     from mitransient_lidar.rendering.shots.batches import (
         MOST_PASSES_FOR_ERROR,
         ReceivedShots,
@@ -179,6 +185,12 @@ def render_shots(
         share_for_error,
     )
 
+    if infrared:
+        (_, own), (channel, other) = with_infrared(instrument, params)
+        green = render_shots(**options_given | {"params": own})
+        options_given |= {"params": other, "instrument": channel, "axis": None}
+        options_given["positions"] = np.column_stack([green[name] for name in AIM])
+        return join(green, render_shots(**options_given))
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
     one_of("light", light, LIGHT)

@@ -57,7 +57,8 @@ def test_quality_of_points():
     values = {"shot": shot, "pixel": np.zeros(6, dtype=int), "kind": kind, "flags": flags[shot, 0, np.tile([0, 3], 3)]}
     values["echo"] = np.tile([0, 2], shots)
     points = xr.Dataset({name: ("point", value) for name, value in values.items()})
-    found = points.assign(_quality(points, echoes))
+    green = np.zeros(shots, dtype=bool)
+    found = points.assign(_quality(points, echoes, green))
     saturated, poor, corrected, beyond, *_ = Quality
     assert found["quality"].values.tolist() == [
         *(saturated, saturated | corrected),
@@ -65,5 +66,7 @@ def test_quality_of_points():
         *(0, saturated | corrected),
     ]
     assert found["withheld"].values.tolist() == [True, False, False, True, False, True]
-    without = points.assign(_quality(points, echoes[["flags"]]))
+    beside = _quality(points, echoes, np.array([False, True, False]))["quality"][1]
+    assert (beside - found["quality"].values).tolist() == [0, 0, Quality.INFRARED, Quality.INFRARED, 0, 0]
+    without = points.assign(_quality(points, echoes[["flags"]], green))
     assert without["quality"].values.tolist() == [saturated, saturated, 0, poor, 0, saturated]

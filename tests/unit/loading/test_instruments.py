@@ -12,8 +12,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, instruments, scenes
 
 NAMES = (
-    *("icesat2_atlas", "leica_chiroptera4x", "leica_hawkeye4x_deep", "published_airborne", "published_mast"),
-    *("riegl_vq840g", "riegl_vq840gl", "riegl_vq880g2", "riegl_vq880g2_infrared", "teledyne_czmil", "usgs_eaarl_b"),
+    *("icesat2_atlas", "leica_chiroptera4x", "leica_chiroptera4x_infrared", "leica_hawkeye4x_deep", "optech_titan"),
+    *("optech_titan_infrared", "published_airborne", "published_mast", "riegl_vq840g", "riegl_vq840gl"),
+    *("riegl_vq880g2", "riegl_vq880g2_infrared", "teledyne_czmil", "teledyne_czmil_infrared", "usgs_eaarl_b"),
 )
 
 #: Parameters that every instrument has; beam and view may be given in several ways.
@@ -162,6 +163,22 @@ def test_unknown_instruments_are_refused(name, sentence):
             call(name)
     with pytest.raises(UserError, match=sentence):
         scenes.open_scene("table1", None, name)
+
+
+def test_parameters_of_an_infrared_channel():
+    """Scene, altitude and aim are shared; the lidar's own parameters are not."""
+    given = {"wind_speed": 3, "altitude": 400, "pulse_fwhm_ns": 2, "time_start_ns": 9, "infrared.off_nadir_deg": 5}
+    (name, own), (channel, other) = instruments.with_infrared("riegl_vq880g2", given)
+    assert (name, channel) == ("riegl_vq880g2", "riegl_vq880g2_infrared")
+    assert own == {"wind_speed": 3, "altitude": 400, "pulse_fwhm_ns": 2, "time_start_ns": 9}
+    assert other == {"wind_speed": 3, "altitude": 400, "off_nadir_deg": 5, "coefficients_nm": 532}
+    loaded = scenes.open_scene("fresh_water_lens", {**FLAT, **other}, channel).scene
+    (water,) = [shape.interior_medium() for shape in loaded.shapes() if shape.interior_medium() is not None]
+    # Layers given at 532 nm absorb as pure water does at 1064 nm.
+    assert (water.water.column.absorption > 14.3).all()
+    for refused in (None, "riegl_vq840g", "riegl_vq880g2_infrared"):
+        with pytest.raises(UserError, match=r"has no infrared channel; instruments with one are .*riegl_vq880g2"):
+            instruments.with_infrared(refused, {})
 
 
 def test_parameters_that_the_instrument_replaces_are_refused():

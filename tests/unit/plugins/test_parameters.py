@@ -21,7 +21,7 @@ from mitransient_lidar.loading.variants import PLUGIN_MODULES
 WITHOUT_VALUE = {
     "layered_water": {
         *("jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"),
-        *("bubble_void_fraction", "bubble_depth"),
+        *("bubble_void_fraction", "bubble_depth", "coefficients_nm"),
     },
     "canopy": {"bending_azimuth_deg", "shoot_density"},
     "ocean_surface": {
