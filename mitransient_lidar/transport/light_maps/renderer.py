@@ -7,7 +7,10 @@ there, displaced and delayed by scattering on both ways at once (`physics.water.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +19,8 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
 from mitransient_lidar.transport.light_maps.heights import HeightFields
 from mitransient_lidar.transport.light_maps.maps import LightMaps, Planes
@@ -44,6 +49,13 @@ _PATHS, _PATHS_AT_BOTTOM = 2**12, 12
 
 #: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
 _LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
+
+#: Spreads of waters that were drawn before, and their largest number; step of their angles [deg].
+_SPREADS: dict[tuple[Any, ...], TwoWaySpread] = {}
+_MOST_SPREADS, _ANGLE_STEP = 16, 2.0
+
+#: Step of the depths of the lowest planes, which lidars of a flight share [m].
+_DEPTH_STEP = 0.5
 
 #: Largest distance of laser and receiver over their range, and angle between their axes [rad].
 _APART = 0.05
@@ -127,7 +139,7 @@ class LightMapRenderer(PassRenderer):
         self.focusing = RippleFocusing.of_scene(scene, _far_apart if level else self._planes.cell)
         column = water.column
         phases = [table_of(phase) for phase in water.phases.phases[: column.count]]
-        spread = TwoWaySpread.of_column(column, phases, self._planes.depths[1:], cos_water, _PATHS)
+        spread = _spread_of(column, phases, self._planes.depths[1:], cos_water)
         self._spread = [
             aligned(mi.Float, values.astype(np.float32))
             for values in (spread.shift_x, spread.shift_y, spread.excess, spread.of_bottom, spread.of_water)
@@ -310,6 +322,20 @@ class LightMapRenderer(PassRenderer):
         )
 
 
+def _spread_of(
+    column: WaterColumn, phases: Sequence[PowerLawTable], depths: FloatArray, cos_water: float
+) -> TwoWaySpread:
+    """Return the spread in a water along an axis, whose angle is rounded: it serves the lidars of a flight."""
+    angle = _ANGLE_STEP * round(float(np.degrees(np.arccos(min(cos_water, 1.0)))) / _ANGLE_STEP)
+    arrays = column.layer_tops, column.attenuation, column.scattering, depths, *(phase.value for phase in phases)
+    key = angle, *(values.tobytes() for values in arrays)
+    if key not in _SPREADS:
+        while len(_SPREADS) >= _MOST_SPREADS:
+            _SPREADS.popitem()
+        _SPREADS[key] = TwoWaySpread.of_column(column, phases, depths, float(np.cos(np.radians(angle))), _PATHS)
+    return _SPREADS[key]
+
+
 def unsuited(scene: LidarScene) -> str | None:
     """Return why light maps are not for a scene, or None."""
     if scene.submerged:
@@ -370,7 +396,7 @@ def _deepest(scene: LidarScene, cos_water: float) -> float:
     deepest = max((scene.axis.path_end - air) / (2 * scene.group_index), 0.1) * cos_water
     lowest = min((float(solid.bbox().min.z) for solid in scene.bottoms), default=-deepest)
     crest = max(scene.sea_heights[1], 0.0) if scene.sea_heights else 0.0
-    return min(deepest, max(-lowest, 0.1)) + crest
+    return _DEPTH_STEP * math.ceil((min(deepest, max(-lowest, 0.1)) + crest) / _DEPTH_STEP)
 
 
 def _spaced(shots: Shots, lanes: Lanes, purpose: int, count: int) -> list[mi.Float]:
