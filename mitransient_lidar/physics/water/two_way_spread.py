@@ -112,7 +112,10 @@ class TwoWaySpread:
             of_water = absorbed * phase * cos_water**2 / (u1[2] * u2[2])
             # Seen at x, light has turned at x + (x2, y2), which that of the way down reaches from x + (x2 - x1, ...).
             groups = np.argsort(np.hypot(x2 - x1, y2 - y1)).reshape(paths, _PAIRS)
-            one = groups[:, 0]
+            # Long paths absorb more: each stands for its neighbours in proportion to what is left of it.
+            kept = np.cumsum(absorbed[groups], axis=1)
+            chosen = np.sum(kept < rng.random((paths, 1)) * kept[:, -1:], axis=1)
+            one = np.take_along_axis(groups, chosen[:, None], axis=1)[:, 0]
             moved = [each[one] for each in (x2 - x1, y2 - y1, e1 + e2)]
             found.append([*moved, *(each[groups].mean(axis=1) for each in (absorbed, of_water)), (n1 + n2)[one]])
         arrays = [np.array(each) for each in zip(*found, strict=True)]
