@@ -71,8 +71,8 @@ LIGHT = ("merging", "maps")
 LightOption = Annotated[
     str,
     Option(
-        "Computation of the light: merging (the default), or maps of the beam at several depths, 20 times faster and "
-        "1 to 2 % in error",
+        "Computation of the light: merging (the default), or maps of the beam at several depths: several times "
+        "faster, within 1 %",
         form="|".join(LIGHT),
     ),
 ]
