@@ -216,10 +216,11 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
         "shots": render_shots,
         "frames": render_frames,
     }
-    kind, chosen = again.recall(result, options)
+    # Language servers follow options that a function hands to itself without an end.
+    kind, chosen = again.recall(result, given := options)
     rendered = functions[kind](**chosen)
     _, infrared = split(result if isinstance(result, xarray.Dataset) else results.open(result))
-    return rendered if infrared is None else join(rendered, render_again(infrared, **options))
+    return rendered if infrared is None else join(rendered, render_again(infrared, **given))
 
 
 def _render(

@@ -10,13 +10,13 @@ from mitransient_lidar.plots.viewer import view_scene
 
 pytestmark = [pytest.mark.slow, needs_browser]
 
-GUIDE = Path(__file__).parents[2] / "docs" / "guide"
+EXAMPLES = Path(__file__).parents[2] / "scenes" / "examples"
 
 #: Most bytes of a page.
 LARGEST = 6e6
 
 
-@pytest.fixture(scope="module", params=["table1", GUIDE / "gated_target.xml"], ids=["table1", "gated_target"])
+@pytest.fixture(scope="module", params=["table1", EXAMPLES / "gated_target.xml"], ids=["table1", "gated_target"])
 def written(request, tmp_path_factory):
     return view_scene(request.param).save(tmp_path_factory.mktemp("page") / "scene.html")
 

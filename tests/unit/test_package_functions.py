@@ -21,6 +21,8 @@ FUNCTIONS = {name: function for name, function in PUBLIC.items() if inspect.isfu
 
 #: Parameters that are a dataset or its path, a scene, or another thing of a kind that a wrong value must not reach.
 DATASETS = {"dataset", "result", "found", "stack", "source"}
+#: Functions that write files, or read others than datasets.
+OF_FILES = ("save", "view_points")
 GIVEN = {*DATASETS, "scene", "campaign", "flight", "instrument", "path", "name"}
 
 #: Values of parameters without a default.
@@ -100,7 +102,9 @@ def test_what_is_given_by_mistake_is_refused_in_a_sentence(name, given, value, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name != "save"])
+@pytest.mark.parametrize(
+    "name", [name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name not in OF_FILES]
+)
 def test_a_path_gives_what_its_dataset_gives(name, tmp_path):
     shots = synthetic_shots.result()
     if name == "correct_depths":

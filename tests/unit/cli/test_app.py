@@ -83,6 +83,7 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     assert options == {
         "params": {"wind_speed": "3", "file": "a=b"},
         "instrument": None,
+        "infrared": False,
         "sensor": None,
         "integrator": None,
         "target_error": None,
