@@ -337,6 +337,32 @@ FAULTS = (
         near=f"{_UNIT}/analysis/gates",
     ),
     Fault(
+        "map_bottom_without_cosine",
+        "mitransient_lidar/transport/light_maps/renderer.py",
+        "dr.select(on_bed, value / -rays.direction.z, 0)",
+        "dr.select(on_bed, value, 0)",
+    ),
+    Fault(
+        "map_absorption_one_way",
+        "mitransient_lidar/transport/light_maps/maps.py",
+        "kept = energy * dr.exp(absorbed)",
+        "kept = energy",
+    ),
+    Fault(
+        "map_scattering_one_way",
+        "mitransient_lidar/transport/light_maps/renderer.py",
+        "share = (1 - dr.exp(-2 * scattered))",
+        "share = (1 - dr.exp(-scattered))",
+        near="tests/analytic/test_light_maps.py",
+    ),
+    Fault(
+        "map_detour_at_phase_index",
+        "mitransient_lidar/transport/light_maps/renderer.py",
+        "length + way + opaque(scene.group_index) * excess",
+        "length + way + excess",
+        near="tests/analytic/test_light_maps.py",
+    ),
+    Fault(
         "frames_add_up", f"{_A}/detection/images.py", ".mean() / frames", ".mean()", near=f"{_UNIT}/analysis/detection"
     ),
 )
