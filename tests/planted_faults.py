@@ -345,8 +345,8 @@ FAULTS = (
     Fault(
         "map_absorption_one_way",
         "mitransient_lidar/transport/light_maps/maps.py",
-        "kept = energy * dr.exp(absorbed)",
-        "kept = energy",
+        "energy * density * dr.exp(-lost)",
+        "energy * density",
     ),
     Fault(
         "map_scattering_one_way",
