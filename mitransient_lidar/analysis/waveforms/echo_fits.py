@@ -27,6 +27,7 @@ _RISE = 0.5  # level of the column that its rise crosses
 _BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
 _WEAK = 0.3  # first guess of the height of a surface without such a peak, in levels of the column
 _FAR = (-np.inf, np.inf)
+_BROAD = 2.0  # width over waves from which an echo is the column's, in echo widths
 _CLOSE = 0.5  # least distance from the earliest time of a surface that a fit may find, in echo widths
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
@@ -56,7 +57,8 @@ def gaussian_surface(
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
     0.45 of the peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include
     the spread of these fits. Over waves, where it is within half an echo width of the earliest time that the samples
-    about the peak allow, the peak is too deep in the column for the surface, which is not found.
+    about the peak allow, the peak is too deep in the column for the surface, which is not found. Over waves, an A E
+    wider than two echo widths is light of the column, and does not count.
 
     Parameters
     ----------
@@ -114,11 +116,17 @@ def gaussian_surface(
             jacobian[3] += fall * value
         return height * jacobian[2] + level * jacobian[3], jacobian.transpose(1, 0, 2)
 
+    def fitted(start: FloatArray, rows: BoolArray, height: FloatArray | None = None) -> WindowFits:
+        found = fit_windows(model, start, data, peak, rows, height)
+        # Light that waves focus in the middle of a column resembles a surface that is much too wide.
+        broad = (found.values[:, 1] > shape.sigma_of(_BROAD * width)) & (early > 0)
+        return replace(found, good=found.good & ~broad, cost=np.where(broad, np.inf, found.cost))
+
     exists = has_echo(flags)
     if not reflects:
         only = fit_windows(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan))
         return _echoes(records, bins, only.later(limit), flags, shape)
-    fit = fit_windows(model, start, data, peak, exists)
+    fit = fitted(start, exists)
     tried: list[WindowFits] = []
     if early > 0:
         # A column that is brightest below the surface has the shape of a late echo.
@@ -126,7 +134,7 @@ def gaussian_surface(
         faint = np.where(tried[0].good[:, np.newaxis], tried[0].values, faint)
         second = faint.copy()
         second[:, 2] = _FAINT * peak
-        other = fit_windows(model, second, data, peak, exists)
+        other = fitted(second, exists)
         fit = fit.replaced(other.good & ~(fit.good & (fit.cost <= other.cost)), other)
     error = np.sqrt(fit.covariance[:, 2, 2])
     weak = exists & ~(fit.good & (fit.values[:, 2] > _CLEAR * error))
@@ -137,7 +145,7 @@ def gaussian_surface(
             continue
         if not weak.any():
             return _echoes(records, bins, fit.later(limit), flags, shape)
-        tried.append(fit_windows(model, faint, data, peak, weak, np.where(weak, share * peak, np.nan)))
+        tried.append(fitted(faint, weak, np.where(weak, share * peak, np.nan)))
         faint = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, faint)
         weak &= ~some | (tried[0].cost <= fit.cost + _SIGNIFICANT)
     return _echoes(records, bins, fit.replaced(weak, _mean(tried)).later(limit), flags, shape)

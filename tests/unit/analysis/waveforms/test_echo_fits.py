@@ -1,7 +1,10 @@
 """Fits to waveforms: bias and standard errors in synthetic records."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.stats import exponnorm
 from significance import largest_count, largest_z
 
@@ -10,6 +13,7 @@ from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focus
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records
 from mitransient_lidar.analysis.waveforms.echo_fits import gaussian_echo, gaussian_surface
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Template
+from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
 TIME = (np.arange(400) + 0.5) * 0.5
@@ -207,3 +211,11 @@ def test_coarse_samples_of_short_pulses_determine_a_bottom():
     assert np.isfinite(z).mean() > 0.99
     assert abs(np.nanmean(z)) < largest_z(COUNT) / np.sqrt(COUNT) + 0.1
     assert 0.8 < np.nanstd(z) < 1.2
+
+
+def test_light_that_waves_focus_within_a_column_is_not_the_surface():
+    """Five of 720 records of `table1`, 2 m deep under a wind of 6 m/s, whose depths were 0.3 to 0.5 m short."""
+    records = xr.open_dataset(Path(__file__).with_name("focused_columns.nc"))
+    bottom = extract(records).sel(echo="bottom").squeeze("pixel")
+    error = np.hypot(bottom.depth_m_stderr, bottom.depth_m_method_error)
+    assert (np.abs(bottom.depth_m - records.true_bottom_depth_below_surface) < 3 * error).all()
