@@ -90,14 +90,14 @@ def register(
 ) -> None:
     """Register a Mitsuba plugin of a kind, made by its class or by a function of the class that describes it.
 
-    The class docstring, the plugin's manual, gets the parameter table.
+    The class docstring, the plugin's manual, gets the parameter table and the example in XML.
 
     The objects get ``parameters``: the plugin's name as ``type``, each parameter's value that they have read, and
     nested objects; and a description that lists these.
     """
     manual: Any = make if described is None else described
     if manual.__doc__:
-        manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
+        manual.__doc__ = plugin.manual(manual.__doc__, kind)
 
     def construct(props: mi.Properties) -> Any:
         own = DeclaredProperties(props, plugin)
@@ -157,6 +157,56 @@ def closed(plugin: Any) -> Any:
 
     plugin.traverse = traverse
     return plugin
+
+
+@closed
+class SampledBSDF(mi.BSDF):
+    """BSDF that is evaluated with its density, and draws directions from one or two components."""
+
+    def __init__(self, props: DeclaredProperties, *components: int) -> None:
+        super().__init__(props)
+        self.m_components, self.m_flags = list(components), components[0] | components[-1]
+
+    @abstractmethod
+    def draw(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Draw directions with the density of `eval_pdf`; return them and the numbers of their components."""
+
+    @abstractmethod
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Color1f, mi.Float]:
+        """Return BSDF times cosine, and density [1/sr]."""
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
+        """Sample a direction; return it and BSDF times cosine over its density."""
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo, bs.sampled_component = self.draw(ctx, si, sample1, sample2)
+        bs.eta = 1.0
+        first, last = mi.UInt32(self.m_components[0]), mi.UInt32(self.m_components[-1])
+        bs.sampled_type = dr.select(bs.sampled_component == 0, first, last)
+        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Color1f:
+        """Return BSDF times cosine [1/sr]."""
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Float:
+        """Return the density with which `sample` draws a direction [1/sr]."""
+        return self.eval_pdf(ctx, si, wo, active)[1]
 
 
 class PassIntegrator(mi.CppADIntegrator):
@@ -297,6 +347,14 @@ class EmitterWithoutExtent(mi.Emitter):
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the emitter does not extend the scene."""
         return mi.ScalarBoundingBox3f()
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Return 0: no direction meets a point or a small disc by chance."""
+        return mi.Float(0)
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return 0: only `sample_direction` finds the emitter."""
+        return mi.Spectrum(0)
 
     def distant_sample(self, it: mi.Interaction3f, direction: mi.Vector3f) -> mi.DirectionSample3f:
         """Return the sample of a direction to infinity, without its density."""

@@ -75,18 +75,10 @@ class LayeredWater(mi.Medium):
     volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
     phase function and index in all layers.
 
-    .. code-block:: xml
+    .. example::
 
-        <medium type="layered_water" name="interior">
-            <string name="layer_tops" value="0, 3"/>
-            <string name="attenuation" value="0.9, 0.5"/>
-            <string name="scattering" value="0.7, 0.35"/>
-            <string name="backscattering" value="0.014, 0.007"/>
-        </medium>
-
-    .. code-block:: python
-
-        {'type': 'layered_water', 'attenuation': 0.3, 'scattering': 0.15, 'backscattering': 0.006}
+        {'type': 'layered_water', 'layer_tops': '0, 3', 'attenuation': '0.9, 0.5', 'scattering': '0.7, 0.35',
+         'backscattering': '0.014, 0.007'}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:

@@ -83,11 +83,7 @@ class LidarMerging(PassIntegrator):
     bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not from
     Mitsuba's gradients.
 
-    .. code-block:: xml
-
-        <integrator type="lidar_merging"/>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'lidar_merging'}
     """

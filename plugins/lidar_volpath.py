@@ -43,13 +43,7 @@ class LidarVolpath(VolpathIntegrator):
     Every segment is timed with the group index of the medium that it crosses. Derivatives come from
     `mitransient_lidar.render`, not from Mitsuba's gradients.
 
-    .. code-block:: xml
-
-        <integrator type="lidar_volpath">
-            <integer name="paths_per_pass" value="262144"/>
-        </integrator>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'lidar_volpath', 'paths_per_pass': 262144}
     """

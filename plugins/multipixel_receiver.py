@@ -31,15 +31,7 @@ class MultipixelReceiver(ReceiverSensor):
     Blur distributes light from the direction (angle_x, angle_y) around that point on the detector by the point-spread
     function, which is the same all over the field of view. Light between pixels is lost.
 
-    .. code-block:: xml
-
-        <sensor type="multipixel_receiver">
-            <string name="layout" value="2x2"/>
-            <float name="field_of_view_mrad" value="30"/>
-            <film type="time_gated_film"/>
-        </sensor>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'multipixel_receiver', 'layout': '2x2', 'field_of_view_mrad': 30.0,
          'film': {'type': 'time_gated_film'}}

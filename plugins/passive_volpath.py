@@ -30,13 +30,7 @@ class PassiveVolpath(VolpathIntegrator):
     Light from outside the surface mesh is lost. The air is clear; the receiver's optics do not affect the radiance.
     There are no derivatives.
 
-    .. code-block:: xml
-
-        <integrator type="passive_volpath">
-            <integer name="paths_per_pass" value="262144"/>
-        </integrator>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'passive_volpath', 'paths_per_pass': 262144}
     """

@@ -24,13 +24,7 @@ class MeasuredPhase(TabulatedPhaseFunction):
     Interpolated in log-log, and extrapolated below the first angle with the power law of the first two
     (`mitransient_lidar.physics.water.phase_file.read_phase_table`).
 
-    .. code-block:: xml
-
-        <phase type="measured_phase">
-            <string name="filename" value="harbour.csv"/>
-        </phase>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'measured_phase', 'filename': 'harbour.csv'}
     """
