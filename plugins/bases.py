@@ -20,8 +20,13 @@ from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 from mitransient_lidar.transport.sensor.pixels import PixelArray
-from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread, PointSpread
-from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
+from mitransient_lidar.transport.sensor.receiver import (
+    GaussianPointSpread,
+    MeasuredPointSpread,
+    PointSpread,
+    Receiver,
+    ReceiverOptics,
+)
 
 #: Parameter of the loader: frame origin in the scene [m], x, y, z, for plugins with a location.
 FRAME_ORIGIN = "_frame_origin"

@@ -22,8 +22,7 @@ from mitransient_lidar.physics.water.seawater import VISIBLE_RANGE, WAVELENGTH_R
 from mitransient_lidar.physics.water.water_types import default_water, near_infrared_column, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
-from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.water import Water

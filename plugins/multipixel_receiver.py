@@ -9,8 +9,7 @@ from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER
 from mitransient_lidar.plugins.bases import DeclaredProperties, ReceiverSensor, register
 from mitransient_lidar.plugins.pixel_fov import PixelFov
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
-from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
-from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels, MappedPixels, PixelArray, ShapedPixels, parse_layout
 
 
 class MultipixelReceiver(ReceiverSensor):

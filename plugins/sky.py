@@ -9,7 +9,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SKY
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
-from mitransient_lidar.transport.daylight.sky import SKIES, direction_of, relative_irradiance
+from mitransient_lidar.transport.daylight.scene import SKIES, direction_of, relative_irradiance
 
 
 class Sky(EmitterWithoutExtent):

@@ -9,7 +9,7 @@ import numpy as np
 from mitransient_lidar.core.parameters.bottom import SUN
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
-from mitransient_lidar.transport.daylight.sky import direction_of
+from mitransient_lidar.transport.daylight.scene import direction_of
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
 

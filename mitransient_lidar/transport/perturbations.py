@@ -19,7 +19,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
-from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam
+from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam
 from mitransient_lidar.transport.medium.tabulated_phase import half_angle
 from mitransient_lidar.transport.opaque import aligned, opaque
 

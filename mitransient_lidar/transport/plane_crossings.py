@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.physics.lidar.level_sea import refract_level
+from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.opaque import aligned, opaque

@@ -15,7 +15,7 @@ from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.physics.sea.shoaling import BottomDepths
-from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
+from mitransient_lidar.transport.laser import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.receiver import Receiver

@@ -16,7 +16,6 @@ from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
-from mitransient_lidar.transport.bottom_depths import bottom_depths
 from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
@@ -33,7 +32,7 @@ from mitransient_lidar.transport.plugin_types import (
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
+from mitransient_lidar.transport.solids import bottom_depths, children, shape_groups, without_unseen
 
 logger = logging.getLogger(__name__)
 

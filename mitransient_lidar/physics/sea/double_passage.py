@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import turn_by_slope
+from mitransient_lidar.physics.lidar.level_sea import turn_by_slope
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState, WaveSpectrum
 
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].

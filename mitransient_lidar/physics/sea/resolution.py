@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mitransient_lidar.core.parameters.fields import AUTO, Read
-from mitransient_lidar.physics.lidar.divergence import read_divergence
+from mitransient_lidar.physics.lidar.lidar_geometry import read_divergence
 
 #: Shortest wave, and sides of cell and patch without a lidar [m].
 _DEFAULT_WAVE, _DEFAULT_CELL, _DEFAULT_SIZE = 1.0, 0.125, 32.0

@@ -24,7 +24,7 @@ from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, reach_of_maps
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose

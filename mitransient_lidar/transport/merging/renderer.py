@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import require_memory
-from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.layout import PATCH_PER_CELL, PHOTONS, MergingLayout, MergingOptions
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids

@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.medium.index_layers import coinciding
-from mitransient_lidar.transport.medium.snell import refract
+from mitransient_lidar.transport.medium.index_layers import coinciding, refract
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
