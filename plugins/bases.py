@@ -15,9 +15,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import Plugin, Read
 from mitransient_lidar.core.parameters.lidar import ANGLES
 from mitransient_lidar.core.validation import integer
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.receiver import (
@@ -283,6 +288,46 @@ class PassIntegrator(mi.CppADIntegrator):
         )
 
     render_backward = render_forward
+
+
+class LidarPassIntegrator(PassIntegrator):
+    """Integrator of lidar echoes."""
+
+    @abstractmethod
+    def renderer(
+        self, lidar: LidarScene, classes: PathClasses, layout_of: PassRenderer | None, connections: bool
+    ) -> PassRenderer:
+        """Return the pass renderer for the parts of a scene; other arguments as for `prepare`."""
+
+    def prepare(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        *,
+        classes: PathClasses | None = None,
+        receiver: Receiver | None = None,
+        layout_of: PassRenderer | None = None,
+        connections: bool = True,
+        axis: TimeAxis | None = None,
+    ) -> PassRenderer:
+        """Return the pass renderer for a scene, by default with one light class and the sensor's own receiver.
+
+        `axis` gives the start or number of time bins that the film leaves to the scene; without it they contain all
+        light (`find_lidar_scene`).
+
+        `layout_of` is another scene's renderer, whose time bins, points and cells are used. Scenes that differ by a
+        target, or slightly in a parameter, then make the same paths from the same seeds. Without `connections`, paths
+        that miss the target return the same light with and without it, except for light in full cells; errors with
+        narrow beams are larger.
+
+        Raises
+        ------
+        UserError
+            When the scene lacks a part or has one that is not supported.
+        """
+        axis = axis if layout_of is None else layout_of.scene.axis
+        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
+        return self.renderer(lidar, classes or PathClasses(), layout_of, connections)
 
 
 @closed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -149,36 +149,6 @@ _BOTTOM_PER_LARGEST = 0.25
 _MARGIN = 1e-3
 
 
-class _Bottoms:
-    """Bottoms of a scene in a box from `low` to `high` [m]."""
-
-    def __init__(self, shapes: list[mi.Shape]) -> None:
-        boxes = [box_of(shape) for shape in shapes]
-        self._shapes = shapes
-        self.low, self.high = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
-
-    @cached_property
-    def _scene(self) -> mi.Scene:
-        return scene_of_shapes(self._shapes, ())
-
-    def depths(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return depths [m] on grid lines [m], shape (len(y), len(x)): of the nearest place in the box, or `DEEP`."""
-        if self.low[2] == self.high[2]:
-            return np.full((len(y), len(x)), -self.low[2])
-        lines = (
-            np.clip(values, low + _MARGIN, high - _MARGIN)
-            for values, low, high in zip((x, y), self.low, self.high, strict=False)
-        )
-        east, north = (values.ravel() for values in np.meshgrid(*lines))
-        top = float(self.high[2]) + _MARGIN
-        origins = np.stack([east, north, np.full(east.size, top)], axis=1)
-        down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
-        found = self._scene.ray_intersect_preliminary(aligned_ray(origins, down, np.full(east.size, np.inf)))
-        distance = np.array(found.t, dtype=np.float64)
-        depth = np.where(np.isfinite(distance), distance - top, DEEP)
-        return np.asarray(depth.reshape(len(y), len(x)))
-
-
 def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
     """Return a scene's bottom depths in its frame, None without a bottom.
 
@@ -195,5 +165,25 @@ def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
     found = [shape for shape, side in zip(shapes, sides, strict=True) if side >= _BOTTOM_PER_LARGEST * largest]
     if not largest > 0:
         return None
-    bottoms = _Bottoms(found)
-    return BottomDepths(-float(bottoms.high[2]), bottoms.depths)
+    boxes = np.array([box_of(shape) for shape in found])
+    lowest, highest = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    alone = cache(partial(scene_of_shapes, tuple(found), ()))
+
+    def depths(x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return depths [m] on grid lines [m], shape (len(y), len(x)): of the nearest place in the box, or `DEEP`."""
+        if lowest[2] == highest[2]:
+            return np.full((len(y), len(x)), -lowest[2])
+        lines = (
+            np.clip(values, low + _MARGIN, high - _MARGIN)
+            for values, low, high in zip((x, y), lowest, highest, strict=False)
+        )
+        east, north = (values.ravel() for values in np.meshgrid(*lines))
+        top = float(highest[2]) + _MARGIN
+        origins = np.stack([east, north, np.full(east.size, top)], axis=1)
+        down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
+        met = alone().ray_intersect_preliminary(aligned_ray(origins, down, np.full(east.size, np.inf)))
+        distance = np.array(met.t, dtype=np.float64)
+        depth = np.where(np.isfinite(distance), distance - top, DEEP)
+        return np.asarray(depth.reshape(len(y), len(x)))
+
+    return BottomDepths(-float(highest[2]), depths)

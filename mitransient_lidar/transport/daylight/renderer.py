@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -163,9 +164,8 @@ class DaylightIntegrator(Protocol):
 
     plugin: str
     passive: bool
-
-    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
-        """Return the pass renderer for a scene."""
+    #: Returns the pass renderer for a scene.
+    prepare: Callable[[mi.Scene, mi.Sensor], DaylightRenderer]
 
 
 #: Least number of points along each field-of-view axis for the pixels' solid angles.
