@@ -41,10 +41,17 @@ from mitransient_lidar.core.files import check_regular, is_file_name, is_there, 
 from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, PLUGINS
 from mitransient_lidar.core.validation import FloatArray, shown
-from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
+from mitransient_lidar.loading.checks import (
+    GRID_PLUGINS,
+    PLY_PLUGINS,
+    check_grid,
+    check_ply,
+    is_transform,
+    matrix_of,
+    resource_folders,
+)
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
-from mitransient_lidar.loading.mesh_files import GRID_PLUGINS, PLY_PLUGINS, check_grid, check_ply
 from mitransient_lidar.loading.parameters import values_of
 from mitransient_lidar.loading.scene_json import from_json, to_json
 

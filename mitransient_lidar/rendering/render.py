@@ -241,8 +241,7 @@ def _render(
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
-    from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
-    from mitransient_lidar.rendering.differences import Differences
+    from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
 
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]

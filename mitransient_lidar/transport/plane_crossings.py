@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.merging.packed_store import PackedStore
+from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams

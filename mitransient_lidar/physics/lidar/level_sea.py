@@ -1,4 +1,7 @@
-"""Refraction by a level sea: angles, times and solid angles, and lines of sight that meet a depth or the sea level."""
+"""Refraction by a level sea: angles, times and solid angles, and lines of sight that meet a depth or the sea level.
+
+Angles are from the vertical, `theta` in air and `phi` in water; n is the index of water relative to air.
+"""
 
 from __future__ import annotations
 
