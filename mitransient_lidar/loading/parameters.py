@@ -33,27 +33,13 @@ _LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
 
 @dataclass(frozen=True)
 class ScenePlugin:
-    """A plugin from this package in a scene.
+    """A plugin from this package in a scene."""
 
-    Attributes
-    ----------
-    element
-        Element of the plugin.
-    declared
-        Declaration of its parameters.
-    settings
-        Attributes that set parameters, by parameter name.
-    ids
-        Ids of the plugin and of the objects around it, and the plugin's name.
-    is_fixed
-        Whether its parameters are an instrument's, and have no names.
-    """
-
-    element: minidom.Element
-    declared: Plugin
-    settings: Mapping[str, Setting]
-    ids: tuple[str, ...]
-    is_fixed: bool
+    element: minidom.Element  #: Element of the plugin.
+    declared: Plugin  #: Declaration of its parameters.
+    settings: Mapping[str, Setting]  #: Attributes that set parameters, by parameter name.
+    ids: tuple[str, ...]  #: Ids of the plugin and of the objects around it, and the plugin's name.
+    is_fixed: bool  #: Whether its parameters are an instrument's, and have no names.
 
     def names(self) -> Iterator[tuple[Parameter, list[str]]]:
         """Yield the parameters with their names: their own, unless it stands for others, and behind an id."""

@@ -67,34 +67,18 @@ _MOST_VALUES = 16
 
 @dataclass(frozen=True)
 class SceneSource:
-    """The information that loads a scene again.
+    """The information that loads a scene again."""
 
-    Parameters
-    ----------
-    name
-        Scene name.
-    text
-        XML with includes in place, or JSON of a dict.
-    is_xml
-        Whether the text is XML.
-    parameters
-        Own parameters of an XML scene with their values as text; for a result also the parameters that its plugins
-        declare.
-    files
-        Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
-    instrument
-        Name of an XML scene's instrument; empty if its laser and receiver are its own.
-    sensor
-        Id of a receiver in the scene; empty for the first one.
-    """
-
-    name: str
-    text: str
-    is_xml: bool
+    name: str  #: Scene name.
+    text: str  #: XML with includes in place, or JSON of a dict.
+    is_xml: bool  #: Whether the text is XML.
+    #: Own parameters of an XML scene with their values as text; for a result also the parameters that its plugins
+    #: declare.
     parameters: Mapping[str, str]
+    #: Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     files: Mapping[tuple[str, str], tuple[str, str]]
-    instrument: str = ""
-    sensor: str = ""
+    instrument: str = ""  #: Name of an XML scene's instrument; empty if its laser and receiver are its own.
+    sensor: str = ""  #: Id of a receiver in the scene; empty for the first one.
 
     @classmethod
     def of_document(cls, document: SceneDocument, former: SceneSource | None = None) -> SceneSource:

@@ -48,20 +48,13 @@ _REFLECTANCE = "_reflectance"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A scene parameter by which light is differentiated.
+    """A scene parameter by which light is differentiated."""
 
-    Attributes
-    ----------
-    name, value, units
-        Name, with the layer number in brackets where there are several; value and its unit.
-    perturbation
-        Path sums for the derivative; None for central differences.
-    """
-
+    #: Name, with the layer number in brackets where there are several; value and its unit.
     name: str
     value: float
     units: str
-    perturbation: Perturbation | None
+    perturbation: Perturbation | None  #: Path sums for the derivative; None for central differences.
 
     @property
     def method(self) -> str:

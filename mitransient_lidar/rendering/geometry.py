@@ -65,31 +65,17 @@ class Solid:
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """What a scene is in three dimensions, in its coordinates [m].
+    """What a scene is in three dimensions, in its coordinates [m]."""
 
-    Attributes
-    ----------
-    name
-        Name of the scene, and of its instrument.
-    box
-        Lowest and highest corner of the water about the footprints, shape (2, 3).
-    lidar
-        Where laser and receiver are, by name.
-    reliefs, solids
-        Sea and bottoms (`WaterScene.bottoms`) at even points of the box, and the targets that reach into it.
-    layers
-        Depths between layers of the water [m], with attenuations above and below each [1/m], shape (n, 3).
-    bundles
-        Beam and pixels.
-    """
-
-    name: str
-    box: FloatArray
-    lidar: dict[str, FloatArray]
+    name: str  #: Name of the scene, and of its instrument.
+    box: FloatArray  #: Lowest and highest corner of the water about the footprints, shape (2, 3).
+    lidar: dict[str, FloatArray]  #: Where laser and receiver are, by name.
+    #: Sea and bottoms (`WaterScene.bottoms`) at even points of the box, and the targets that reach into it.
     reliefs: list[Relief]
     solids: list[Solid]
+    #: Depths between layers of the water [m], with attenuations above and below each [1/m], shape (n, 3).
     layers: FloatArray
-    bundles: list[Bundle]
+    bundles: list[Bundle]  #: Beam and pixels.
 
     @property
     def spacing(self) -> float:
@@ -225,27 +211,14 @@ _SMALLEST_DESCENT, _ASIDE = 1e-3, (1e-4, 0.7e-4, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Rays along the outlines of a beam or a pixel, refracted as by a level sea.
+    """Rays along the outlines of a beam or a pixel, refracted as by a level sea."""
 
-    Attributes
-    ----------
-    name
-        What the outline is of.
-    kind
-        ``beam``, ``pixel``, or ``lines`` between the pixels of an imager.
-    azimuth
-        Direction of the axis of the lidar, from +x to +y [rad].
-    angles
-        Full angles along angle_x and angle_y [rad].
-    loops
-        Points x, y, z of each outline in the scene [m], shape (levels, n, 3): the lidar, the sea surface, boundaries of
-        index layers, and the solid that the ray meets first, or the depth at which it ends.
-    """
-
-    name: str
-    kind: str
-    azimuth: float
-    angles: tuple[float, float]
+    name: str  #: What the outline is of.
+    kind: str  #: ``beam``, ``pixel``, or ``lines`` between the pixels of an imager.
+    azimuth: float  #: Direction of the axis of the lidar, from +x to +y [rad].
+    angles: tuple[float, float]  #: Full angles along angle_x and angle_y [rad].
+    #: Points x, y, z of each outline in the scene [m], shape (levels, n, 3): the lidar, the sea surface, boundaries of
+    #: index layers, and the solid that the ray meets first, or the depth at which it ends.
     loops: list[FloatArray]
 
     def size(self, level: int) -> tuple[float, float]:

@@ -32,49 +32,30 @@ Sums = list[Any]
 
 @dataclass(frozen=True)
 class LayerChange:
-    """A perturbation's additions per metre and per scattering event between two depths.
+    """A perturbation's additions per metre and per scattering event between two depths."""
 
-    Attributes
-    ----------
-    top, bottom
-        Depths [m], -inf and inf for no limit.
-    per_metre, per_event
-        Addition for each metre travelled [1/m], and for each scattering event by water.
-    by_angle
-        Addition by scattering angle for each of these events, at nodes that are uniform in ln s from `DEFAULT_LOG_S0`
-        to 0 with s = sin^2(theta/2), shape (DEFAULT_COUNT,); or None.
-    """
-
+    #: Depths [m], -inf and inf for no limit.
     top: float
     bottom: float
+    #: Addition for each metre travelled [1/m], and for each scattering event by water.
     per_metre: float = 0.0
     per_event: float = 0.0
+    #: Addition by scattering angle for each of these events, at nodes that are uniform in ln s from `DEFAULT_LOG_S0` to
+    #: 0 with s = sin^2(theta/2), shape (DEFAULT_COUNT,); or None.
     by_angle: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A change in water and solids by a parameter: the derivative of a path contribution's logarithm.
+    """A change in water and solids by a parameter: the derivative of a path contribution's logarithm."""
 
-    Attributes
-    ----------
-    layers
-        Additions by water between depths.
-    solids
-        Solids with the addition by each reflection.
-    focusing
-        Derivative of `RippleFocusing.factors`; None where they do not change.
-    ripples
-        Sea ripples with the parameter below and above its value, and the difference between these values; None where
-        they do not change.
-    beam
-        Change in a Gaussian beam's logarithmic widths with the parameter; None where they do not change.
-    """
-
-    layers: tuple[LayerChange, ...] = ()
-    solids: tuple[tuple[mi.Shape, float], ...] = ()
-    focusing: FloatArray | None = None
+    layers: tuple[LayerChange, ...] = ()  #: Additions by water between depths.
+    solids: tuple[tuple[mi.Shape, float], ...] = ()  #: Solids with the addition by each reflection.
+    focusing: FloatArray | None = None  #: Derivative of `RippleFocusing.factors`; None where they do not change.
+    #: Sea ripples with the parameter below and above its value, and the difference between these values; None where
+    #: they do not change.
     ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
+    #: Change in a Gaussian beam's logarithmic widths with the parameter; None where they do not change.
     beam: float | None = None
 
 

@@ -70,43 +70,23 @@ class ScenePart:
 
 @dataclass(frozen=True)
 class WaterScene:
-    """Receiver, water and sea surface in a scene.
-
-    Attributes
-    ----------
-    mitsuba_scene
-        The Mitsuba scene.
-    receiver
-        Pose, aperture and pixels of the sensor.
-    water
-        Its water, or None in a scene without water.
-    surfaces
-        Shapes that bound the water, with it as interior medium.
-    slope_variance
-        Total slope variance of the sea, for sampling surface connections.
-    parts
-        Scene parts at locations that differ between shots, in place of `mitsuba_scene`; none for a single shot.
-    receiver_poses
-        Pose of the receiver in each shot, where they differ.
-    perturbations
-        Changes of water and solids whose effect on each path is summed.
-    groups
-        Shape groups that instances repeat.
-    interpolates
-        Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
-    """
+    """Receiver, water and sea surface in a scene."""
 
     OF_SHOTS: ClassVar[tuple[str, ...]] = ("parts", "receiver_poses")
 
-    mitsuba_scene: mi.Scene
-    receiver: Receiver
-    water: Water | None
-    surfaces: list[mi.Shape]
-    slope_variance: float
+    mitsuba_scene: mi.Scene  #: The Mitsuba scene.
+    receiver: Receiver  #: Pose, aperture and pixels of the sensor.
+    water: Water | None  #: Its water, or None in a scene without water.
+    surfaces: list[mi.Shape]  #: Shapes that bound the water, with it as interior medium.
+    slope_variance: float  #: Total slope variance of the sea, for sampling surface connections.
+    #: Scene parts at locations that differ between shots, in place of `mitsuba_scene`; none for a single shot.
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
+    #: Pose of the receiver in each shot, where they differ.
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
+    #: Changes of water and solids whose effect on each path is summed.
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
-    groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)
+    groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)  #: Shape groups that instances repeat.
+    #: Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
     interpolates: bool = field(default=False, kw_only=True)
 
     def with_parts_of(self, shapes: Sequence[mi.Shape]) -> Self:
@@ -413,28 +393,15 @@ class WaterScene:
 
 @dataclass(frozen=True)
 class LidarScene(WaterScene):
-    """A scene with a transmitter, and a receiver that records the time of arrival.
-
-    Attributes
-    ----------
-    transmitter
-        The ``lidar_transmitter``.
-    axis
-        Time bins of the record.
-    record_end
-        Source of the last light in the record, where the scene decides its end.
-    gates
-        Gates of the ``time_gated_film``, or None.
-    transmitter_poses
-        Pose of the transmitter in each shot, where they differ.
-    """
+    """A scene with a transmitter, and a receiver that records the time of arrival."""
 
     OF_SHOTS = (*WaterScene.OF_SHOTS, "transmitter_poses")
 
-    transmitter: Transmitter
-    axis: TimeAxis
-    gates: GatePlan | None
-    record_end: str = ""
+    transmitter: Transmitter  #: The ``lidar_transmitter``.
+    axis: TimeAxis  #: Time bins of the record.
+    gates: GatePlan | None  #: Gates of the ``time_gated_film``, or None.
+    record_end: str = ""  #: Source of the last light in the record, where the scene decides its end.
+    #: Pose of the transmitter in each shot, where they differ.
     transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
 
     @property

@@ -47,21 +47,11 @@ _NS_PER_M = 1e9 / C0
 
 @dataclass(frozen=True, eq=False)
 class Cone:
-    """Directions in the air within a laser beam or a field of view.
+    """Directions in the air within a laser beam or a field of view."""
 
-    Parameters
-    ----------
-    pose
-        Position above the sea level, and axis.
-    half_angles
-        Half angles along the two tangent-plane angles [rad].
-    is_round
-        Whether the cross-section is an ellipse instead of a rectangle.
-    """
-
-    pose: Pose
-    half_angles: tuple[float, float]
-    is_round: bool = True
+    pose: Pose  #: Position above the sea level, and axis.
+    half_angles: tuple[float, float]  #: Half angles along the two tangent-plane angles [rad].
+    is_round: bool = True  #: Whether the cross-section is an ellipse instead of a rectangle.
 
     def places(self, z: float, reach: float) -> FloatArray:
         """Return where its directions meet a height [m], x, y [m]; beyond `reach` [m] and above the horizon there."""
@@ -136,28 +126,17 @@ class AxisLimits:
 
 @dataclass(frozen=True, eq=False)
 class LidarView:
-    """Lidar geometry over a sea.
+    """Lidar geometry over a sea."""
 
-    Parameters
-    ----------
-    view, beam
-        Field of view with its blur, and beam.
-    sea, decay
-        Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
-    heights
-        Lowest and highest sea height [m].
-    reach
-        Horizontal distance to the end of the scene [m], where light towards the horizon ends.
-    column
-        Least depth of the last light from water without a bottom [m], such as light from bubbles; None without water.
-    """
-
+    #: Field of view with its blur, and beam.
     view: Cone
     beam: Cone
+    #: Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
     sea: LevelSea
     decay: WaterColumn
-    heights: tuple[float, float]
-    reach: float
+    heights: tuple[float, float]  #: Lowest and highest sea height [m].
+    reach: float  #: Horizontal distance to the end of the scene [m], where light towards the horizon ends.
+    #: Least depth of the last light from water without a bottom [m], such as light from bubbles; None without water.
     column: float | None
 
     def limits(self, solids: Sequence[Solid], direct: bool = False, dry: bool = False) -> AxisLimits:

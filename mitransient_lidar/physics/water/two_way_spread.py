@@ -39,28 +39,17 @@ class TwoWaySpread:
     All are relative to the straight path along the axis, which is tilted towards +x, and sorted by displacement. The
     mean of a weight is the energy of scattered light over (1 - q^2) times that of light that meets absorption alone,
     where q is the share of light that no event has turned on one way.
-
-    Attributes
-    ----------
-    depths
-        Depths [m], increasing, shape (depths,).
-    shift_x, shift_y
-        Displacement of the straight way that the light came down beside, from that in which it is seen [m].
-    excess
-        Length of the path beyond the straight one [m].
-    of_bottom, of_water
-        Weights of light that a horizontal Lambertian plane has turned, and that one scattering event has turned [1].
-    events
-        Number of scattering events without that one.
     """
 
-    depths: FloatArray
+    depths: FloatArray  #: Depths [m], increasing, shape (depths,).
+    #: Displacement of the straight way that the light came down beside, from that in which it is seen [m].
     shift_x: FloatArray
     shift_y: FloatArray
-    excess: FloatArray
+    excess: FloatArray  #: Length of the path beyond the straight one [m].
+    #: Weights of light that a horizontal Lambertian plane has turned, and that one scattering event has turned [1].
     of_bottom: FloatArray
     of_water: FloatArray
-    events: IntArray
+    events: IntArray  #: Number of scattering events without that one.
 
     @classmethod
     def of_column(

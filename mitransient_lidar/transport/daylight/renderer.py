@@ -36,24 +36,14 @@ _LONG, _LONG_SURVIVAL = 100, 0.9
 
 @dataclass
 class ReceivedDaylight:
-    """Daylight in one pass.
+    """Daylight in one pass."""
 
-    Attributes
-    ----------
-    found
-        Each pixel's radiance times solid angle [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
-    sampled
-        Solid angle that each pixel's samples represent [sr], shape (pixels,).
-    edge_loss
-        Radiance times solid angle that would have been found if the surface mesh did not end, shape (1,).
-    rays
-        Number of traced rays.
-    """
-
+    #: Each pixel's radiance times solid angle [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
     found: mi.Float64
-    sampled: mi.Float64
+    sampled: mi.Float64  #: Solid angle that each pixel's samples represent [sr], shape (pixels,).
+    #: Radiance times solid angle that would have been found if the surface mesh did not end, shape (1,).
     edge_loss: mi.Float64
-    rays: mi.Float64
+    rays: mi.Float64  #: Number of traced rays.
 
 
 class DaylightLight(PathLight):

@@ -21,14 +21,9 @@ _SAME_DIRECTION_DEG = 0.05
 
 @dataclass(frozen=True)
 class DaylightScene(WaterScene):
-    """A scene lit by sun and sky.
+    """A scene lit by sun and sky."""
 
-    Attributes
-    ----------
-    sun, sky
-        The ``sun`` and the ``sky`` plugins, None where there is none; at least one is present.
-    """
-
+    #: The ``sun`` and the ``sky`` plugins, None where there is none; at least one is present.
     sun: SunEmitter | None
     sky: SkyEmitter | None
 

@@ -18,23 +18,14 @@ class BubblePlume:
 
     They scatter and do not absorb. A flight ends at the first event by bubbles or water layers, which is exact for
     their sum.
-
-    Parameters
-    ----------
-    scattering
-        Scattering coefficient of the bubbles [1/m], 0 to 1000, added to the water's.
-    x, y
-        Start of the plume, at the stern [m], -1e7 to 1e7.
-    bearing
-        Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
-    length, width, depth
-        Plume extent [m].
     """
 
-    scattering: float
+    scattering: float  #: Scattering coefficient of the bubbles [1/m], 0 to 1000, added to the water's.
+    #: Start of the plume, at the stern [m], -1e7 to 1e7.
     x: float
     y: float
-    bearing: float
+    bearing: float  #: Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
+    #: Plume extent [m].
     length: float
     width: float
     depth: float
@@ -109,17 +100,11 @@ class BubbleLayer:
     """Bubbles everywhere, whose scattering falls with depth as exp(-z / depth); even above the mean sea level.
 
     They scatter and do not absorb, and have the interface of `BubblePlume`.
-
-    Parameters
-    ----------
-    scattering
-        Scattering coefficient of the bubbles at the mean sea level [1/m], at most 1000, added to the water's.
-    depth
-        Depth at which it has fallen to 1/e [m], 0.05 to 20.
     """
 
+    #: Scattering coefficient of the bubbles at the mean sea level [1/m], at most 1000, added to the water's.
     scattering: float
-    depth: float
+    depth: float  #: Depth at which it has fallen to 1/e [m], 0.05 to 20.
 
     def scattering_at(self, point: mi.Point3f) -> mi.Float:
         """Return the scattering coefficient of the bubbles at a point [1/m]."""

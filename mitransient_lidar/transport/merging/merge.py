@@ -170,24 +170,15 @@ _TOLERANCE, _RELATIVE_TOLERANCE = 1e-3, 1e-4
 
 @dataclass(frozen=True)
 class ConnectionRates:
-    """Rates at which merges and connections in a pass find the same path.
-
-    Attributes
-    ----------
-    cells
-        Cells, whose volumes are the merge rates.
-    in_water, on_solids
-        Share of point pairs, and of pairs of points and photons on solids, that are connected.
-    per_path
-        Number of connections per receiver path, with points and with photons on solids; 0 for none.
-    """
+    """Rates at which merges and connections in a pass find the same path."""
 
     OF_SHOTS = ("cells",)
 
-    cells: WaterCells | SphericalCells
+    cells: WaterCells | SphericalCells  #: Cells, whose volumes are the merge rates.
+    #: Share of point pairs, and of pairs of points and photons on solids, that are connected.
     in_water: mi.Float
     on_solids: mi.Float
-    per_path: int
+    per_path: int  #: Number of connections per receiver path, with points and with photons on solids; 0 for none.
 
     @classmethod
     def of_pass(

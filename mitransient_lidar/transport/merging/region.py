@@ -170,28 +170,18 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Grids with equal cells over a region, one per shot location, and values in their cells.
-
-    Attributes
-    ----------
-    values, kind
-        Values in all cells, and their type.
-    low, per_metre
-        Grid corner for each shot [m], and inverse cell sides [1/m].
-    cells
-        Cells per side.
-    start
-        First cell number for each shot.
-    """
+    """Grids with equal cells over a region, one per shot location, and values in their cells."""
 
     OF_SHOTS = ("low", "start")
 
+    #: Values in all cells, and their type.
     values: mi.Float
     kind: type[mi.Float] | type[mi.UInt32]
+    #: Grid corner for each shot [m], and inverse cell sides [1/m].
     low: mi.Point2f
     per_metre: mi.Point2f
-    cells: int
-    start: mi.UInt32
+    cells: int  #: Cells per side.
+    start: mi.UInt32  #: First cell number for each shot.
 
     def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or at the nearest point; and offsets from the cell centres [m]."""

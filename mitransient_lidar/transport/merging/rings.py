@@ -68,23 +68,15 @@ def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float,
 
 @dataclass(frozen=True)
 class RingSector:
-    """Sector of a ring.
+    """Sector of a ring."""
 
-    Attributes
-    ----------
-    ring, number
-        Ring number, counted outwards, and number of the sector in it.
-    inner, outer
-        Ring radii [m].
-    share
-        Inverse of the number of sectors in the ring.
-    """
-
+    #: Ring number, counted outwards, and number of the sector in it.
     ring: mi.UInt32
     number: mi.UInt32
+    #: Ring radii [m].
     inner: mi.Float
     outer: mi.Float
-    share: mi.Float
+    share: mi.Float  #: Inverse of the number of sectors in the ring.
 
 
 class BeamRings:

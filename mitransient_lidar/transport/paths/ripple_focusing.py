@@ -38,18 +38,11 @@ _SAMPLES = 1000
 
 @dataclass(frozen=True)
 class Echo:
-    """Where paths have turned.
+    """Where paths have turned."""
 
-    Attributes
-    ----------
-    surface_length
-        Relative optical length by the point of the sea that the path has crossed [m], `Path.surface_length`.
-    on_solid
-        Whether they have met a solid.
-    """
-
+    #: Relative optical length by the point of the sea that the path has crossed [m], `Path.surface_length`.
     surface_length: mi.Float
-    on_solid: mi.Bool | bool
+    on_solid: mi.Bool | bool  #: Whether they have met a solid.
 
 
 class RippleFocusing:

@@ -33,27 +33,14 @@ IMAGE_PIXELS = 4096
 
 @dataclass(frozen=True)
 class ReceiverOptics:
-    """Receiver aperture and losses.
+    """Receiver aperture and losses."""
 
-    Parameters
-    ----------
-    aperture_area
-        Area [m^2] normal to every ray of the (small) field of view, 1e-12 to 1000.
-    optical_efficiency
-        Share of the collected light that reaches the detector, above 0 to 1.
-    two_way_atmospheric_transmittance
-        Share of the light that the air transmits both ways, above 0 to 1.
-    response_time_ns
-        Time constant of the receiver's exponential (single-pole) impulse response [ns], at most 1e6; 0 is ideal.
-    obscuration
-        Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
-    """
-
-    aperture_area: float
-    optical_efficiency: float
-    two_way_atmospheric_transmittance: float
+    aperture_area: float  #: Area [m^2] normal to every ray of the (small) field of view, 1e-12 to 1000.
+    optical_efficiency: float  #: Share of the collected light that reaches the detector, above 0 to 1.
+    two_way_atmospheric_transmittance: float  #: Share of the light that the air transmits both ways, above 0 to 1.
+    #: Time constant of the receiver's exponential (single-pole) impulse response [ns], at most 1e6; 0 is ideal.
     response_time_ns: float
-    obscuration: float = 0.0
+    obscuration: float = 0.0  #: Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
 
     @property
     def collection(self) -> float:
@@ -108,20 +95,13 @@ def solid_angle_factor(angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True)
 class SensorSample:
-    """One field-of-view sample for every path.
+    """One field-of-view sample for every path."""
 
-    Attributes
-    ----------
-    angles, direction, pixel
-        Tangent-plane angles and unit direction of the ray, and index of the pixel that sees it.
-    weight
-        Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
-    """
-
+    #: Tangent-plane angles and unit direction of the ray, and index of the pixel that sees it.
     angles: mi.Point2f
     direction: mi.Vector3f
     pixel: mi.UInt32
-    weight: mi.Float
+    weight: mi.Float  #: Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
 
     @classmethod
     def at(cls, pose: KernelPose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
