@@ -29,24 +29,14 @@ _SMALLEST_ISLAND = 0.02
 
 
 class BeamProfile(ABC):
-    """Beam energy over the tangent plane, normalised to 1.
+    """Beam energy over the tangent plane, normalised to 1."""
 
-    Attributes
-    ----------
-    spreads
-        Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
-    rotation
-        Azimuth of the first axis, from +angle_x towards +angle_y [rad].
-    divergence
-        Full angles along these axes [rad], as defined for the transmitter parameter ``divergence_mrad``.
-    reach
-        Angle from the optical axis that contains all of the energy but 4e-6 [rad].
-    """
-
+    #: Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
     spreads: tuple[float, float]
-    rotation: float
+    rotation: float  #: Azimuth of the first axis, from +angle_x towards +angle_y [rad].
+    #: Full angles along these axes [rad], as defined for the transmitter parameter ``divergence_mrad``.
     divergence: tuple[float, float]
-    reach: float
+    reach: float  #: Angle from the optical axis that contains all of the energy but 4e-6 [rad].
 
     @abstractmethod
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:

@@ -73,18 +73,10 @@ class VolpathOptions:
 
 
 class PathLight:
-    """Emitters to which the vertices of paths are connected, and the light received from them.
+    """Emitters to which the vertices of paths are connected, and the light received from them."""
 
-    Attributes
-    ----------
-    sampler
-        Samples directions under water towards the emitter.
-    weight
-        Light weight of each path.
-    """
-
-    sampler: RefractedEmitterSampler
-    weight: mi.Float
+    sampler: RefractedEmitterSampler  #: Samples directions under water towards the emitter.
+    weight: mi.Float  #: Light weight of each path.
 
     #: Whether the emitter is under water, where straight lines reach it.
     submerged = False

@@ -38,32 +38,15 @@ _CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
 
 
 class PixelArray(ABC):
-    """A receiver's pixels in tangent-plane angles [rad].
+    """A receiver's pixels in tangent-plane angles [rad]."""
 
-    Attributes
-    ----------
-    names
-        One name a pixel.
-    layout
-        ``RxC``, ``hexN``, ``map`` or ``nested``.
-    grid
-        (rows, columns) of an imager, else None.
-    area
-        Area in which `sample` is uniform, counted once a pixel where pixels overlap [rad^2].
-    field_of_view
-        Full angle that contains all pixels [rad]: diameter or side about the axis.
-    field_of_view_shape
-        ``circle``, ``square``, ``rectangle`` or ``nested``.
-    sides
-        Full angles along angle_x and angle_y [rad] for rows and columns of pixels, else None.
-    """
-
-    names: list[str]
-    layout: str
-    grid: tuple[int, int] | None
-    area: float
-    field_of_view: float
-    field_of_view_shape: str
+    names: list[str]  #: One name a pixel.
+    layout: str  #: ``RxC``, ``hexN``, ``map`` or ``nested``.
+    grid: tuple[int, int] | None  #: (rows, columns) of an imager, else None.
+    area: float  #: Area in which `sample` is uniform, counted once a pixel where pixels overlap [rad^2].
+    field_of_view: float  #: Full angle that contains all pixels [rad]: diameter or side about the axis.
+    field_of_view_shape: str  #: ``circle``, ``square``, ``rectangle`` or ``nested``.
+    #: Full angles along angle_x and angle_y [rad] for rows and columns of pixels, else None.
     sides: tuple[float, float] | None = None
 
     @property
