@@ -236,10 +236,7 @@ class PassIntegrator(mi.CppADIntegrator):
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> Any:
         """Return the pass renderer for a scene (`PassRenderer` or `DaylightRenderer`).
 
-        Raises
-        ------
-        UserError
-            When the scene lacks a part or has one that the integrator does not support.
+        Raises UserError when the scene lacks a part or has one that the integrator does not support.
         """
 
     def develop(self, received: Any, sensor: mi.Sensor) -> mi.TensorXf:
@@ -320,10 +317,7 @@ class LidarPassIntegrator(PassIntegrator):
         that miss the target return the same light with and without it, except for light in full cells; errors with
         narrow beams are larger.
 
-        Raises
-        ------
-        UserError
-            When the scene lacks a part or has one that is not supported.
+        Raises UserError when the scene lacks a part or has one that is not supported.
         """
         axis = axis if layout_of is None else layout_of.scene.axis
         lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)

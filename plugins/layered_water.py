@@ -121,6 +121,8 @@ def _read_water(
 ) -> Water:
     """Return the water that parameters describe.
 
+    Raises UserError when a value is not allowed, or two parameters describe one thing.
+
     Parameters
     ----------
     props
@@ -129,11 +131,6 @@ def _read_water(
         Phase functions by name, one for all layers or one for each; may be empty.
     bubbles
         Phase function of the bubbles; None for the one by ``plume_backscatter_ratio`` or ``bubble_backscatter``.
-
-    Raises
-    ------
-    UserError
-        When a value is not allowed, or two parameters describe one thing.
     """
     check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
     read = props.read

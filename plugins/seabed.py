@@ -56,10 +56,8 @@ class Patch:
 class Bottom:
     """Height and reflectance of a bottom, with the `Seabed` parameters as attributes.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range, the height map cannot be read, or cells are too coarse or too many.
+    Raises UserError if a parameter lies outside its range, the height map cannot be read, or cells are too coarse or
+    too many.
     """
 
     def __init__(self, read: Read) -> None:

@@ -74,12 +74,9 @@ _AT_ONE_WAVELENGTH = "must be one number, the value at the laser's wavelength: o
 def check(document: SceneDocument) -> None:
     """Check the object types and the numbers in an XML scene, with its parameter values in place.
 
-    Raises
-    ------
-    UserError
-        If the root is no scene; a type is not the name of a plugin; a plugin library lies in a folder of
-        `document.folders` where `check_libraries` forbids it; a number is not finite, not a number or out of its
-        declared range, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
+    Raises UserError if the root is no scene; a type is not the name of a plugin; a plugin library lies in a folder of
+    `document.folders` where `check_libraries` forbids it; a number is not finite, not a number or out of its declared
+    range, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
     """
     root = document.root
     if root.tagName != "scene" or root.getAttribute("type") not in ("", "scene"):

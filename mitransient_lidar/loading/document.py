@@ -138,10 +138,8 @@ def read_document(path: Path) -> SceneDocument:
 
     Names of included files are relative to the file that names them and contain no parameters.
 
-    Raises
-    ------
-    UserError
-        If a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than 256.
+    Raises UserError if a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than
+    256.
     """
     text = read_text(path)
     if parse_part(text, path).getElementsByTagName("include"):
@@ -206,10 +204,7 @@ def _drop_repeated(root: minidom.Element) -> None:
 def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
     """Return a text with parameters in place, the longest names first, and those that it refers to.
 
-    Raises
-    ------
-    UserError
-        If the text becomes longer than a million characters.
+    Raises UserError if the text becomes longer than a million characters.
     """
     referred: list[str] = []
     while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):

@@ -112,10 +112,7 @@ class SceneSource:
         A missing or changed file is looked for by its name and SHA-256 in the result's `folder`, and in the working
         folder.
 
-        Raises
-        ------
-        UserError
-            If the attributes contain no scene, or are damaged, or the scene's name is no file name.
+        Raises UserError if the attributes contain no scene, or are damaged, or the scene's name is no file name.
         """
         kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
         if not kinds:
@@ -176,10 +173,7 @@ class SceneSource:
     def place_files(self, document: SceneDocument) -> str:
         """Return a scene's XML without parameters, with the paths of its files.
 
-        Raises
-        ------
-        UserError
-            If a file is missing or has changed.
+        Raises UserError if a file is missing or has changed.
         """
         paths = {id(setting): str(folder) for setting, folder in document.paths.items()}
         for plugin, setting in _files_of(document):

@@ -78,6 +78,8 @@ class Canopy:
     def leaves(self, side: float, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return leaves on a level square about x = y = 0 at z = 0, drawn at random.
 
+        Raises UserError if they exceed the memory.
+
         Parameters
         ----------
         side
@@ -90,11 +92,6 @@ class Canopy:
         feet, width, length : ndarray
             Middle of each leaf's lower edge [m], and vectors along that edge and away from it, as long as the leaf is
             wide and long [m]; shape (leaves, 3).
-
-        Raises
-        ------
-        UserError
-            If they exceed the memory.
         """
         count = round(self.density * side * side)
         what = f"{count} leaves of leaf_area_index = {self.leaf_area_index:g} within size = {side:g} m"

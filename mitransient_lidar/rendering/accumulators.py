@@ -335,11 +335,8 @@ def choose_accumulator(
     and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of passes is
     kept, too. With a standard deviation [pixels], gate images are smoothed and nothing else is kept.
 
-    Raises
-    ------
-    UserError
-        If images without rows, columns or gates would be smoothed, a histogram without gates or a single gate exceeds
-        the memory, or gates by depth have no surface.
+    Raises UserError if images without rows, columns or gates would be smoothed, a histogram without gates or a single
+    gate exceeds the memory, or gates by depth have no surface.
     """
     from mitransient_lidar.transport.paths.histogram import TransientHistogram
 

@@ -70,10 +70,7 @@ def path_parameters(
     `others` are the scene parameters, with their values as text; those without path sums are left to central
     differences; none by default.
 
-    Raises
-    ------
-    UserError
-        If a name is unknown or given twice, or the light does not depend on the parameter.
+    Raises UserError if a name is unknown or given twice, or the light does not depend on the parameter.
     """
     if not isinstance(names, (str, Sequence)):
         raise UserError(f"derivatives = {shown(names)} must be names of parameters")
@@ -246,6 +243,9 @@ class Differences:
     (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), in `fig15_2x2` 8 (``layer_tops[1]``). Light that does not
     reach a moving bottom or target is the same.
 
+    Raises UserError if the scene is not an XML scene; a parameter is unknown, not a number, or belongs to record, gates
+    or seeds; or a step is for another parameter, not positive, or leads to a value that the scene refuses.
+
     Parameters
     ----------
     session
@@ -270,12 +270,6 @@ class Differences:
         pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
     gates
         Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate).
-
-    Raises
-    ------
-    UserError
-        If the scene is not an XML scene; a parameter is unknown, not a number, or belongs to record, gates or seeds; or
-        a step is for another parameter, not positive, or leads to a value that the scene refuses.
     """
 
     def __init__(

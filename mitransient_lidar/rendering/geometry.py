@@ -87,10 +87,7 @@ class SceneGeometry:
 def scene_geometry(loaded: LoadedScene) -> SceneGeometry:
     """Return the geometry of a loaded scene, as rays of its renderer meet it.
 
-    Raises
-    ------
-    UserError
-        As `scene_parts.find_solids`.
+    Raises UserError as `scene_parts.find_solids`.
     """
     scene = find_solids(loaded.scene, find_receiver(loaded.sensor))
     transmitter = next((one for one in loaded.scene.emitters() if isinstance(one, Transmitter)), None)

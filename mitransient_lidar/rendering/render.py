@@ -183,6 +183,9 @@ def render(
 def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.Dataset:
     """Render a result again: the same bits on the same machine, unless options change it.
 
+    Raises UserError if the result does not contain its scene, a file of the scene has changed, shots were selected or
+    reordered, or an option is invalid.
+
     Parameters
     ----------
     result
@@ -197,12 +200,6 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     -------
     xarray.Dataset
         As from the function that rendered the result.
-
-    Raises
-    ------
-    UserError
-        If the result does not contain its scene, a file of the scene has changed, shots were selected or reordered, or
-        an option is invalid.
     """
     import xarray
 

@@ -44,10 +44,7 @@ def fitted_axis(
 
     `shifts` are horizontal displacements of a lidar above water [m]: the bins contain the light at all its positions.
 
-    Raises
-    ------
-    UserError
-        If the bins are too many.
+    Raises UserError if the bins are too many.
     """
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns

@@ -235,10 +235,8 @@ class WaterScene:
     def gate_train(self, plan: GatePlan) -> GateTrain:
         """Return the gates of a plan at their times, which waves do not change.
 
-        Raises
-        ------
-        UserError
-            If they start at a depth, and the receiver's axis does not meet the mean sea level, or is level under water.
+        Raises UserError if they start at a depth, and the receiver's axis does not meet the mean sea level, or is level
+        under water.
         """
         pose, start = self.receiver.pose, plan.start
         meets_sea = bool(self.surfaces) and pose.looks_down

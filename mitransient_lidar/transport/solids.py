@@ -52,10 +52,7 @@ def children(parent: mi.Object) -> list[mi.Object]:
 def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
     """Return the shape groups that a scene's instances repeat.
 
-    Raises
-    ------
-    UserError
-        If one of them bounds a medium.
+    Raises UserError if one of them bounds a medium.
     """
     groups = tuple(child for child in children(scene) if child.class_name().startswith("ShapeGroup"))
     for group in groups:

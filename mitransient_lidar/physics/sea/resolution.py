@@ -100,6 +100,8 @@ class Resolution:
     def read(cls, read: Read, footprints: Sequence[Footprint]) -> Resolution:
         """Read the parameters of the plugin ``ocean_surface``, and choose those that are ``auto``.
 
+        Raises UserError if a value is not positive or out of range.
+
         Parameters
         ----------
         read
@@ -107,11 +109,6 @@ class Resolution:
         footprints
             Footprints of the lasers and receivers above the sea. Values of the parameters ``altitude``,
             ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
-
-        Raises
-        ------
-        UserError
-            If a value is not positive or out of range.
         """
         names = ("cell_size", "refined_size", "size", "shortest_wave")
         cell, side, size, wave = (None if value == AUTO else value for value in map(read, names))

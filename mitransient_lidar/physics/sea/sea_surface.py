@@ -111,6 +111,8 @@ class SeaSurface:
     ) -> SeaSurface:
         """Build a sea from the parameters of the plugin ``ocean_surface``.
 
+        Raises UserError if a parameter is out of range, or a file cannot be read.
+
         Parameters
         ----------
         read
@@ -121,11 +123,6 @@ class SeaSurface:
             Whether to check the parameters only, and return a sea without waves.
         depths
             Depths that waves shall follow (see `followed_depths`), None for deep water.
-
-        Raises
-        ------
-        UserError
-            If a parameter is out of range, or a file cannot be read.
         """
         spectrum, wind_speed = read("spectrum"), read("wind_speed")
         wind_speed = wind_speed if wind_speed >= _CALM else 0.0

@@ -31,10 +31,7 @@ class DaylightScene(WaterScene):
     def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor) -> DaylightScene:
         """Find the parts in a loaded scene. A ``lidar_transmitter`` may be present and is ignored.
 
-        Raises
-        ------
-        UserError
-            When a part is missing, not supported, or there are several where one is allowed.
+        Raises UserError when a part is missing, not supported, or there are several where one is allowed.
         """
         fit_seas(scene)
         receiver = find_receiver(sensor)

@@ -22,17 +22,14 @@ class IndexLayers:
     Light at the boundary of two index layers is refracted by Snell's law, or reflected totally. The partial reflection
     (5e-6 at vertical incidence between fresh and sea water) is neglected.
 
+    Raises UserError if there are more than 16 index layers.
+
     Parameters
     ----------
     layer_tops
         Upper edge depths of the water layers [m], shape (layers,).
     refractive_index, group_index
         Indices of the water layers, shape (layers,).
-
-    Raises
-    ------
-    UserError
-        If there are more than 16 index layers.
     """
 
     def __init__(self, layer_tops: np.ndarray, refractive_index: np.ndarray, group_index: np.ndarray) -> None:

@@ -89,10 +89,7 @@ class LayerPhases:
     def functions(self) -> list[mi.PhaseFunction]:
         """Return one phase function a layer, the same object where layers share it.
 
-        Raises
-        ------
-        UserError
-            When nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
+        Raises UserError when nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
         """
         column, nested, count = self.column, self.nested, self.column.count
         share = np.divide(self.water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)

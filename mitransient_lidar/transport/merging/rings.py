@@ -40,6 +40,8 @@ _LONGEST, _WIDEST_BEAM = 0.3, 500.0
 def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float, float]:
     """Return the nearest possible cell width for rings about a beam, and the largest width in water.
 
+    Raises UserError if the beam is too wide for automatic cells.
+
     Parameters
     ----------
     given
@@ -48,11 +50,6 @@ def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float,
         Beam standard deviation there [m].
     attenuation
         Beam attenuation of the water [1/m].
-
-    Raises
-    ------
-    UserError
-        If the beam is too wide for automatic cells.
     """
     core = CORE_PER_SPREAD * spread
     if given:

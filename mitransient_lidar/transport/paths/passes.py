@@ -150,10 +150,7 @@ class PassRenderer(ABC):
         Passes with different seeds are independent. Energy is summed over `gates` instead of time bins if they are
         given, or `beside` them. The pixels of several shots are one row, shot after shot.
 
-        Raises
-        ------
-        UserError
-            When the histogram would be too large.
+        Raises UserError when the histogram would be too large.
         """
         pixels, shots = self.scene.receiver.pixels, Shots(seed if isinstance(seed, Sequence) else [seed])
         flat = (shots.count * pixels.count * self.classes.count,)

@@ -276,10 +276,7 @@ class FovLookup:
 def parse_layout(layout: str) -> tuple[int, int]:
     """Return (rows, columns) for a layout such as ``2x2``; ``1x4`` is the published receiver with four strips.
 
-    Raises
-    ------
-    UserError
-        When the text is not two positive integers with an x between them, or has more than 2^22 pixels.
+    Raises UserError when the text is not two positive integers with an x between them, or has more than 2^22 pixels.
     """
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", layout)
     if not match:
