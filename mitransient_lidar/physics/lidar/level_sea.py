@@ -23,21 +23,12 @@ _SMALLEST_DESCENT = 1e-9
 
 @dataclass(frozen=True)
 class LevelSea:
-    """Water below the mean sea level z = 0, in layers of one refractive index each.
+    """Water below the mean sea level z = 0, in layers of one refractive index each."""
 
-    Parameters
-    ----------
-    refractive_index
-        Indices relative to air from the top down, at least 1, shape (layers,).
-    boundaries
-        Depths of the boundaries between the layers [m], increasing, shape (layers - 1,).
-    group_index
-        Group indices of the layers; by default the refractive indices.
-    """
-
-    refractive_index: tuple[float, ...]
+    refractive_index: tuple[float, ...]  #: Indices relative to air from the top down, at least 1, shape (layers,).
+    #: Depths of the boundaries between the layers [m], increasing, shape (layers - 1,).
     boundaries: tuple[float, ...] = ()
-    group_index: tuple[float, ...] | None = None
+    group_index: tuple[float, ...] | None = None  #: Group indices of the layers; by default the refractive indices.
 
     def lengths(self, depth: npt.ArrayLike, sine: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the optical length of rays from the sea level to depths, and the horizontal one over the sine [m].

@@ -40,17 +40,10 @@ _FAR_APART = 8.0
 
 @dataclass(frozen=True, eq=False)
 class SlopeStructure:
-    """Slope structure functions of an isotropic sea against distance.
+    """Slope structure functions of an isotropic sea against distance."""
 
-    Attributes
-    ----------
-    distance
-        Point distances [m], equally spaced in their logarithm.
-    along, across
-        Mean square difference of the slopes along the distance and across it [1].
-    """
-
-    distance: FloatArray
+    distance: FloatArray  #: Point distances [m], equally spaced in their logarithm.
+    #: Mean square difference of the slopes along the distance and across it [1].
     along: FloatArray
     across: FloatArray
 
@@ -84,18 +77,10 @@ class SlopeStructure:
 
 @dataclass(frozen=True, eq=False)
 class EnhancementTable:
-    """Enhancement by depth and displacement.
+    """Enhancement by depth and displacement."""
 
-    Attributes
-    ----------
-    depths
-        Depths [m], ascending, shape (depths,).
-    values
-        Enhancements [1], shape (depths, displacements).
-    """
-
-    depths: FloatArray
-    values: FloatArray
+    depths: FloatArray  #: Depths [m], ascending, shape (depths,).
+    values: FloatArray  #: Enhancements [1], shape (depths, displacements).
 
     @classmethod
     def of(cls, structure: SlopeStructure, depths: FloatArray, spread_per_depth: float) -> EnhancementTable:
