@@ -40,26 +40,13 @@ class PowerLawTable:
     0.3, 2e-3 for 0.5 and 2e-2 for 0.7, or 2e-3 for 0.7 with 8192 nodes.
 
     Build one with `from_function`, `from_values`, `fournier_forand` or `mixture`.
-
-    Parameters
-    ----------
-    log_s0 : float
-        ln s at the first node, negative.
-    value : ndarray, shape (N,)
-        p at the nodes [1/sr].
-    exponent : ndarray, shape (N,)
-        Power-law exponents of the segments; the last is 0 and unused.
-    cdf : ndarray, shape (N,)
-        Probability below each node; cdf[0] belongs to the cap, and cdf[-1] = 1.
-    cap_exponent : float
-        Exponent below s_0, less than 1.
     """
 
-    log_s0: float
-    value: FloatArray
-    exponent: FloatArray
-    cdf: FloatArray
-    cap_exponent: float
+    log_s0: float  #: ln s at the first node, negative.
+    value: FloatArray  #: p at the nodes [1/sr], shape (N,).
+    exponent: FloatArray  #: Power-law exponents of the segments; the last is 0 and unused, shape (N,).
+    cdf: FloatArray  #: Probability below each node; cdf[0] belongs to the cap, and cdf[-1] = 1, shape (N,).
+    cap_exponent: float  #: Exponent below s_0, less than 1.
 
     @classmethod
     def from_values(
