@@ -121,13 +121,6 @@ class SeabedShape(Protocol):
 
 
 @runtime_checkable
-class OpenShape(Protocol):
-    """The shape ``canopy``, whose gaps beam and view share."""
-
-    shares_gaps: bool
-
-
-@runtime_checkable
 class GatedFilm(Protocol):
     """The film ``time_gated_film``; its time bins are None where start or number are chosen for the scene."""
 

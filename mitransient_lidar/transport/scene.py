@@ -21,7 +21,7 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.plugin_types import OpenShape, SeaShape, Transmitter
+from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import box_of, children, scene_of_shapes
@@ -172,7 +172,7 @@ class WaterScene:
     @property
     def has_shared_gaps(self) -> bool:
         """Whether a solid has gaps, finer than patches, through which both laser and receiver look."""
-        return any(isinstance(solid, OpenShape) and solid.shares_gaps for solid in self.solids)
+        return any(getattr(solid, "shares_gaps", False) for solid in self.solids)
 
     @property
     def has_veils(self) -> bool:

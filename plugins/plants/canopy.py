@@ -44,7 +44,7 @@ class CanopyShape(mi.Mesh):
         {'type': 'canopy', 'depth': 5.0, 'leaf_area_index': 1.5, 'height': 0.8}
     """
 
-    #: Solids of a scene with it are not merged (`transport.plugin_types.OpenShape`).
+    #: Solids of a scene with it are not merged (`WaterScene.has_shared_gaps`).
     shares_gaps = True
 
     def __init__(self, props: DeclaredProperties) -> None:
