@@ -15,13 +15,23 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import Plugin, Read
 from mitransient_lidar.core.parameters.lidar import ANGLES
 from mitransient_lidar.core.validation import integer
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 from mitransient_lidar.transport.sensor.pixels import PixelArray
-from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread, PointSpread
-from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
+from mitransient_lidar.transport.sensor.receiver import (
+    GaussianPointSpread,
+    MeasuredPointSpread,
+    PointSpread,
+    Receiver,
+    ReceiverOptics,
+)
 
 #: Parameter of the loader: frame origin in the scene [m], x, y, z, for plugins with a location.
 FRAME_ORIGIN = "_frame_origin"
@@ -90,14 +100,14 @@ def register(
 ) -> None:
     """Register a Mitsuba plugin of a kind, made by its class or by a function of the class that describes it.
 
-    The class docstring, the plugin's manual, gets the parameter table.
+    The class docstring, the plugin's manual, gets the parameter table and the example in XML.
 
     The objects get ``parameters``: the plugin's name as ``type``, each parameter's value that they have read, and
     nested objects; and a description that lists these.
     """
     manual: Any = make if described is None else described
     if manual.__doc__:
-        manual.__doc__ = manual.__doc__.replace(".. parameters::", plugin.table().replace("\n", "\n    "))
+        manual.__doc__ = plugin.manual(manual.__doc__, kind)
 
     def construct(props: mi.Properties) -> Any:
         own = DeclaredProperties(props, plugin)
@@ -159,6 +169,56 @@ def closed(plugin: Any) -> Any:
     return plugin
 
 
+@closed
+class SampledBSDF(mi.BSDF):
+    """BSDF that is evaluated with its density, and draws directions from one or two components."""
+
+    def __init__(self, props: DeclaredProperties, *components: int) -> None:
+        super().__init__(props)
+        self.m_components, self.m_flags = list(components), components[0] | components[-1]
+
+    @abstractmethod
+    def draw(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Draw directions with the density of `eval_pdf`; return them and the numbers of their components."""
+
+    @abstractmethod
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Color1f, mi.Float]:
+        """Return BSDF times cosine, and density [1/sr]."""
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
+        """Sample a direction; return it and BSDF times cosine over its density."""
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo, bs.sampled_component = self.draw(ctx, si, sample1, sample2)
+        bs.eta = 1.0
+        first, last = mi.UInt32(self.m_components[0]), mi.UInt32(self.m_components[-1])
+        bs.sampled_type = dr.select(bs.sampled_component == 0, first, last)
+        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Color1f:
+        """Return BSDF times cosine [1/sr]."""
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Float:
+        """Return the density with which `sample` draws a direction [1/sr]."""
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+
 class PassIntegrator(mi.CppADIntegrator):
     """Integrator that prepares a scene and renders one pass of it.
 
@@ -176,10 +236,7 @@ class PassIntegrator(mi.CppADIntegrator):
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> Any:
         """Return the pass renderer for a scene (`PassRenderer` or `DaylightRenderer`).
 
-        Raises
-        ------
-        UserError
-            When the scene lacks a part or has one that the integrator does not support.
+        Raises UserError when the scene lacks a part or has one that the integrator does not support.
         """
 
     def develop(self, received: Any, sensor: mi.Sensor) -> mi.TensorXf:
@@ -228,6 +285,43 @@ class PassIntegrator(mi.CppADIntegrator):
         )
 
     render_backward = render_forward
+
+
+class LidarPassIntegrator(PassIntegrator):
+    """Integrator of lidar echoes."""
+
+    @abstractmethod
+    def renderer(
+        self, lidar: LidarScene, classes: PathClasses, layout_of: PassRenderer | None, connections: bool
+    ) -> PassRenderer:
+        """Return the pass renderer for the parts of a scene; other arguments as for `prepare`."""
+
+    def prepare(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        *,
+        classes: PathClasses | None = None,
+        receiver: Receiver | None = None,
+        layout_of: PassRenderer | None = None,
+        connections: bool = True,
+        axis: TimeAxis | None = None,
+    ) -> PassRenderer:
+        """Return the pass renderer for a scene, by default with one light class and the sensor's own receiver.
+
+        `axis` gives the start or number of time bins that the film leaves to the scene; without it they contain all
+        light (`find_lidar_scene`).
+
+        `layout_of` is another scene's renderer, whose time bins, points and cells are used. Scenes that differ by a
+        target, or slightly in a parameter, then make the same paths from the same seeds. Without `connections`, paths
+        that miss the target return the same light with and without it, except for light in full cells; errors with
+        narrow beams are larger.
+
+        Raises UserError when the scene lacks a part or has one that is not supported.
+        """
+        axis = axis if layout_of is None else layout_of.scene.axis
+        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
+        return self.renderer(lidar, classes or PathClasses(), layout_of, connections)
 
 
 @closed
@@ -297,6 +391,14 @@ class EmitterWithoutExtent(mi.Emitter):
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the emitter does not extend the scene."""
         return mi.ScalarBoundingBox3f()
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Return 0: no direction meets a point or a small disc by chance."""
+        return mi.Float(0)
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return 0: only `sample_direction` finds the emitter."""
+        return mi.Spectrum(0)
 
     def distant_sample(self, it: mi.Interaction3f, direction: mi.Vector3f) -> mi.DirectionSample3f:
         """Return the sample of a direction to infinity, without its density."""

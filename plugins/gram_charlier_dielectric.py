@@ -9,15 +9,14 @@ import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, SampledBSDF, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
 _TERMS = ("c21", "c03", "c40", "c22", "c04")
 
 
-@closed
-class GramCharlierDielectric(mi.BSDF):
+class GramCharlierDielectric(SampledBSDF):
     r"""Rough dielectric whose slopes have a Gram-Charlier series (``gram_charlier_dielectric``).
 
     .. parameters::
@@ -39,21 +38,12 @@ class GramCharlierDielectric(mi.BSDF):
     with the normal density :math:`\varphi` and its tail *Q*. Directions are drawn from the Gaussian facets that are
     visible, and weighted by the ratio of the densities. Where the series is negative, the density is 0.
 
-    .. code-block:: xml
-
-        <bsdf type="gram_charlier_dielectric">
-            <float name="variance_u" value="0.02"/>
-            <float name="variance_v" value="0.015"/>
-            <float name="c03" value="-0.16"/>
-        </bsdf>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'gram_charlier_dielectric', 'variance_u': 0.02, 'variance_v': 0.015, 'c03': -0.16}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props)
         variances = list(map(props.read, ("variance_u", "variance_v")))
         series = GramCharlierSeries(*map(props.read, _TERMS))
         inside, outside = props.read("int_ior"), props.read("ext_ior")
@@ -62,9 +52,8 @@ class GramCharlierDielectric(mi.BSDF):
         self._gaussian = create_object(
             "roughdielectric", distribution="beckmann", int_ior=inside, ext_ior=outside, **roughness
         )
+        super().__init__(props, *map(self._gaussian.flags, range(self._gaussian.component_count())))
         self.set_slopes((variances[0], variances[1]), series)
-        self.m_components = [self._gaussian.flags(number) for number in range(self._gaussian.component_count())]
-        self.m_flags = self._gaussian.flags()
 
     def set_slopes(self, variances: tuple[float, float], series: GramCharlierSeries) -> None:
         """Set slope variances along and across u, and the series of slopes over their standard deviations."""
@@ -90,18 +79,6 @@ class GramCharlierDielectric(mi.BSDF):
         """Sample a direction as for Gaussian slopes; return it and BSDF times cosine over its density."""
         bs, weight = self._gaussian.sample(ctx, si, sample1, sample2, active)
         return bs, weight * self._ratio(si.wi, bs.wo)
-
-    def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Color1f:
-        """Return BSDF times cosine [1/sr]."""
-        return self._gaussian.eval(ctx, si, wo, active) * self._ratio(si.wi, wo)
-
-    def pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Float:
-        """Return the density with which `sample` draws a direction [1/sr]."""
-        return self._gaussian.pdf(ctx, si, wo, active)
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

@@ -22,8 +22,7 @@ from mitransient_lidar.physics.water.seawater import VISIBLE_RANGE, WAVELENGTH_R
 from mitransient_lidar.physics.water.water_types import default_water, near_infrared_column, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
-from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.water import Water
@@ -75,18 +74,10 @@ class LayeredWater(mi.Medium):
     volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
     phase function and index in all layers.
 
-    .. code-block:: xml
+    .. example::
 
-        <medium type="layered_water" name="interior">
-            <string name="layer_tops" value="0, 3"/>
-            <string name="attenuation" value="0.9, 0.5"/>
-            <string name="scattering" value="0.7, 0.35"/>
-            <string name="backscattering" value="0.014, 0.007"/>
-        </medium>
-
-    .. code-block:: python
-
-        {'type': 'layered_water', 'attenuation': 0.3, 'scattering': 0.15, 'backscattering': 0.006}
+        {'type': 'layered_water', 'layer_tops': '0, 3', 'attenuation': '0.9, 0.5', 'scattering': '0.7, 0.35',
+         'backscattering': '0.014, 0.007'}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:
@@ -130,6 +121,8 @@ def _read_water(
 ) -> Water:
     """Return the water that parameters describe.
 
+    Raises UserError when a value is not allowed, or two parameters describe one thing.
+
     Parameters
     ----------
     props
@@ -138,11 +131,6 @@ def _read_water(
         Phase functions by name, one for all layers or one for each; may be empty.
     bubbles
         Phase function of the bubbles; None for the one by ``plume_backscatter_ratio`` or ``bubble_backscatter``.
-
-    Raises
-    ------
-    UserError
-        When a value is not allowed, or two parameters describe one thing.
     """
     check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
     read = props.read

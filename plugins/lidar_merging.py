@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, LidarPassIntegrator, register
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
-from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.scene import LidarScene
 
 
-class LidarMerging(PassIntegrator):
+class LidarMerging(LidarPassIntegrator):
     r"""Bidirectional transient volumetric integrator (``lidar_merging``).
 
     .. parameters::
@@ -83,11 +79,7 @@ class LidarMerging(PassIntegrator):
     bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not from
     Mitsuba's gradients.
 
-    .. code-block:: xml
-
-        <integrator type="lidar_merging"/>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'lidar_merging'}
     """
@@ -101,37 +93,11 @@ class LidarMerging(PassIntegrator):
         lengths = {name: props.read(name) for name in ("cell_size", "point_spacing")}
         self.options = MergingOptions(**counts, **lengths, solids=props.read("solids"))
 
-    def prepare(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        *,
-        classes: PathClasses | None = None,
-        receiver: Receiver | None = None,
-        layout_of: PassRenderer | None = None,
-        connections: bool = True,
-        axis: TimeAxis | None = None,
+    def renderer(
+        self, lidar: LidarScene, classes: PathClasses, layout_of: PassRenderer | None, connections: bool
     ) -> PassRenderer:
-        """Return the pass renderer for a scene, by default with one light class and the sensor's own receiver.
-
-        `axis` gives the start or number of time bins that the film leaves to the scene; without it they contain all
-        light (`find_lidar_scene`).
-
-        `layout_of` is another scene's renderer, whose time bins, points and cells are used. Scenes that differ by a
-        target, or slightly in a parameter, then make the same paths from the same seeds. Without `connections`, paths
-        that miss the target return the same light with and without it, except for light in full cells; errors with
-        narrow beams are larger.
-
-        Raises
-        ------
-        UserError
-            When the scene lacks a part or has one that is not supported.
-        """
-        axis = axis if layout_of is None else layout_of.scene.axis
-        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
-        classes = classes or PathClasses()
+        """Return the renderer, which connects all light in a scene without water."""
         if lidar.water is None:
-            # Without water all light is connected.
             paths = paths_of_pass(self.options, lidar.receiver.pixels.count)
             return VolpathRenderer(lidar, classes, paths, VolpathOptions())
         layout = layout_of.layout if isinstance(layout_of, MergingRenderer) else None

@@ -8,10 +8,10 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
-from mitransient_lidar.physics.lidar.divergence import WIDTHS, read_divergence
+from mitransient_lidar.physics.lidar.lidar_geometry import WIDTHS, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, read_pose, register
-from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
+from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
@@ -39,15 +39,7 @@ class LidarTransmitter(EmitterWithoutExtent):
     From orbit, lengths are relative to the distance from a point near the scene, and rays start just above it. Times
     are then accurate to a millimetre of range in single precision.
 
-    .. code-block:: xml
-
-        <emitter type="lidar_transmitter">
-            <float name="altitude" value="200"/>
-            <float name="off_nadir_deg" value="20"/>
-            <float name="divergence_mrad" value="10"/>
-        </emitter>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'lidar_transmitter', 'altitude': 200.0, 'off_nadir_deg': 20.0, 'divergence_mrad': 10.0}
     """
@@ -115,17 +107,9 @@ class LidarTransmitter(EmitterWithoutExtent):
         ds.d = offset / ds.dist
         return ds, self.eval_direction(it, ds, active)
 
-    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
-        """Return 0: no direction meets a point by chance."""
-        return mi.Float(0)
-
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Return the energy per area normal to the connection [J/m^2]."""
         return mi.Spectrum(self.intensity(-ds.d) / (ds.dist * ds.dist)) & active
-
-    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Return 0: the laser has no surface."""
-        return mi.Spectrum(0)
 
 
 def _profile(props: DeclaredProperties, kind: str) -> BeamProfile:

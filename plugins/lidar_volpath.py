@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
+from typing import Any
 
 from mitransient_lidar.core.parameters.integrators import LIDAR_VOLPATH
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, LidarPassIntegrator, register
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
-from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.scene import LidarScene
 
 
-class VolpathIntegrator(PassIntegrator):
-    """Integrator with the path tracer's options."""
-
-    def __init__(self, props: DeclaredProperties, complement_only: bool = False) -> None:
-        super().__init__(props)
-        self.paths_per_pass = props.read("paths_per_pass")
-        names = ("max_scatterings", "roulette_threshold", "guiding_probability")
-        self.options = VolpathOptions(*map(props.read, names), complement_only=complement_only)
+def volpath_options(props: DeclaredProperties, **others: Any) -> VolpathOptions:
+    """Return the path tracer's options, some of which a plugin gives."""
+    names = ("max_scatterings", "roulette_threshold", "guiding_probability")
+    return VolpathOptions(*map(props.read, names), **others)
 
 
-class LidarVolpath(VolpathIntegrator):
+class LidarVolpath(LidarPassIntegrator):
     r"""Transient volumetric path tracer with surface connection (``lidar_volpath``).
 
     .. parameters::
@@ -43,13 +37,7 @@ class LidarVolpath(VolpathIntegrator):
     Every segment is timed with the group index of the medium that it crosses. Derivatives come from
     `mitransient_lidar.render`, not from Mitsuba's gradients.
 
-    .. code-block:: xml
-
-        <integrator type="lidar_volpath">
-            <integer name="paths_per_pass" value="262144"/>
-        </integrator>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'lidar_volpath', 'paths_per_pass': 262144}
     """
@@ -57,23 +45,15 @@ class LidarVolpath(VolpathIntegrator):
     plugin = "lidar_volpath"
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props, props.read("complement_only"))
+        super().__init__(props)
+        self.paths_per_pass = props.read("paths_per_pass")
+        self.options = volpath_options(props, complement_only=props.read("complement_only"))
 
-    def prepare(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        *,
-        classes: PathClasses | None = None,
-        receiver: Receiver | None = None,
-        layout_of: PassRenderer | None = None,
-        connections: bool = True,
-        axis: TimeAxis | None = None,
+    def renderer(
+        self, lidar: LidarScene, classes: PathClasses, layout_of: PassRenderer | None, connections: bool
     ) -> VolpathRenderer:
-        """Return the pass renderer for a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
-        axis = axis if layout_of is None else layout_of.scene.axis
-        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
-        return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
+        """Return the renderer: it has no cells, and always connects."""
+        return VolpathRenderer(lidar, classes, self.paths_per_pass, self.options)
 
 
 register("integrator", LIDAR_VOLPATH, LidarVolpath)

@@ -9,8 +9,7 @@ from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER
 from mitransient_lidar.plugins.bases import DeclaredProperties, ReceiverSensor, register
 from mitransient_lidar.plugins.pixel_fov import PixelFov
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
-from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
-from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels, MappedPixels, PixelArray, ShapedPixels, parse_layout
 
 
 class MultipixelReceiver(ReceiverSensor):
@@ -31,15 +30,7 @@ class MultipixelReceiver(ReceiverSensor):
     Blur distributes light from the direction (angle_x, angle_y) around that point on the detector by the point-spread
     function, which is the same all over the field of view. Light between pixels is lost.
 
-    .. code-block:: xml
-
-        <sensor type="multipixel_receiver">
-            <string name="layout" value="2x2"/>
-            <float name="field_of_view_mrad" value="30"/>
-            <film type="time_gated_film"/>
-        </sensor>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'multipixel_receiver', 'layout': '2x2', 'field_of_view_mrad': 30.0,
          'film': {'type': 'time_gated_film'}}

@@ -108,14 +108,7 @@ class OceanSurface(mi.Mesh):
     Other surfaces: any mesh (``ply``, ``obj``) with a ``layered_water`` as its interior medium and a dielectric BSDF of
     the water's index.
 
-    .. code-block:: xml
-
-        <shape type="ocean_surface">
-            <float name="wind_speed" value="3"/>
-            <medium name="interior" type="layered_water"/>
-        </shape>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'ocean_surface', 'wind_speed': 3.0, 'interior': {'type': 'layered_water'}}
     """

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.integrators import PASSIVE_VOLPATH
-from mitransient_lidar.plugins.bases import DeclaredProperties, register
-from mitransient_lidar.plugins.lidar_volpath import VolpathIntegrator
+from mitransient_lidar.plugins.bases import DeclaredProperties, PassIntegrator, register
+from mitransient_lidar.plugins.lidar_volpath import volpath_options
 from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, ReceivedDaylight
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 
 
-class PassiveVolpath(VolpathIntegrator):
+class PassiveVolpath(PassIntegrator):
     r"""Volumetric path tracer for images by daylight (``passive_volpath``).
 
     .. parameters::
@@ -30,13 +28,7 @@ class PassiveVolpath(VolpathIntegrator):
     Light from outside the surface mesh is lost. The air is clear; the receiver's optics do not affect the radiance.
     There are no derivatives.
 
-    .. code-block:: xml
-
-        <integrator type="passive_volpath">
-            <integer name="paths_per_pass" value="262144"/>
-        </integrator>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'passive_volpath', 'paths_per_pass': 262144}
     """
@@ -46,8 +38,9 @@ class PassiveVolpath(VolpathIntegrator):
 
     def __init__(self, props: DeclaredProperties) -> None:
         super().__init__(props)
-        self.options = dataclasses.replace(
-            self.options,
+        self.paths_per_pass = props.read("paths_per_pass")
+        self.options = volpath_options(
+            props,
             solid_guiding_probability=props.read("solid_guiding_probability"),
             expects_emitter=True,
             weights_absorption=True,

@@ -21,16 +21,7 @@ class PixelFov(ReceiverSensor):
     Nested in ``multipixel_receiver`` only the shape and the name are used: pose, aperture, losses and blur are the
     receiver's. As the only sensor of a scene it is a receiver with one pixel.
 
-    .. code-block:: xml
-
-        <sensor type="pixel_fov">
-            <string name="shape" value="ring"/>
-            <float name="field_of_view_mrad" value="30"/>
-            <float name="inner_mrad" value="10"/>
-            <film type="time_gated_film"/>
-        </sensor>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'pixel_fov', 'shape': 'ring', 'field_of_view_mrad': 30.0, 'inner_mrad': 10.0,
          'film': {'type': 'time_gated_film'}}

@@ -8,12 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.parameters.bottom import RETROREFLECTOR
-from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, SampledBSDF, register
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
 
-@closed
-class Retroreflector(mi.BSDF):
+class Retroreflector(SampledBSDF):
     r"""Retro-reflecting surface (``retroreflector``).
 
     .. parameters::
@@ -35,62 +34,29 @@ class Retroreflector(mi.BSDF):
     It reflects on the side of its normal only; ``twosided`` makes it reflect on both. A lobe much narrower than the
     beam's spread under water, about 1 degree, causes noise.
 
-    .. code-block:: xml
-
-        <bsdf type="retroreflector">
-            <float name="reflectance" value="0.6"/>
-            <float name="width_deg" value="2"/>
-            <float name="diffuse_share" value="0.1"/>
-        </bsdf>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'retroreflector', 'reflectance': 0.6, 'width_deg': 2.0, 'diffuse_share': 0.1}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props)
+        kinds = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
+        super().__init__(props, *(kind.value | mi.BSDFFlags.FrontSide.value for kind in kinds))
         self.reflectance, self.diffuse_share = props.read("reflectance"), props.read("diffuse_share")
         self.width = math.radians(props.read("width_deg"))
         self._concentration = 0.25 / math.sin(0.25 * self.width) ** 2
         self._mass = -math.expm1(-2 * self._concentration)
-        kinds = (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection)
-        self.m_components = [kind.value | mi.BSDFFlags.FrontSide.value for kind in kinds]
-        self.m_flags = self.m_components[0] | self.m_components[1]
 
-    def sample(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
-        """Sample a direction from lobe and Lambertian share; return it and BSDF times cosine over its density."""
+    def draw(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Draw directions from lobe and Lambertian share."""
         lobe, diffuse = self._shares(ctx)
-        total = lobe + diffuse
-        in_lobe = sample1 * total < lobe
+        in_lobe = sample1 * (lobe + diffuse) < lobe
         s = -dr.log(dr.maximum(1 - sample2.x * self._mass, dr.epsilon(mi.Float))) / (2 * self._concentration)
         back = deflect(mi.Frame3f(si.wi), dr.minimum(s, 1), dr.two_pi * sample2.y)
-        bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = dr.select(in_lobe, back, mi.warp.square_to_cosine_hemisphere(sample2))
-        bs.eta = 1.0
-        bs.sampled_component = dr.select(in_lobe, mi.UInt32(0), mi.UInt32(1))
-        bs.sampled_type = dr.select(in_lobe, *(mi.UInt32(component) for component in self.m_components))
-        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
-        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
-
-    def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Color1f:
-        """Return BSDF times cosine [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Float:
-        """Return the density with which `sample` draws a direction [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[1]
+        wo = dr.select(in_lobe, back, mi.warp.square_to_cosine_hemisphere(sample2))
+        return wo, dr.select(in_lobe, mi.UInt32(0), mi.UInt32(1))
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

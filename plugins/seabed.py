@@ -56,10 +56,8 @@ class Patch:
 class Bottom:
     """Height and reflectance of a bottom, with the `Seabed` parameters as attributes.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range, the height map cannot be read, or cells are too coarse or too many.
+    Raises UserError if a parameter lies outside its range, the height map cannot be read, or cells are too coarse or
+    too many.
     """
 
     def __init__(self, read: Read) -> None:
@@ -223,17 +221,9 @@ class Seabed(mi.Mesh):
     meets the bottom. Dry land of another reflectance is a patch, or another shape. Land within ``size`` takes time, as
     light is then also traced in the air; a smaller size leaves it out.
 
-    .. code-block:: xml
+    .. example::
 
-        <shape type="seabed">
-            <float name="depth" value="8"/>
-            <float name="slope_x_deg" value="3"/>
-            <string name="patches" value="0 0 1 0.3; 2 1 0.5 0.02"/>
-        </shape>
-
-    .. code-block:: python
-
-        {'type': 'seabed', 'depth': 8.0, 'ripple_height': 0.03, 'ripple_length': 0.2}
+        {'type': 'seabed', 'depth': 8.0, 'slope_x_deg': 3.0, 'patches': '0 0 1 0.3; 2 1 0.5 0.02'}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:

@@ -8,7 +8,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEDIMENT
 from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
-from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, SampledBSDF, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 
@@ -16,8 +16,7 @@ from mitransient_lidar.transport.opaque import opaque
 _PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
 
 
-@closed
-class Sediment(mi.BSDF):
+class Sediment(SampledBSDF):
     r"""Bottom by reflectance or name (``sediment``).
 
     .. parameters::
@@ -45,20 +44,13 @@ class Sediment(mi.BSDF):
 
     It reflects on the side of its normal only; ``twosided`` makes it reflect on both.
 
-    .. code-block:: xml
-
-        <bsdf type="sediment">
-            <string name="model" value="hapke"/>
-            <string name="reflectance" value="coral_sand"/>
-        </bsdf>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'sediment', 'model': 'hapke', 'reflectance': 'coral_sand'}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props)
+        super().__init__(props, mi.BSDFFlags.DiffuseReflection.value | mi.BSDFFlags.FrontSide.value)
         particles = _particles(props)
         if "single_scattering_albedo" in props:
             albedo = props.read("single_scattering_albedo")
@@ -70,42 +62,17 @@ class Sediment(mi.BSDF):
         self._asymmetry, self._backward, self._amplitude, self._width = (
             opaque(getattr(self.surface, name)) for name in _PARTICLES
         )
-        self.m_components = [mi.BSDFFlags.DiffuseReflection.value | mi.BSDFFlags.FrontSide.value]
-        self.m_flags = self.m_components[0]
 
     @property
     def used_values(self) -> dict[str, float]:
         """Single-scattering albedo of the particles, and reflectance at vertical incidence."""
         return {"single_scattering_albedo": self.surface.albedo, "reflectance": self.surface.reflectance()}
 
-    def sample(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
-        """Sample a direction in proportion to its cosine; return it and BSDF times cosine over its density."""
-        bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
-        bs.eta = 1.0
-        bs.sampled_type = mi.UInt32(self.m_components[0])
-        bs.sampled_component = mi.UInt32(0)
-        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
-        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
-
-    def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Color1f:
-        """Return BSDF times cosine [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Float:
-        """Return the density with which `sample` draws a direction [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[1]
+    def draw(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Draw directions in proportion to their cosines."""
+        return mi.warp.square_to_cosine_hemisphere(sample2), mi.UInt32(0)
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
@@ -131,44 +98,22 @@ class Sediment(mi.BSDF):
         return dr.rcp(1 - self._albedo * x * (r0 + (0.5 - r0 * x) * dr.log(1 + dr.rcp(x))))
 
 
-class LambertianSediment(mi.BSDF):
+class LambertianSediment(SampledBSDF):
     """Lambertian `Sediment` model: Mitsuba's ``diffuse``, with parameters that a result can contain."""
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props)
         if "single_scattering_albedo" in props:
             albedo = props["single_scattering_albedo"]
             raise UserError(f"single_scattering_albedo = {albedo} needs model = 'hapke': give reflectance")
         # A scene may give the particles for either model.
         _particles(props)
         reflectance = _reflectance(props)
+        self._diffuse = create_object("diffuse", reflectance=reflectance)
+        super().__init__(props, *self._diffuse.m_components)
         #: Reflectance, a number also where the parameter is a name.
         self.used_values = {"reflectance": reflectance}
-        self._diffuse = create_object("diffuse", reflectance=reflectance)
-        self.m_components, self.m_flags = self._diffuse.m_components, self._diffuse.m_flags
 
-    def sample(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
-        """Sample a direction in proportion to its cosine; return it and BSDF times cosine over its density."""
-        return self._diffuse.sample(ctx, si, sample1, sample2, active)
-
-    def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Color1f:
-        """Return BSDF times cosine [1/sr]."""
-        return self._diffuse.eval(ctx, si, wo, active)
-
-    def pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Float:
-        """Return the density with which `sample` draws a direction [1/sr]."""
-        return self._diffuse.pdf(ctx, si, wo, active)
+    draw = Sediment.draw
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

@@ -9,7 +9,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SKY
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
-from mitransient_lidar.transport.daylight.sky import SKIES, direction_of, relative_irradiance
+from mitransient_lidar.transport.daylight.scene import SKIES, direction_of, relative_irradiance
 
 
 class Sky(EmitterWithoutExtent):
@@ -21,14 +21,7 @@ class Sky(EmitterWithoutExtent):
     and Coombes 1988, doi:10.1016/0038-092X(88)90072-2) is scaled to the irradiance. The sun itself is the plugin
     ``sun``, whose angles a clear sky must share. The lidar integrators leave the sky out.
 
-    .. code-block:: xml
-
-        <emitter type="sky">
-            <string name="distribution" value="clear"/>
-            <float name="sun_zenith_deg" value="40"/>
-        </emitter>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'sky', 'distribution': 'clear', 'sun_zenith_deg': 40.0}
     """

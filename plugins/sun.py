@@ -9,7 +9,7 @@ import numpy as np
 from mitransient_lidar.core.parameters.bottom import SUN
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, register
-from mitransient_lidar.transport.daylight.sky import direction_of
+from mitransient_lidar.transport.daylight.scene import direction_of
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
 
@@ -22,14 +22,7 @@ class Sun(EmitterWithoutExtent):
     each path; the lidar integrators leave it out. Mitsuba's own integrators sample the disc, and do not meet it by
     chance.
 
-    .. code-block:: xml
-
-        <emitter type="sun">
-            <float name="zenith_deg" value="40"/>
-            <float name="azimuth_deg" value="120"/>
-        </emitter>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'sun', 'zenith_deg': 40.0, 'azimuth_deg': 120.0}
     """
@@ -71,17 +64,9 @@ class Sun(EmitterWithoutExtent):
         ds.delta, ds.pdf = True, 1.0
         return ds, self.eval_direction(it, ds, active)
 
-    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
-        """Return 0: only `sample_direction` finds the disc."""
-        return mi.Float(0)
-
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Return the irradiance that a direction of the disc represents [W m^-2 nm^-1]."""
         return mi.Spectrum(self.sampled_irradiance) & active
-
-    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Return 0: only `sample_direction` finds the disc."""
-        return mi.Spectrum(0)
 
 
 register("emitter", SUN, Sun)

@@ -44,15 +44,9 @@ class TimeGatedFilm(mi.Film):
     exceeds the allowed memory, each arrival is added to the gates open during its pulse instead. In this case
     ``bin_width_ns`` and ``bin_count`` only set the end of the record.
 
-    .. code-block:: xml
+    .. example::
 
-        <film type="time_gated_film">
-            <float name="bin_width_ns" value="0.5"/>
-        </film>
-
-    .. code-block:: python
-
-        {'type': 'time_gated_film', 'time_start_ns': 1390.0, 'bin_width_ns': 0.5, 'bin_count': 'auto'}
+        {'type': 'time_gated_film', 'bin_width_ns': 0.5}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:

@@ -103,7 +103,7 @@ FAULTS = (
     # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
     Fault(
         "share_of_photons_in_view",
-        f"{_T}/laser/beam_sampler.py",
+        f"{_T}/laser.py",
         "opaque(count // 2 / count)",
         "opaque(0.97 * (count // 2) / count)",
         near="tests/sampling",

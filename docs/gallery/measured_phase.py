@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.physics.water.phase_file import read_phase_table
+from mitransient_lidar.physics.water.phase_table import read_phase_table
 
 
 def scene(phase):

@@ -14,9 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Ellipse, Polygon
 
 import mitransient_lidar
-from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.level_sea import LevelSea, snell
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.physics.lidar.refraction import snell
 from mitransient_lidar.plots import drawing
 
 INDEX = 1.34

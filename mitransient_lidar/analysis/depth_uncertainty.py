@@ -14,7 +14,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.core.tables.written import write_csv
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative
-from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
+from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
 from mitransient_lidar.results.geometry import required_number
 from mitransient_lidar.results.variables import described
 

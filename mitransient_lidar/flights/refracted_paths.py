@@ -13,7 +13,7 @@ from mitransient_lidar.core.options import Option
 from mitransient_lidar.core.plans import Plan
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_array
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
-from mitransient_lidar.physics.lidar.refraction import cos_in_water, refract
+from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract
 
 
 @dataclass(frozen=True)

@@ -360,7 +360,7 @@ def _turned_lines(
     renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis, turn_deg: float
 ) -> LinesOfSight:
     """Return the lines of sight of the lidar of a group whose pixels are turned about the receiver's axis [deg]."""
-    from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+    from mitransient_lidar.rendering.describe import lines_of_sight
 
     scene = _shot_scene(renderer, angle_deg, height, x, y, axis, renderer.plan.light)
     return lines_of_sight(scene.lidar, turn_deg)

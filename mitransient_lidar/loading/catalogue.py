@@ -27,10 +27,7 @@ def scene_names() -> list[str]:
 def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
     """Return the path of a shipped scene, which has priority over a file with the same name, or of an XML file.
 
-    Raises
-    ------
-    UserError
-        If there is no such scene; the message lists shipped scenes with similar names.
+    Raises UserError if there is no such scene; the message lists shipped scenes with similar names.
     """
     names = scene_names()
     if not isinstance(name_or_path, (str, os.PathLike)):
@@ -82,6 +79,9 @@ def copy_scene(
 ) -> Path:
     """Write a scene as one self-contained file, with copies of its data files from the same folder.
 
+    Raises UserError if there is no such scene, a file exists already, or one cannot be read or written. No file is
+    written then.
+
     Parameters
     ----------
     name : str or path
@@ -90,11 +90,6 @@ def copy_scene(
         Folder, or path of the new file, which is returned.
     overwrite : bool
         Whether to replace files.
-
-    Raises
-    ------
-    UserError
-        If there is no such scene, a file exists already, or one cannot be read or written. No file is written then.
     """
     source = example_files().get(str(name)) or scene_path(name)
     text = read_document(source).text if source.suffix == ".xml" else read_text(source)

@@ -51,33 +51,16 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneDocument:
-    """An XML scene without includes.
+    """An XML scene without includes."""
 
-    Attributes
-    ----------
-    name
-        Scene name.
-    root
-        Root element; it is not changed.
-    folder
-        Folder that file names refer to.
-    parameters
-        Values of its own parameters (``<default>``), as text.
-    given
-        Those that the user has given.
-    instrument
-        Name of the instrument whose laser and receiver the scene has; empty if they are its own.
-    source
-        Text of the file, if the document is as it was read.
-    """
-
-    name: str
-    root: minidom.Element
-    folder: Path = Path()
+    name: str  #: Scene name.
+    root: minidom.Element  #: Root element; it is not changed.
+    folder: Path = Path()  #: Folder that file names refer to.
+    #: Values of its own parameters (``<default>``), as text.
     parameters: Mapping[str, str] = field(default_factory=dict)
-    given: Mapping[str, str] = field(default_factory=dict)
-    instrument: str = ""
-    source: str | None = None
+    given: Mapping[str, str] = field(default_factory=dict)  #: Those that the user has given.
+    instrument: str = ""  #: Name of the instrument whose laser and receiver the scene has; empty if they are its own.
+    source: str | None = None  #: Text of the file, if the document is as it was read.
 
     def copied(self) -> SceneDocument:
         """Return a scene whose root is a copy, to be changed."""
@@ -155,10 +138,8 @@ def read_document(path: Path) -> SceneDocument:
 
     Names of included files are relative to the file that names them and contain no parameters.
 
-    Raises
-    ------
-    UserError
-        If a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than 256.
+    Raises UserError if a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than
+    256.
     """
     text = read_text(path)
     if parse_part(text, path).getElementsByTagName("include"):
@@ -223,10 +204,7 @@ def _drop_repeated(root: minidom.Element) -> None:
 def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
     """Return a text with parameters in place, the longest names first, and those that it refers to.
 
-    Raises
-    ------
-    UserError
-        If the text becomes longer than a million characters.
+    Raises UserError if the text becomes longer than a million characters.
     """
     referred: list[str] = []
     while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):

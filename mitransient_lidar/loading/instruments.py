@@ -102,10 +102,7 @@ def with_infrared(
     altitude and the aim are those of both channels, ``infrared.NAME`` is the parameter ``NAME`` of the infrared one
     alone, and others of the lidar are those of the green one. Coefficients of the water are at 532 nm.
 
-    Raises
-    ------
-    UserError
-        If there is no such instrument, or it has no infrared channel.
+    Raises UserError if there is no such instrument, or it has no infrared channel.
     """
     known = [one.removesuffix(_INFRARED) for one in instrument_names() if one.endswith(_INFRARED)]
     if name is None or f"{_path(name).stem}{_INFRARED}" not in instrument_names():
@@ -139,10 +136,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     its other emitters. Limits of the time axis and resolution of the sea, which fit the scene's own lidar, return to
     their defaults. Parameters that have become unused are removed.
 
-    Raises
-    ------
-    UserError
-        If there is no such instrument.
+    Raises UserError if there is no such instrument.
     """
     path = _path(name)
     own, part = _own_part(path), read_document(path).root

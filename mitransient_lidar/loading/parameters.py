@@ -33,27 +33,13 @@ _LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
 
 @dataclass(frozen=True)
 class ScenePlugin:
-    """A plugin from this package in a scene.
+    """A plugin from this package in a scene."""
 
-    Attributes
-    ----------
-    element
-        Element of the plugin.
-    declared
-        Declaration of its parameters.
-    settings
-        Attributes that set parameters, by parameter name.
-    ids
-        Ids of the plugin and of the objects around it, and the plugin's name.
-    is_fixed
-        Whether its parameters are an instrument's, and have no names.
-    """
-
-    element: minidom.Element
-    declared: Plugin
-    settings: Mapping[str, Setting]
-    ids: tuple[str, ...]
-    is_fixed: bool
+    element: minidom.Element  #: Element of the plugin.
+    declared: Plugin  #: Declaration of its parameters.
+    settings: Mapping[str, Setting]  #: Attributes that set parameters, by parameter name.
+    ids: tuple[str, ...]  #: Ids of the plugin and of the objects around it, and the plugin's name.
+    is_fixed: bool  #: Whether its parameters are an instrument's, and have no names.
 
     def names(self) -> Iterator[tuple[Parameter, list[str]]]:
         """Yield the parameters with their names: their own, unless it stands for others, and behind an id."""
@@ -140,10 +126,7 @@ def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocu
     ``sea.wind_speed`` (in formulas ``sea_wind_speed``) for the one with this id, and for those inside it, or
     ``sediment.model`` for all plugins with this name.
 
-    Raises
-    ------
-    UserError
-        If the scene has no such parameter or uses it nowhere, or a value is empty or of another type.
+    Raises UserError if the scene has no such parameter or uses it nowhere, or a value is empty or of another type.
     """
     if not params:
         return document
@@ -231,6 +214,9 @@ def unknown_parameters(message: str) -> str | None:
 def value_of(parameters: Mapping[str, str], name: str) -> float:
     """Return a number's value among a scene's parameters, in the unit of `core.parameters.catalogue.unit_of`.
 
+    Raises UserError if there is no such parameter or element, it is a list and `name` has no index, or it is no finite
+    number.
+
     Parameters
     ----------
     parameters
@@ -238,11 +224,6 @@ def value_of(parameters: Mapping[str, str], name: str) -> float:
     name
         Parameter name; for a list, such as "0.9, 0.5", with the index of an element from 0 on (``attenuation[1]``). A
         list with one value holds for every layer of ``layer_tops``, and has their indices, too.
-
-    Raises
-    ------
-    UserError
-        If there is no such parameter or element, it is a list and `name` has no index, or it is no finite number.
     """
     words, index = _words(parameters, name)
     return finite(name, words[index])

@@ -41,10 +41,17 @@ from mitransient_lidar.core.files import check_regular, is_file_name, is_there, 
 from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, PLUGINS
 from mitransient_lidar.core.validation import FloatArray, shown
-from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
+from mitransient_lidar.loading.checks import (
+    GRID_PLUGINS,
+    PLY_PLUGINS,
+    check_grid,
+    check_ply,
+    is_transform,
+    matrix_of,
+    resource_folders,
+)
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
-from mitransient_lidar.loading.mesh_files import GRID_PLUGINS, PLY_PLUGINS, check_grid, check_ply
 from mitransient_lidar.loading.parameters import values_of
 from mitransient_lidar.loading.scene_json import from_json, to_json
 
@@ -60,34 +67,18 @@ _MOST_VALUES = 16
 
 @dataclass(frozen=True)
 class SceneSource:
-    """The information that loads a scene again.
+    """The information that loads a scene again."""
 
-    Parameters
-    ----------
-    name
-        Scene name.
-    text
-        XML with includes in place, or JSON of a dict.
-    is_xml
-        Whether the text is XML.
-    parameters
-        Own parameters of an XML scene with their values as text; for a result also the parameters that its plugins
-        declare.
-    files
-        Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
-    instrument
-        Name of an XML scene's instrument; empty if its laser and receiver are its own.
-    sensor
-        Id of a receiver in the scene; empty for the first one.
-    """
-
-    name: str
-    text: str
-    is_xml: bool
+    name: str  #: Scene name.
+    text: str  #: XML with includes in place, or JSON of a dict.
+    is_xml: bool  #: Whether the text is XML.
+    #: Own parameters of an XML scene with their values as text; for a result also the parameters that its plugins
+    #: declare.
     parameters: Mapping[str, str]
+    #: Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
     files: Mapping[tuple[str, str], tuple[str, str]]
-    instrument: str = ""
-    sensor: str = ""
+    instrument: str = ""  #: Name of an XML scene's instrument; empty if its laser and receiver are its own.
+    sensor: str = ""  #: Id of a receiver in the scene; empty for the first one.
 
     @classmethod
     def of_document(cls, document: SceneDocument, former: SceneSource | None = None) -> SceneSource:
@@ -121,10 +112,7 @@ class SceneSource:
         A missing or changed file is looked for by its name and SHA-256 in the result's `folder`, and in the working
         folder.
 
-        Raises
-        ------
-        UserError
-            If the attributes contain no scene, or are damaged, or the scene's name is no file name.
+        Raises UserError if the attributes contain no scene, or are damaged, or the scene's name is no file name.
         """
         kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
         if not kinds:
@@ -185,10 +173,7 @@ class SceneSource:
     def place_files(self, document: SceneDocument) -> str:
         """Return a scene's XML without parameters, with the paths of its files.
 
-        Raises
-        ------
-        UserError
-            If a file is missing or has changed.
+        Raises UserError if a file is missing or has changed.
         """
         paths = {id(setting): str(folder) for setting, folder in document.paths.items()}
         for plugin, setting in _files_of(document):

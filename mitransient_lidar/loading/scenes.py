@@ -161,10 +161,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
 
     For `passive` the default is ``passive_volpath`` if the scene's integrator does not render daylight.
 
-    Raises
-    ------
-    UserError
-        If it is not a lidar integrator, or for `passive`, not one for daylight.
+    Raises UserError if it is not a lidar integrator, or for `passive`, not one for daylight.
     """
     import mitsuba as mi
 

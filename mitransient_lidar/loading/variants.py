@@ -174,10 +174,7 @@ def set_variant(name: str | None = None) -> str:
 
     `name` is ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active variant, or the fastest that works here.
 
-    Raises
-    ------
-    UserError
-        If the variant is not supported or does not work on this machine.
+    Raises UserError if the variant is not supported or does not work on this machine.
     """
     import drjit as dr
     import mitsuba as mi
@@ -214,10 +211,7 @@ def leave_the_gpu(what: str) -> None:
     `what` is rendered through several Mitsuba scenes in one kernel. OptiX traces rays through the first scene only:
     light in the other scenes would be missing without a message.
 
-    Raises
-    ------
-    UserError
-        If there is no LLVM.
+    Raises UserError if there is no LLVM.
     """
     if set_variant() == "cuda_ad_mono":
         _tell_of_llvm(what)

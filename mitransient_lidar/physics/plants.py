@@ -25,29 +25,16 @@ class Canopy:
     Leaves lie at random locations. Light at the angle theta from the vertical passes them unhindered with the
     probability exp(-G L / cos theta), for the leaf area index L and the mean leaf projection G on that direction
     (Nilson 1971, Agric. Meteorol. 8, 25, doi:10.1016/0002-1571(71)90092-6).
-
-    Attributes
-    ----------
-    leaf_area_index
-        One-sided leaf area per bottom area, above 0.
-    height
-        Height of the tips above the bottom [m], above 0.
-    leaf_width
-        Leaf width [m]; without blades the side of a square leaf.
-    bending
-        Blade angle from the vertical [rad], 0 to 1.4; None for square leaves that look in all directions alike,
-        everywhere in the layer.
-    bending_azimuth
-        Azimuth towards which blades lean, from +x to +y [rad]; None for any.
-    shoot_density
-        Shoots per area [1/m^2], whose blades stand at one location; None for blades that stand alone.
     """
 
-    leaf_area_index: float
-    height: float
-    leaf_width: float
+    leaf_area_index: float  #: One-sided leaf area per bottom area, above 0.
+    height: float  #: Height of the tips above the bottom [m], above 0.
+    leaf_width: float  #: Leaf width [m]; without blades the side of a square leaf.
+    #: Blade angle from the vertical [rad], 0 to 1.4; None for square leaves that look in all directions alike,
+    #: everywhere in the layer.
     bending: float | None = None
-    bending_azimuth: float | None = None
+    bending_azimuth: float | None = None  #: Azimuth towards which blades lean, from +x to +y [rad]; None for any.
+    #: Shoots per area [1/m^2], whose blades stand at one location; None for blades that stand alone.
     shoot_density: float | None = None
 
     def __post_init__(self) -> None:
@@ -91,6 +78,8 @@ class Canopy:
     def leaves(self, side: float, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return leaves on a level square about x = y = 0 at z = 0, drawn at random.
 
+        Raises UserError if they exceed the memory.
+
         Parameters
         ----------
         side
@@ -103,11 +92,6 @@ class Canopy:
         feet, width, length : ndarray
             Middle of each leaf's lower edge [m], and vectors along that edge and away from it, as long as the leaf is
             wide and long [m]; shape (leaves, 3).
-
-        Raises
-        ------
-        UserError
-            If they exceed the memory.
         """
         count = round(self.density * side * side)
         what = f"{count} leaves of leaf_area_index = {self.leaf_area_index:g} within size = {side:g} m"

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.products import Flown
-from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.variables import PointClass
 

@@ -127,7 +127,7 @@ def view_scene(
     from mitransient_lidar.loading.scenes import open_scene
     from mitransient_lidar.plots.scene_viewer import traces
     from mitransient_lidar.plots.scene_viewer.page import page_text
-    from mitransient_lidar.rendering.geometry.shapes import scene_geometry
+    from mitransient_lidar.rendering.geometry import scene_geometry
 
     geometry = scene_geometry(open_scene(scene, params, instrument))
     about = traces.scene_views(geometry), traces.scene_notes(geometry)

@@ -28,8 +28,7 @@ from mitransient_lidar.results.variables import label
 if TYPE_CHECKING:
     import xarray as xr
 
-    from mitransient_lidar.rendering.derivatives import Parameter
-    from mitransient_lidar.rendering.differences import Differences
+    from mitransient_lidar.rendering.derivatives import Differences, Parameter
     from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -115,6 +114,8 @@ class PassAccumulator:
         pass.
     smooth
         Standard deviation by which each gate's image is smoothed [pixels], or None.
+    size
+        Memory of film, means and errors [bytes], 0 if it is unknown.
     """
 
     def __init__(
@@ -128,6 +129,7 @@ class PassAccumulator:
         batches: int = 0,
         kept: Literal["histograms", "gates", "direct"] = "histograms",
         smooth: float | None = None,
+        size: float = 0.0,
     ) -> None:
         self.scene, self.window, self.train, self._kept, self._smooth = scene, window, train, kept, smooth
         self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
@@ -136,8 +138,7 @@ class PassAccumulator:
         self._differences = differences
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # power sums of every batch
         self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
-        #: Memory of film, means and errors [bytes], 0 if it is unknown.
-        self.size = 0.0
+        self.size = size
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
         self._weights: FloatArray | None = None
@@ -334,11 +335,8 @@ def choose_accumulator(
     and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of passes is
     kept, too. With a standard deviation [pixels], gate images are smoothed and nothing else is kept.
 
-    Raises
-    ------
-    UserError
-        If images without rows, columns or gates would be smoothed, a histogram without gates or a single gate exceeds
-        the memory, or gates by depth have no surface.
+    Raises UserError if images without rows, columns or gates would be smoothed, a histogram without gates or a single
+    gate exceeds the memory, or gates by depth have no surface.
     """
     from mitransient_lidar.transport.paths.histogram import TransientHistogram
 
@@ -353,9 +351,8 @@ def choose_accumulator(
         raise UserError(f"smooth = {smooth:g} pixels needs gates in the film, and a layout of rows and columns")
     if everything <= limit and not smooth:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
-        chosen = PassAccumulator(scene, window, train, origins, parameters, differences, batches)
-        chosen.size = everything
-        return chosen
+        kept = origins, parameters, differences, batches
+        return PassAccumulator(scene, window, train, *kept, size=everything)
     cure = "take fewer of them"
     if origins:
         of_what, cure = f" x {len(origins)} components", "take fewer bins or pixels"
@@ -372,9 +369,8 @@ def choose_accumulator(
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
         if not smooth:
             logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
-        chosen = PassAccumulator(scene, window, train, kept="gates", smooth=smooth)
-        chosen.size = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates
-        return chosen
+        size_of_gates = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates
+        return PassAccumulator(scene, window, train, kept="gates", smooth=smooth, size=size_of_gates)
     each = (per_bin + _BYTES_PER_DIRECT_GATE + (_BYTES_PER_SMOOTHED_GATE if smooth else 0)) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
@@ -385,9 +381,7 @@ def choose_accumulator(
         )
     if not smooth:
         logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
-    chosen = PassAccumulator(scene, window, train, kept="direct", smooth=smooth)
-    chosen.size = each * train.count
-    return chosen
+    return PassAccumulator(scene, window, train, kept="direct", smooth=smooth, size=each * train.count)
 
 
 def share_of_pass(smooth: float) -> float:

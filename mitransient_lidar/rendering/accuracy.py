@@ -198,23 +198,14 @@ class ErrorCorrelation:
 
 @dataclass(frozen=True)
 class ErrorWindow:
-    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and land bins.
+    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and land bins."""
 
-    Parameters
-    ----------
-    start_ns, end_ns
-        Limits for each pixel [ns], shape (pixels,), or for each shot (shots x pixels,); land limits where a pixel sees
-        no water.
-    time_ns
-        Bin centres [ns], shape (time,).
-    land_ns
-        Limits of the land echo beside the water [ns], shape (pixels, 2) likewise; NaN without.
-    """
-
+    #: Limits for each pixel [ns], shape (pixels,), or for each shot (shots x pixels,); land limits where a pixel sees
+    #: no water.
     start_ns: FloatArray
     end_ns: FloatArray
-    time_ns: FloatArray
-    land_ns: FloatArray
+    time_ns: FloatArray  #: Bin centres [ns], shape (time,).
+    land_ns: FloatArray  #: Limits of the land echo beside the water [ns], shape (pixels, 2) likewise; NaN without.
 
     @classmethod
     def of_probe(cls, probe: Probe) -> ErrorWindow:

@@ -67,6 +67,8 @@ def result_kind(attributes: Mapping[str, Any]) -> str:
 def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Return the command that rendered a result, and the options that render it again, with `scene`.
 
+    Raises UserError if the result does not contain its scene or an option, or contains only some shots of a series.
+
     Parameters
     ----------
     result
@@ -74,11 +76,6 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     options
         Options of that function which replace the result's, unless they are None; its parameters are added to the
         scene's.
-
-    Raises
-    ------
-    UserError
-        If the result does not contain its scene or an option, or contains only some shots of a series.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)

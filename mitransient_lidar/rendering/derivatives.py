@@ -1,7 +1,8 @@
-"""Parameters by which waveforms are differentiated."""
+"""Parameters by which waveforms are differentiated, and central differences on common random numbers."""
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,18 +11,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.catalogue import unit_of
+from mitransient_lidar.core.parameters.catalogue import is_quantity, unit_of
 from mitransient_lidar.core.parameters.water import COEFFICIENTS
-from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.parameters import parameter_of, value_of
+from mitransient_lidar.core.validation import FloatArray, positive, shown
+from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
+from mitransient_lidar.loading.scenes import LoadedScene, open_scene
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.rendering.accuracy import LightStatistics, PassStatistics, received_power
 from mitransient_lidar.transport.paths.water_changes import coefficient_derivative, mean_cosine_derivative
 from mitransient_lidar.transport.perturbations import Perturbation
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.transport.paths.passes import PassRenderer
+    from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
     from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -43,20 +48,13 @@ _REFLECTANCE = "_reflectance"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A scene parameter by which light is differentiated.
+    """A scene parameter by which light is differentiated."""
 
-    Attributes
-    ----------
-    name, value, units
-        Name, with the layer number in brackets where there are several; value and its unit.
-    perturbation
-        Path sums for the derivative; None for central differences.
-    """
-
+    #: Name, with the layer number in brackets where there are several; value and its unit.
     name: str
     value: float
     units: str
-    perturbation: Perturbation | None
+    perturbation: Perturbation | None  #: Path sums for the derivative; None for central differences.
 
     @property
     def method(self) -> str:
@@ -72,10 +70,7 @@ def path_parameters(
     `others` are the scene parameters, with their values as text; those without path sums are left to central
     differences; none by default.
 
-    Raises
-    ------
-    UserError
-        If a name is unknown or given twice, or the light does not depend on the parameter.
+    Raises UserError if a name is unknown or given twice, or the light does not depend on the parameter.
     """
     if not isinstance(names, (str, Sequence)):
         raise UserError(f"derivatives = {shown(names)} must be names of parameters")
@@ -200,3 +195,177 @@ def _uniform_reflectance(solid: mi.Shape) -> float | None:
     if names not in (["reflectance.value"], ["brdf_0.reflectance.value"]):
         return None
     return float(np.array(kept[names[0]]).ravel()[0])
+
+
+#: Echo shift by a depth step, over the pulse's full width at half maximum; layer edges, which change the record little,
+#: have a step longer by a factor.
+_SHIFT_PER_WIDTH, _LAYER_FACTOR = 0.05, 2.0
+
+#: Step for other lengths [m].
+_LENGTH_STEP = 0.05
+
+#: Steps for beams and views, and for all others, over the value; and steps where that is 0.
+_VIEW_STEP, _RELATIVE_STEP, _STEP_FROM_ZERO = 0.1, 0.01, 0.01
+
+#: Longest angle step, and step for the sea's mean slope, by which surface echoes change fast [degree].
+_ANGLE_STEP_DEG, _SEA_STEP_DEG = 0.5, 0.2
+
+
+class _Side:
+    """A scene with a parameter beside its value."""
+
+    def __init__(self, renderer: PassRenderer) -> None:
+        self._renderer, self._power_of = renderer, received_power(renderer.scene)
+        self._weights: FloatArray | None = None
+
+    def cut(self, train: GateTrain) -> None:
+        """From this call on, return the energy in gates, too."""
+        scene = self._renderer.scene
+        self._weights = train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)
+
+    def render(self, seed: int, share: float) -> list[FloatArray]:
+        """Return energy [J] and power [W] of one pass, shape (pixel, time), and that in gates [J], (pixel, gate)."""
+        fitted = self._renderer if share == 1 else self._renderer.scaled(share)
+        energy = fitted.render_pass(seed).histogram.energy().reshape(fitted.scene.receiver.pixels.count, -1)
+        found = [energy, self._power_of(energy)]
+        return found if self._weights is None else [*found, energy @ self._weights]
+
+
+class Differences:
+    """Derivatives of impulse response and waveform by scene parameters, from passes that are added one by one.
+
+    Each pass renders the scene with a parameter above and below its value. Both renders share the random numbers, and
+    the time bins and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in
+    renders of waveforms, and follow beam and sea. The session and its scene stay unchanged.
+
+    Standard errors are smaller than with independent random numbers (median over lit bins, default steps). In `table1`
+    the factors are 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
+    (``divergence_mrad``) and 3.3 (``field_of_view_mrad``), in `fig15_2x2` 8 (``layer_tops[1]``). Light that does not
+    reach a moving bottom or target is the same.
+
+    Raises UserError if the scene is not an XML scene; a parameter is unknown, not a number, or belongs to record, gates
+    or seeds; or a step is for another parameter, not positive, or leads to a value that the scene refuses.
+
+    Parameters
+    ----------
+    session
+        LoadedScene of an XML scene.
+    integrator
+        Lidar integrator.
+    names
+        Names of numbers among the scene parameters, as for `loading.parameters.value_of`.
+    steps
+        Distance of the two values from the scene's value, greater than 0, by name; by default `default_step`.
+    renderer
+        Renderer of the unchanged scene, by default a new one.
+
+    Attributes
+    ----------
+    names
+        Parameter names.
+    values, steps
+        Values and steps of the parameters, in their units, shape (parameter,).
+    light
+        Derivatives of bin energy [J per unit of the parameter] and of received power [W per unit], shape (parameter,
+        pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
+    gates
+        Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate).
+    """
+
+    def __init__(
+        self,
+        session: LoadedScene,
+        integrator: LidarIntegrator,
+        names: Sequence[str],
+        *,
+        steps: Mapping[str, float] | None = None,
+        renderer: PassRenderer | None = None,
+    ) -> None:
+        if session.source is None or not session.source.is_xml:
+            raise UserError(f"derivatives by {', '.join(names)} need an XML scene, whose parameters can be changed")
+        if others := [name for name in steps or {} if name not in names]:
+            raise UserError(f"steps: {others[0]!r} is not among the parameters {', '.join(names)}")
+        self._integrator, self._model = integrator, session
+        self._base = (renderer or integrator.prepare(session.scene, session.sensor)).for_differences()
+        self.names = list(names)
+        self.values = np.array([_checked_value(session.parameters, name) for name in names])
+        self.steps = np.array(
+            [
+                positive(f"step of {name}", steps[name])
+                if steps and name in steps
+                else default_step(name, value, self._base)
+                for name, value in zip(self.names, self.values.tolist(), strict=True)
+            ]
+        )
+        self._pairs = [
+            (self._side(name, value, step), self._side(name, value, -step))
+            for name, value, step in zip(self.names, self.values.tolist(), self.steps.tolist(), strict=True)
+        ]
+        self.light, self.gates = LightStatistics(), PassStatistics()
+
+    def cut(self, train: GateTrain) -> None:
+        """Differentiate the energy in gates, too, before the first pass; the gates stay at their times."""
+        for side in itertools.chain(*self._pairs):
+            side.cut(train)
+
+    def _side(self, name: str, value: float, step: float) -> _Side:
+        """Return the scene with a parameter beside its value."""
+        model, known = self._model, parameter_of(name)
+        params = {known: with_value(model.parameters, name, value + step)[known]}
+        try:
+            moved = open_scene(model.source, params, model=model.scene)
+            renderer = self._integrator.prepare(moved.scene, moved.sensor, layout_of=self._base)
+        except UserError as error:
+            raise UserError(
+                f"the derivative by {name} = {value:g} needs values {abs(step):.3g} below and above, and {error}"
+            ) from error
+        return _Side(renderer)
+
+    def add_pass(self, seed: int, share: float = 1.0) -> None:
+        """Render and add one pass for every parameter, with a share of the paths of a full one."""
+        slopes = []
+        for pair, step in zip(self._pairs, self.steps, strict=True):
+            sides = zip(*(side.render(seed, share) for side in pair), strict=True)
+            slopes.append([(high - low) / (2 * step) for high, low in sides])
+        energy, power, *gates = (np.array(one) for one in zip(*slopes, strict=True))
+        self.light.add(energy, power)
+        for one in gates:
+            self.gates.add(one)
+
+
+def default_step(name: str, value: float, renderer: PassRenderer) -> float:
+    """Return a parameter's step for central differences, from measured noise and bias.
+
+    The derivative's noise falls with the square root of the step or faster, and the bias grows with its square. Depths,
+    the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which changes
+    derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views 10 % of their width,
+    other angles 0.5 degrees, and all others 1 %. The sea's mean slope has steps of 0.2 degrees. At 3 m/s and 20 degrees
+    off nadir they change the surface echo from Gaussian slopes by 15 %, and derivatives by 0.4 %.
+    """
+    known, scene = parameter_of(name), renderer.scene
+    unit = unit_of(known)
+    shift = 0.5 * C0 * 1e-9 * _SHIFT_PER_WIDTH * scene.transmitter.pulse.fwhm_ns
+    if known == "off_nadir_deg":
+        pose = scene.receiver.pose
+        slope = scene.relative(pose).range * np.tan(np.deg2rad(min(abs(value), 80.0)))
+        return float(min(np.rad2deg(shift / max(slope, 1e-9)), _ANGLE_STEP_DEG))
+    if known == "altitude":
+        return float(shift)
+    if "depth" in known or known == "layer_tops":
+        return float(shift / scene.group_index) * (_LAYER_FACTOR if known == "layer_tops" else 1.0)
+    if known.removeprefix("surface_") in ("slope_x_deg", "slope_y_deg"):
+        return _SEA_STEP_DEG
+    fixed = {"m": _LENGTH_STEP, "degree": _ANGLE_STEP_DEG}.get(unit or "")
+    relative = _VIEW_STEP if unit == "mrad" else _RELATIVE_STEP
+    return fixed or relative * abs(value) or _STEP_FROM_ZERO
+
+
+def _checked_value(parameters: Mapping[str, str], name: str) -> float:
+    """Return the value of a measured parameter."""
+    value, known = value_of(parameters, name), parameter_of(name)
+    if not is_quantity(known):
+        raise UserError(
+            f"parameter {name} = {value:g} belongs to the record, its gates or its random numbers: there are "
+            "derivatives by quantities of lidar, sea, water, bottom and targets"
+        )
+    return value

@@ -86,10 +86,7 @@ KEPT = {name: name for name in ("passes", "seed", "pass_share", "variant")} | {"
 class RenderOptions:
     """Options of a render, None for those that are not given. The commands show their meanings as help.
 
-    Raises
-    ------
-    UserError
-        If a number is out of range, or a quantile has no error that it must reach.
+    Raises UserError if a number is out of range, or a quantile has no error that it must reach.
     """
 
     target_error: TargetError = None

@@ -263,7 +263,7 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
 
 def _etendue(renderer: DaylightRenderer) -> FloatArray:
     """Return open area times solid angle times transmittance of optics and air, one way [m^2 sr], shape (pixels,)."""
-    from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
+    from mitransient_lidar.transport.daylight.renderer import pixel_solid_angles
 
     receiver = renderer.scene.receiver
     optics = receiver.optics
@@ -274,7 +274,7 @@ def _etendue(renderer: DaylightRenderer) -> FloatArray:
 
 def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
     """Return the attributes of receiver and daylight; warn about a field of view beyond the surface."""
-    from mitransient_lidar.transport.daylight.sampling import share_outside_surface
+    from mitransient_lidar.transport.daylight.renderer import share_outside_surface
 
     scene, receiver = renderer.scene, renderer.scene.receiver
     outside = share_outside_surface(scene, renderer.sampler)

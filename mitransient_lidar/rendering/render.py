@@ -183,6 +183,9 @@ def render(
 def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.Dataset:
     """Render a result again: the same bits on the same machine, unless options change it.
 
+    Raises UserError if the result does not contain its scene, a file of the scene has changed, shots were selected or
+    reordered, or an option is invalid.
+
     Parameters
     ----------
     result
@@ -197,12 +200,6 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     -------
     xarray.Dataset
         As from the function that rendered the result.
-
-    Raises
-    ------
-    UserError
-        If the result does not contain its scene, a file of the scene has changed, shots were selected or reordered, or
-        an option is invalid.
     """
     import xarray
 
@@ -241,8 +238,7 @@ def _render(
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
-    from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
-    from mitransient_lidar.rendering.differences import Differences
+    from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
 
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]

@@ -43,11 +43,8 @@ def check_scene(probe: Probe) -> None:
     Warnings name shapes whose echo comes before or after the record, and shapes out of view, outside the beam, or
     partly in the air. They also report a laser and a receiver whose axes do not meet.
 
-    Raises
-    ------
-    UserError
-        If no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the record,
-        nothing in view reflects or scatters light, the record contains no echo, or a target lies below the bottom.
+    Raises UserError if no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the
+    record, nothing in view reflects or scatters light, the record contains no echo, or a target lies below the bottom.
     """
     scene, view, beam = probe.scene, probe.view, probe.beam
     if scene.submerged:

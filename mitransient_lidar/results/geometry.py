@@ -18,7 +18,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.lidar import refraction
+from mitransient_lidar.physics.lidar.level_sea import snell, solid_angle_per_area, surface_time_ns
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
@@ -102,11 +102,11 @@ class LinesOfSight:
         if np.any(down <= 0):
             raise UserError("angle_x and angle_y must point below the horizon: the lines of sight must meet the sea")
         off_nadir = np.arccos(np.minimum(down, 1))
-        time = refraction.surface_time_ns(axis.height, off_nadir)
+        time = surface_time_ns(axis.height, off_nadir)
         measured = optional_number(dataset.attrs, "surface_time_ns")
         if measured is not None:
             time = time + measured - time.mean()
-        water = np.cos(refraction.snell(off_nadir, axis.refractive_index))
+        water = np.cos(snell(off_nadir, axis.refractive_index))
         unknown = np.full(count, np.nan)
         return cls(x, y, off_nadir, time, np.zeros(count), axis.metres_per_ns * water, unknown)
 
@@ -159,7 +159,7 @@ class LinesOfSight:
         """
         depth = np.maximum(self.depth_of_time(np.broadcast_to(time_ns, (self.off_nadir.size, time_ns.size))), 0)
         theta = self.off_nadir[:, np.newaxis]
-        at, n = refraction.solid_angle_per_area, geometry.refractive_index
+        at, n = solid_angle_per_area, geometry.refractive_index
         return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
 
 

@@ -23,7 +23,7 @@ from mitransient_lidar.core.formats.las_waveforms import las_blocks
 from mitransient_lidar.core.formats.pulse_waves import pulse_blocks
 from mitransient_lidar.core.formats.waveform_blocks import WaveformBlock
 from mitransient_lidar.core.validation import finite, integer, require_memory
-from mitransient_lidar.physics.lidar import refraction
+from mitransient_lidar.physics.lidar.level_sea import snell, surface_time_ns
 from mitransient_lidar.results.attributes import check_attributes, step_of_history
 from mitransient_lidar.results.variables import label
 
@@ -218,8 +218,8 @@ def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known
     off_nadir = np.where(speed > 0, off_nadir, np.radians(values.get("off_nadir_deg", np.nan)))
     surface = np.where(np.isfinite(surface), surface, block.return_ns[rows])
     typical = {"off_nadir_deg": np.degrees(off_nadir), "altitude": place[:, 2] - first * step[:, 2] - level}
-    by_level = refraction.surface_time_ns(values.get("altitude", np.nan), off_nadir) - surface + 0 * level
-    water = np.cos(refraction.snell(off_nadir, values["refractive_index"]))
+    by_level = surface_time_ns(values.get("altitude", np.nan), off_nadir) - surface + 0 * level
+    water = np.cos(snell(off_nadir, values["refractive_index"]))
     zero = np.zeros(rows.size)
     lines = {
         **{"sight_x": zero, "sight_y": zero, "off_nadir": np.degrees(off_nadir), "beam_share": zero * np.nan},

@@ -22,8 +22,8 @@ from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import plugins_of
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
-from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import label

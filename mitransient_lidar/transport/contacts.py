@@ -70,10 +70,8 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
     up, or the smaller one to the side. If they look the same way, the smaller solid is moved, if it lies within the
     larger one.
 
-    Raises
-    ------
-    UserError
-        If a solid coincides with the water surface, or if it is not defined which one of two solids is seen.
+    Raises UserError if a solid coincides with the water surface, or if it is not defined which one of two solids is
+    seen.
     """
     # Waves coincide with nothing.
     waves = [sea for sea in scene.seas if np.isfinite(sea.sea.cell_size)]

@@ -11,10 +11,9 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.axis_limits import COLUMN_LEVEL, Cone, LidarView, Solid
+from mitransient_lidar.physics.lidar.axis_limits import COLUMN_LEVEL, Cone, LidarView, Solid, system_attenuation
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
@@ -45,10 +44,7 @@ def fitted_axis(
 
     `shifts` are horizontal displacements of a lidar above water [m]: the bins contain the light at all its positions.
 
-    Raises
-    ------
-    UserError
-        If the bins are too many.
+    Raises UserError if the bins are too many.
     """
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns

@@ -9,7 +9,7 @@ between techniques that find the same path add up to 1 in any water, and are not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
-from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam
+from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam
 from mitransient_lidar.transport.medium.tabulated_phase import half_angle
 from mitransient_lidar.transport.opaque import aligned, opaque
 
@@ -32,49 +32,30 @@ Sums = list[Any]
 
 @dataclass(frozen=True)
 class LayerChange:
-    """A perturbation's additions per metre and per scattering event between two depths.
+    """A perturbation's additions per metre and per scattering event between two depths."""
 
-    Attributes
-    ----------
-    top, bottom
-        Depths [m], -inf and inf for no limit.
-    per_metre, per_event
-        Addition for each metre travelled [1/m], and for each scattering event by water.
-    by_angle
-        Addition by scattering angle for each of these events, at nodes that are uniform in ln s from `DEFAULT_LOG_S0`
-        to 0 with s = sin^2(theta/2), shape (DEFAULT_COUNT,); or None.
-    """
-
+    #: Depths [m], -inf and inf for no limit.
     top: float
     bottom: float
+    #: Addition for each metre travelled [1/m], and for each scattering event by water.
     per_metre: float = 0.0
     per_event: float = 0.0
+    #: Addition by scattering angle for each of these events, at nodes that are uniform in ln s from `DEFAULT_LOG_S0` to
+    #: 0 with s = sin^2(theta/2), shape (DEFAULT_COUNT,); or None.
     by_angle: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A change in water and solids by a parameter: the derivative of a path contribution's logarithm.
+    """A change in water and solids by a parameter: the derivative of a path contribution's logarithm."""
 
-    Attributes
-    ----------
-    layers
-        Additions by water between depths.
-    solids
-        Solids with the addition by each reflection.
-    focusing
-        Derivative of `RippleFocusing.factors`; None where they do not change.
-    ripples
-        Sea ripples with the parameter below and above its value, and the difference between these values; None where
-        they do not change.
-    beam
-        Change in a Gaussian beam's logarithmic widths with the parameter; None where they do not change.
-    """
-
-    layers: tuple[LayerChange, ...] = ()
-    solids: tuple[tuple[mi.Shape, float], ...] = ()
-    focusing: FloatArray | None = None
+    layers: tuple[LayerChange, ...] = ()  #: Additions by water between depths.
+    solids: tuple[tuple[mi.Shape, float], ...] = ()  #: Solids with the addition by each reflection.
+    focusing: FloatArray | None = None  #: Derivative of `RippleFocusing.factors`; None where they do not change.
+    #: Sea ripples with the parameter below and above its value, and the difference between these values; None where
+    #: they do not change.
     ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
+    #: Change in a Gaussian beam's logarithmic widths with the parameter; None where they do not change.
     beam: float | None = None
 
 
@@ -157,6 +138,8 @@ class Perturbations:
     def __init__(self, perturbations: Sequence[Perturbation] = ()) -> None:
         self.perturbations = tuple(perturbations)
         self._layers = [[_Layer(change) for change in one.layers] for one in self.perturbations]
+        self._travelled = [[layer for layer in layers if layer.travels] for layers in self._layers]
+        self._scattered = [[layer for layer in layers if layer.scatters] for layers in self._layers]
         self._solids = [[(solid, opaque(addition)) for solid, addition in one.solids] for one in self.perturbations]
         self._tables: list[_Tables] = []
         for one, layers in zip(self.perturbations, self._layers, strict=True):
@@ -173,6 +156,11 @@ class Perturbations:
         self._tables.append(_Tables())
         return len(self._tables) - 1
 
+    @staticmethod
+    def _with(sums: Sums, parts: Sequence[Sequence[Any]], addition: Callable[[Any], mi.Float]) -> Sums:
+        """Return sums with the additions of each perturbation's parts."""
+        return [sum(map(addition, some), total) for total, some in zip(sums, parts, strict=True)]
+
     @property
     def count(self) -> int:
         """Number of perturbations."""
@@ -186,23 +174,13 @@ class Perturbations:
         self, sums: Sums, depth: mi.Float, downward: mi.Float, length: mi.Float, active: mi.Bool | bool = True
     ) -> Sums:
         """Return sums beyond segments in water: depth of their start [m], downward component, length [m]."""
-        found = []
-        for before, layers in zip(sums, self._layers, strict=True):
-            for layer in layers:
-                if layer.travels:
-                    before = before + dr.select(mi.Bool(active), layer.along(depth, downward, length), 0)
-            found.append(before)
-        return found
+        return self._with(
+            sums, self._travelled, lambda one: dr.select(mi.Bool(active), one.along(depth, downward, length), 0)
+        )
 
     def about(self, sums: Sums, depth: mi.Float, length: mi.Float) -> Sums:
         """Return sums of light that is carried on about depths [m] by small lengths [m], negative on the way back."""
-        found = []
-        for total, layers in zip(sums, self._layers, strict=True):
-            for layer in layers:
-                if layer.travels:
-                    total = total + layer.about(depth, length)
-            found.append(total)
-        return found
+        return self._with(sums, self._travelled, lambda one: one.about(depth, length))
 
     def at_event(
         self,
@@ -226,24 +204,18 @@ class Perturbations:
             cell = dr.minimum(mi.UInt32(dr.maximum(place, 0)), DEFAULT_COUNT - 2)
             fraction = place - mi.Float(cell)
             by_angle = [tables.at(depth, cell, fraction) for tables in self._tables]
-        found = []
-        for total, layers in zip(sums, self._layers, strict=True):
-            for layer in layers:
-                if layer.scatters:
-                    addition = layer.at_event(depth, by_angle)
-                    addition = addition if share is None else addition * share
-                    total = total + dr.select(mi.Bool(active), addition, 0)
-            found.append(total)
-        return found
+
+        def addition(layer: _Layer) -> mi.Float:
+            own = layer.at_event(depth, by_angle)
+            return dr.select(mi.Bool(active), own if share is None else own * share, 0)
+
+        return self._with(sums, self._scattered, addition)
 
     def at_solid(self, sums: Sums, shape: mi.ShapePtr, active: mi.Bool | bool = True) -> Sums:
         """Return sums beyond reflections by solids."""
-        found = []
-        for total, solids in zip(sums, self._solids, strict=True):
-            for solid, addition in solids:
-                total = total + dr.select(mi.Bool(active) & (shape == mi.ShapePtr(solid)), addition, 0)
-            found.append(total)
-        return found
+        return self._with(
+            sums, self._solids, lambda one: dr.select(mi.Bool(active) & (shape == mi.ShapePtr(one[0])), one[1], 0)
+        )
 
     def at_laser(self, sums: Sums, profile: BeamProfile, angle_x: mi.Float, angle_y: mi.Float) -> Sums:
         """Return the sums for paths that leave the laser, with a beam profile, at tangent-plane angles [rad]."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refract_level
-from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.physics.lidar.level_sea import refract_level
+from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.merging.packed_store import PackedStore
+from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
@@ -36,62 +36,34 @@ _FIELDS = dict.fromkeys(("before", "passed", "scatterings", "index_layer"), "UIn
 
 @dataclass(kw_only=True)
 class CrossingPath(RandomWalkPath):
-    """A path with its entry into the water, and its side of each plane.
+    """A path with its entry into the water, and its side of each plane."""
 
-    Attributes
-    ----------
-    entry, entry_direction, entry_length
-        Start of its first segment in the water [m], unit direction, and optical length up to there [m].
-    entered
-        Whether it has entered the water.
-    submerged
-        Whether its last segment lies in water.
-    passed
-        Number of planes at or above it, stored because rounding could lose or repeat crossings if it were recomputed.
-    """
-
+    #: Start of its first segment in the water [m], unit direction, and optical length up to there [m].
     entry: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
     entry_direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
     entry_length: mi.Float = field(default_factory=lambda: mi.Float(0))
-    entered: mi.Bool = field(default_factory=lambda: mi.Bool(False))
-    submerged: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    entered: mi.Bool = field(default_factory=lambda: mi.Bool(False))  #: Whether it has entered the water.
+    submerged: mi.Bool = field(default_factory=lambda: mi.Bool(False))  #: Whether its last segment lies in water.
+    #: Number of planes at or above it, stored because rounding could lose or repeat crossings if it were recomputed.
     passed: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
 
 @dataclass(frozen=True)
 class PlaneCrossings:
-    """Plane crossings, one per element.
+    """Plane crossings, one per element."""
 
-    Attributes
-    ----------
-    plane
-        Plane number.
-    downward
-        Whether it is crossed downwards.
-    x, y
-        Position [m].
-    weight
-        Light energy [J].
-    length
-        Optical path length up to the crossing [m].
-    scatterings
-        Number of scattering events before.
-    shift_x, shift_y
-        Horizontal distance from its crossing without scattering in the water [m].
-    delay
-        Delay against that crossing [s].
-    """
-
-    plane: NDArray[np.int64]
-    downward: NDArray[np.bool_]
+    plane: NDArray[np.int64]  #: Plane number.
+    downward: NDArray[np.bool_]  #: Whether it is crossed downwards.
+    #: Position [m].
     x: FloatArray
     y: FloatArray
-    weight: FloatArray
-    length: FloatArray
-    scatterings: NDArray[np.int64]
+    weight: FloatArray  #: Light energy [J].
+    length: FloatArray  #: Optical path length up to the crossing [m].
+    scatterings: NDArray[np.int64]  #: Number of scattering events before.
+    #: Horizontal distance from its crossing without scattering in the water [m].
     shift_x: FloatArray
     shift_y: FloatArray
-    delay: FloatArray
+    delay: FloatArray  #: Delay against that crossing [s].
 
     def select(self, which: NDArray[np.bool_]) -> PlaneCrossings:
         """Return the crossings where `which` is true."""

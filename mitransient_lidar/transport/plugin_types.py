@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
@@ -14,8 +14,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.sea.resolution import Footprint
-from mitransient_lidar.physics.sea.shoaling import BottomDepths
-from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
+from mitransient_lidar.transport.laser import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -45,14 +44,12 @@ class Transmitter(Protocol):
     angular_spread: float
     widest_angular_spread: float
 
-    def intensity_at(self, angle_x: mi.Float, angle_y: mi.Float, cos_axis: mi.Float) -> mi.Float:
-        """Return the radiant intensity [J/sr] at a tangent-plane point whose direction has a cosine with the axis."""
-
-    def tangent_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
-        """Return the share of the energy per tangent-plane area [1/rad^2]."""
-
-    def sample_tangent(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers in the unit square to tangent-plane points distributed as the beam's energy."""
+    #: Radiant intensity [J/sr] at a tangent-plane point, by the cosine of its direction with the axis.
+    intensity_at: Callable[[mi.Float, mi.Float, mi.Float], mi.Float]
+    #: Share of the energy per tangent-plane area [1/rad^2] at a point of the tangent plane.
+    tangent_density: Callable[[mi.Float, mi.Float], mi.Float]
+    #: Map of uniform numbers in the unit square to tangent-plane points distributed as the beam's energy.
+    sample_tangent: Callable[[mi.Point2f], tuple[mi.Float, mi.Float]]
 
 
 @runtime_checkable
@@ -69,12 +66,9 @@ class SunEmitter(Daylight, Protocol):
     direction: FloatArray
     irradiance: float
     sampled_irradiance: float
-
-    def radiance(self, direction: mi.Vector3f) -> mi.Float:
-        """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
-
-    def sample(self, u: mi.Point2f) -> mi.Vector3f:
-        """Map uniform numbers to directions within the disc."""
+    #: Radiance in a direction [W m^-2 sr^-1 nm^-1], and map of uniform numbers to directions within the disc.
+    radiance: Callable[[mi.Vector3f], mi.Float]
+    sample: Callable[[mi.Point2f], mi.Vector3f]
 
 
 class SkyEmitter(Daylight, Protocol):
@@ -83,9 +77,8 @@ class SkyEmitter(Daylight, Protocol):
     distribution: str
     sun: FloatArray
     irradiance: float
-
-    def radiance(self, direction: mi.Vector3f) -> mi.Float:
-        """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
+    #: Radiance in a direction [W m^-2 sr^-1 nm^-1].
+    radiance: Callable[[mi.Vector3f], mi.Float]
 
 
 @runtime_checkable
@@ -109,49 +102,22 @@ class SeaShape(Protocol):
     sea: sea_surface.SeaSurface
     has_ripples: bool
     footprints: Sequence[Footprint] | None
-
-    @property
-    def time_s(self) -> float:
-        """Wave time [s]."""
-
-    @property
-    def footprint_size(self) -> float:
-        """Side of the fine patch [m], without an automatic margin for scattered light."""
-
-    def fit(self, footprints: Sequence[Footprint], depths: BottomDepths | None = None) -> bool:
-        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed.
-
-        Waves may follow bottom depths.
-        """
-
-    def rippled(self, refractive_index: float) -> mi.BSDF:
-        """Return the BSDF of a level sea, all of whose slopes are ripples."""
-
-    def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
-        """Return the ripple BSDF with the sea's ripple slope variances times a factor."""
+    #: Wave time [s], and side of the fine patch without an automatic margin for scattered light [m].
+    time_s: float
+    footprint_size: float
+    #: As `OceanSurface` documents them.
+    fit: Callable[..., bool]
+    rippled: Callable[[float], mi.BSDF]
+    scaled_ripples: Callable[[float, float], mi.BSDF]
 
 
 @runtime_checkable
 class SeabedShape(Protocol):
-    """The shape ``seabed``."""
+    """The shape ``seabed``: reflectance, None where it is not even; height map, or None; places beyond it [m]."""
 
-    @property
-    def uniform_reflectance(self) -> float | None:
-        """Reflectance of bottom and patches, None where they differ."""
-
-    @property
-    def height_map(self) -> HeightMap | None:
-        """Bottom height map; None without one."""
-
-    def is_beyond_map(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Return whether places [m] lie beyond the height map; nowhere without one."""
-
-
-@runtime_checkable
-class OpenShape(Protocol):
-    """The shape ``canopy``, whose gaps beam and view share."""
-
-    shares_gaps: bool
+    uniform_reflectance: float | None
+    height_map: HeightMap | None
+    is_beyond_map: Callable[[FloatArray, FloatArray], BoolArray]
 
 
 @runtime_checkable

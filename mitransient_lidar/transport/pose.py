@@ -23,21 +23,13 @@ class KernelPose(Pose):
     """One pose for all paths, or the poses of their shots, as kernels read them.
 
     Poses for several shots serve paths alone: `direction`, `tangent`, `point` and `RelativePose`.
-
-    Parameters
-    ----------
-    delay
-        Length that is added to relative lengths [m], per shot.
-    lanes
-        Lanes of the paths that have their shot's pose; none if all paths have one pose.
-    frame_origin
-        Frame origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
     """
 
     OF_SHOTS = ("lanes",)
 
-    delay: float | FloatArray = 0.0
-    lanes: Lanes | None = None
+    delay: float | FloatArray = 0.0  #: Length that is added to relative lengths [m], per shot.
+    lanes: Lanes | None = None  #: Lanes of the paths that have their shot's pose; none if all paths have one pose.
+    #: Frame origin in the scene [m], shape (3,): not 0 in a scene far from its own origin.
     frame_origin: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def in_frame(self, frame_origin: FloatArray) -> Self:

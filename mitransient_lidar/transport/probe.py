@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
-from mitransient_lidar.transport.medium.snell import refract
+from mitransient_lidar.transport.medium.index_layers import refract
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
@@ -41,23 +41,15 @@ _MOST_PIXELS = 1024
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays in a view or in a beam.
+    """Rays in a view or in a beam."""
 
-    Attributes
-    ----------
-    scene, pose
-        Scene, and pose from which the rays start.
-    angles, direction
-        Tangent-plane angles and unit directions.
-    seen
-        Which rays count: in a view the rays that pixels see, in a beam all.
-    """
-
+    #: Scene, and pose from which the rays start.
     scene: WaterScene
     pose: KernelPose
+    #: Tangent-plane angles and unit directions.
     angles: mi.Point2f
     direction: mi.Vector3f
-    seen: mi.Bool
+    seen: mi.Bool  #: Which rays count: in a view the rays that pixels see, in a beam all.
 
     @classmethod
     def of_view(cls, scene: WaterScene, sampler: SensorSampler) -> Rays:
@@ -164,33 +156,20 @@ class SolidEcho:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Expected echo arrival, weighted by the laser beam.
+    """Expected echo arrival, weighted by the laser beam."""
 
-    Attributes
-    ----------
-    surface_ns, bottom_ns
-        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo from the first solid
-        under water [ns], shape (pixels, 2) each; NaN without one.
-    missed_beam
-        Share of the beam inside the field of view that passes outside the surface mesh, without light that solids in
-        the air intercept.
-    dry_ns
-        Earliest and latest arrival of the echo from land and other solids in the air [ns], shape (pixels, 2).
-    on_land
-        Share of the beam inside the field of view that meets them.
-    pierced
-        Solids visible in the air that reach below the crests of the sea.
-    solids
-        Echoes from the solids that rays in beam and view meet, in the air and under water.
-    """
-
+    #: Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo from the first solid under
+    #: water [ns], shape (pixels, 2) each; NaN without one.
     surface_ns: FloatArray
     bottom_ns: FloatArray
+    #: Share of the beam inside the field of view that passes outside the surface mesh, without light that solids in the
+    #: air intercept.
     missed_beam: float
+    #: Earliest and latest arrival of the echo from land and other solids in the air [ns], shape (pixels, 2).
     dry_ns: FloatArray
-    on_land: float
-    pierced: list[mi.Shape]
-    solids: list[SolidEcho]
+    on_land: float  #: Share of the beam inside the field of view that meets them.
+    pierced: list[mi.Shape]  #: Solids visible in the air that reach below the crests of the sea.
+    solids: list[SolidEcho]  #: Echoes from the solids that rays in beam and view meet, in the air and under water.
 
 
 class Probe:

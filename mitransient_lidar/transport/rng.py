@@ -18,17 +18,10 @@ Tree = TypeVar("Tree")
 
 @dataclass(frozen=True)
 class Lanes:
-    """Kernel lanes that belong to the shots in a pass.
+    """Kernel lanes that belong to the shots in a pass."""
 
-    Attributes
-    ----------
-    shots
-        Number of shots.
-    shot, number
-        Each lane's shot number, and its path's number within the shot.
-    """
-
-    shots: int
+    shots: int  #: Number of shots.
+    #: Each lane's shot number, and its path's number within the shot.
     shot: mi.UInt32
     number: mi.UInt32
 

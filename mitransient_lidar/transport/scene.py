@@ -15,14 +15,13 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain, range_time_ns
-from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.lidar.level_sea import LevelSea, refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.plugin_types import OpenShape, SeaShape, Transmitter
+from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.solids import box_of, children, scene_of_shapes
@@ -71,43 +70,23 @@ class ScenePart:
 
 @dataclass(frozen=True)
 class WaterScene:
-    """Receiver, water and sea surface in a scene.
-
-    Attributes
-    ----------
-    mitsuba_scene
-        The Mitsuba scene.
-    receiver
-        Pose, aperture and pixels of the sensor.
-    water
-        Its water, or None in a scene without water.
-    surfaces
-        Shapes that bound the water, with it as interior medium.
-    slope_variance
-        Total slope variance of the sea, for sampling surface connections.
-    parts
-        Scene parts at locations that differ between shots, in place of `mitsuba_scene`; none for a single shot.
-    receiver_poses
-        Pose of the receiver in each shot, where they differ.
-    perturbations
-        Changes of water and solids whose effect on each path is summed.
-    groups
-        Shape groups that instances repeat.
-    interpolates
-        Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
-    """
+    """Receiver, water and sea surface in a scene."""
 
     OF_SHOTS: ClassVar[tuple[str, ...]] = ("parts", "receiver_poses")
 
-    mitsuba_scene: mi.Scene
-    receiver: Receiver
-    water: Water | None
-    surfaces: list[mi.Shape]
-    slope_variance: float
+    mitsuba_scene: mi.Scene  #: The Mitsuba scene.
+    receiver: Receiver  #: Pose, aperture and pixels of the sensor.
+    water: Water | None  #: Its water, or None in a scene without water.
+    surfaces: list[mi.Shape]  #: Shapes that bound the water, with it as interior medium.
+    slope_variance: float  #: Total slope variance of the sea, for sampling surface connections.
+    #: Scene parts at locations that differ between shots, in place of `mitsuba_scene`; none for a single shot.
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
+    #: Pose of the receiver in each shot, where they differ.
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
+    #: Changes of water and solids whose effect on each path is summed.
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
-    groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)
+    groups: tuple[mi.Shape, ...] = field(default=(), kw_only=True)  #: Shape groups that instances repeat.
+    #: Whether a BSDF has an attribute that Mitsuba interpolates between vertices (`on_shapes`).
     interpolates: bool = field(default=False, kw_only=True)
 
     def with_parts_of(self, shapes: Sequence[mi.Shape]) -> Self:
@@ -193,7 +172,7 @@ class WaterScene:
     @property
     def has_shared_gaps(self) -> bool:
         """Whether a solid has gaps, finer than patches, through which both laser and receiver look."""
-        return any(isinstance(solid, OpenShape) and solid.shares_gaps for solid in self.solids)
+        return any(getattr(solid, "shares_gaps", False) for solid in self.solids)
 
     @property
     def has_veils(self) -> bool:
@@ -256,10 +235,8 @@ class WaterScene:
     def gate_train(self, plan: GatePlan) -> GateTrain:
         """Return the gates of a plan at their times, which waves do not change.
 
-        Raises
-        ------
-        UserError
-            If they start at a depth, and the receiver's axis does not meet the mean sea level, or is level under water.
+        Raises UserError if they start at a depth, and the receiver's axis does not meet the mean sea level, or is level
+        under water.
         """
         pose, start = self.receiver.pose, plan.start
         meets_sea = bool(self.surfaces) and pose.looks_down
@@ -414,28 +391,15 @@ class WaterScene:
 
 @dataclass(frozen=True)
 class LidarScene(WaterScene):
-    """A scene with a transmitter, and a receiver that records the time of arrival.
-
-    Attributes
-    ----------
-    transmitter
-        The ``lidar_transmitter``.
-    axis
-        Time bins of the record.
-    record_end
-        Source of the last light in the record, where the scene decides its end.
-    gates
-        Gates of the ``time_gated_film``, or None.
-    transmitter_poses
-        Pose of the transmitter in each shot, where they differ.
-    """
+    """A scene with a transmitter, and a receiver that records the time of arrival."""
 
     OF_SHOTS = (*WaterScene.OF_SHOTS, "transmitter_poses")
 
-    transmitter: Transmitter
-    axis: TimeAxis
-    gates: GatePlan | None
-    record_end: str = ""
+    transmitter: Transmitter  #: The ``lidar_transmitter``.
+    axis: TimeAxis  #: Time bins of the record.
+    gates: GatePlan | None  #: Gates of the ``time_gated_film``, or None.
+    record_end: str = ""  #: Source of the last light in the record, where the scene decides its end.
+    #: Pose of the transmitter in each shot, where they differ.
     transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
 
     @property

@@ -16,7 +16,6 @@ from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
-from mitransient_lidar.transport.bottom_depths import bottom_depths
 from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
@@ -33,7 +32,7 @@ from mitransient_lidar.transport.plugin_types import (
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.solids import children, shape_groups, without_unseen
+from mitransient_lidar.transport.solids import bottom_depths, children, shape_groups, without_unseen
 
 logger = logging.getLogger(__name__)
 
@@ -65,10 +64,7 @@ def find_lidar_scene(
     `axis` gives the time bins that the film does not; without it they contain the light at all lidar positions, above
     water displaced by `shifts` (x, y) [m].
 
-    Raises
-    ------
-    UserError
-        When a part is missing, not supported, or there are several where one is allowed.
+    Raises UserError when a part is missing, not supported, or there are several where one is allowed.
     """
     fit_seas(scene)
     receiver = receiver or find_receiver(sensor)
@@ -99,10 +95,7 @@ def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
 
     `wanted` is another receiver's id.
 
-    Raises
-    ------
-    UserError
-        If the scene has none, or none with that id.
+    Raises UserError if the scene has none, or none with that id.
     """
     sensors = scene.sensors()
     receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
@@ -185,11 +178,8 @@ def seas_of(scene: mi.Scene) -> list[SeaShape]:
 def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
     """Return the water, and the solids that have an effect on light, none of which coincide in a face.
 
-    Raises
-    ------
-    UserError
-        As `find_water`, `shape_groups` and `separate_contacts`, for mirrored spheres, and for BSDFs that Mitsuba cannot
-        evaluate.
+    Raises UserError as `find_water`, `shape_groups` and `separate_contacts`, for mirrored spheres, and for BSDFs that
+    Mitsuba cannot evaluate.
     """
     # Mitsuba's own loader joins meshes of equal BSDFs, without a bounding box.
     joined = [shape for shape in scene.shapes() if not shape.bbox().valid()]
@@ -267,10 +257,7 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
 
     The slope variance belongs to the roughest surface, or is a typical one without ``ocean_surface``.
 
-    Raises
-    ------
-    UserError
-        When a medium is not supported or in the wrong place, or there are several.
+    Raises UserError when a medium is not supported or in the wrong place, or there are several.
     """
     surfaces: list[mi.Shape] = []
     waters: list[Water] = []

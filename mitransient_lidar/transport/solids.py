@@ -1,8 +1,9 @@
-"""Solids as light meets them: without ineffective ones, and with instances in place of the shapes that they repeat."""
+"""Solids as light meets them, without ineffective ones, as instances; depths of the bottom, which waves follow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.sea_surface import DEEP
+from mitransient_lidar.physics.sea.shoaling import BottomDepths
+from mitransient_lidar.transport.opaque import aligned_ray
 
 #: BSDFs that have no effect where the indices of refraction on both sides are equal.
 _DIELECTRICS = ("SmoothDielectric", "ThinDielectric")
@@ -48,10 +52,7 @@ def children(parent: mi.Object) -> list[mi.Object]:
 def shape_groups(scene: mi.Scene) -> tuple[mi.Shape, ...]:
     """Return the shape groups that a scene's instances repeat.
 
-    Raises
-    ------
-    UserError
-        If one of them bounds a medium.
+    Raises UserError if one of them bounds a medium.
     """
     groups = tuple(child for child in children(scene) if child.class_name().startswith("ShapeGroup"))
     for group in groups:
@@ -136,3 +137,50 @@ def met_shape(si: mi.SurfaceInteraction3f) -> mi.ShapePtr:
 def met_numbers(si: mi.SurfaceInteraction3f) -> NDArray[np.uint32]:
     """Return the numbers of the shapes that rays meet, as by `shape_number`; 0 where they meet none."""
     return np.array(dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, met_shape(si)), 0))
+
+
+#: Smallest bottom side over the largest solid's side: waves do not follow targets and piers.
+_BOTTOM_PER_LARGEST = 0.25
+
+#: Distance of locations from the bottoms' edges, and of ray starts above them [m].
+_MARGIN = 1e-3
+
+
+def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
+    """Return a scene's bottom depths in its frame, None without a bottom.
+
+    Bottoms are the solids whose shorter horizontal side is at least a quarter of the largest solid's. Beyond them the
+    depth is the depth of their nearest edge.
+    """
+    shapes = [
+        shape
+        for shape in scene.shapes()
+        if not shape.is_medium_transition() and shape.bbox().valid() and shape.class_name() != "Instance"
+    ]
+    sides = [float((high - low)[:2].min()) for low, high in map(box_of, shapes)]
+    largest = max(sides, default=0.0)
+    found = [shape for shape, side in zip(shapes, sides, strict=True) if side >= _BOTTOM_PER_LARGEST * largest]
+    if not largest > 0:
+        return None
+    boxes = np.array([box_of(shape) for shape in found])
+    lowest, highest = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    alone = cache(partial(scene_of_shapes, tuple(found), ()))
+
+    def depths(x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return depths [m] on grid lines [m], shape (len(y), len(x)): of the nearest place in the box, or `DEEP`."""
+        if lowest[2] == highest[2]:
+            return np.full((len(y), len(x)), -lowest[2])
+        lines = (
+            np.clip(values, low + _MARGIN, high - _MARGIN)
+            for values, low, high in zip((x, y), lowest, highest, strict=False)
+        )
+        east, north = (values.ravel() for values in np.meshgrid(*lines))
+        top = float(highest[2]) + _MARGIN
+        origins = np.stack([east, north, np.full(east.size, top)], axis=1)
+        down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
+        met = alone().ray_intersect_preliminary(aligned_ray(origins, down, np.full(east.size, np.inf)))
+        distance = np.array(met.t, dtype=np.float64)
+        depth = np.where(np.isfinite(distance), distance - top, DEEP)
+        return np.asarray(depth.reshape(len(y), len(x)))
+
+    return BottomDepths(-float(highest[2]), depths)

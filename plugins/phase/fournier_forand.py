@@ -22,13 +22,7 @@ class FournierForand(TabulatedPhaseFunction):
     The function has a singularity at 0 degrees. It is tabulated as power laws of :math:`s = \sin^2(\theta/2)` over
     twelve decades and sampled exactly, including angles below 2 microradian.
 
-    .. code-block:: xml
-
-        <phase type="fournier_forand">
-            <float name="backscatter_ratio" value="0.04"/>
-        </phase>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'fournier_forand', 'backscatter_ratio': 0.04}
     """

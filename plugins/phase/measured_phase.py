@@ -6,7 +6,7 @@ import logging
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import MEASURED_PHASE
-from mitransient_lidar.physics.water.phase_file import read_phase_table
+from mitransient_lidar.physics.water.phase_table import read_phase_table
 from mitransient_lidar.plugins.bases import DeclaredProperties, register
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
@@ -22,15 +22,9 @@ class MeasuredPhase(TabulatedPhaseFunction):
     .. parameters::
 
     Interpolated in log-log, and extrapolated below the first angle with the power law of the first two
-    (`mitransient_lidar.physics.water.phase_file.read_phase_table`).
+    (`mitransient_lidar.physics.water.phase_table.read_phase_table`).
 
-    .. code-block:: xml
-
-        <phase type="measured_phase">
-            <string name="filename" value="harbour.csv"/>
-        </phase>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'measured_phase', 'filename': 'harbour.csv'}
     """

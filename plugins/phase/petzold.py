@@ -21,13 +21,7 @@ class Petzold(TabulatedPhaseFunction):
     The average particle is the table in Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
     0.0183 and a mean cosine of 0.924. The waters include scattering by pure water.
 
-    .. code-block:: xml
-
-        <phase type="petzold">
-            <string name="water" value="coastal"/>
-        </phase>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'petzold', 'water': 'coastal'}
     """

@@ -19,11 +19,7 @@ class SeaWater(TabulatedPhaseFunction):
     :math:`p \propto 1 + \frac{1 - \delta}{1 + \delta} \cos^2 \theta` (Morel 1974), with a backscatter ratio of 0.5.
     The ``layered_water`` parameter ``water_scattering`` mixes it with the particles' function.
 
-    .. code-block:: xml
-
-        <phase type="sea_water"/>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'sea_water'}
     """

@@ -15,23 +15,9 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
 
     def __init__(self, props: mi.Properties, table: PowerLawTable) -> None:
         super().__init__(props)
-        self.tabulated = TabulatedPhase(table)
+        self.tabulated = self.functions = TabulatedPhase(table)
+        self.number = mi.UInt32(0)
         self.backscatter_ratio = table.backscatter_ratio
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
 
-    def eval_pdf(
-        self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> tuple[mi.Spectrum, mi.Float]:
-        """Return the phase function [1/sr] of a direction, as value and density."""
-        return NumberedPhase(self.tabulated, mi.UInt32(0)).eval_pdf(ctx, mei, wo, active)
-
-    def sample(
-        self,
-        ctx: mi.PhaseFunctionContext,
-        mei: mi.MediumInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
-        """Sample a direction distributed as the phase function."""
-        return NumberedPhase(self.tabulated, mi.UInt32(0)).sample(ctx, mei, sample1, sample2, active)
+    eval_pdf, sample = NumberedPhase.eval_pdf, NumberedPhase.sample

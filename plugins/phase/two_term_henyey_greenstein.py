@@ -21,15 +21,7 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
 
     (Haltrin 2002, doi:10.1364/AO.41.001022). Mean cosine :math:`w g_f - (1-w) g_b`.
 
-    .. code-block:: xml
-
-        <phase type="two_term_henyey_greenstein">
-            <float name="weight" value="0.98"/>
-            <float name="g_forward" value="0.93"/>
-            <float name="g_backward" value="0.3"/>
-        </phase>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'two_term_henyey_greenstein', 'weight': 0.98, 'g_forward': 0.93, 'g_backward': 0.3}
     """

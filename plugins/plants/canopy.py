@@ -39,20 +39,12 @@ class CanopyShape(mi.Mesh):
     Plants stand in a square, on the level ``depth``, or on a ``seabed`` to which a reference is nested, as
     ``<ref id="bottom"/>`` in the scene ``seagrass``.
 
-    .. code-block:: xml
+    .. example::
 
-        <shape type="canopy">
-            <float name="depth" value="5"/>
-            <float name="leaf_area_index" value="1.5"/>
-            <float name="height" value="0.8"/>
-        </shape>
-
-    .. code-block:: python
-
-        {'type': 'canopy', 'depth': 3.0, 'leaf_area_index': 2.0, 'form': 'leaves', 'leaf_width': 0.03}
+        {'type': 'canopy', 'depth': 5.0, 'leaf_area_index': 1.5, 'height': 0.8}
     """
 
-    #: Solids of a scene with it are not merged (`transport.plugin_types.OpenShape`).
+    #: Solids of a scene with it are not merged (`WaterScene.has_shared_gaps`).
     shares_gaps = True
 
     def __init__(self, props: DeclaredProperties) -> None:

@@ -7,11 +7,10 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import LEAF
-from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
+from mitransient_lidar.plugins.bases import DeclaredProperties, SampledBSDF, register
 
 
-@closed
-class Leaf(mi.BSDF):
+class Leaf(SampledBSDF):
     r"""Plant leaf (``leaf``).
 
     .. parameters::
@@ -21,63 +20,31 @@ class Leaf(mi.BSDF):
 
     .. math:: f = \frac{R}{\pi} \text{ on the side of the light}, \quad f = \frac{T}{\pi} \text{ on the other side}.
 
-    .. code-block:: xml
-
-        <bsdf type="leaf">
-            <float name="reflectance" value="0.08"/>
-            <float name="transmittance" value="0.1"/>
-        </bsdf>
-
-    .. code-block:: python
+    .. example::
 
         {'type': 'leaf', 'reflectance': 0.08, 'transmittance': 0.1}
     """
 
     def __init__(self, props: DeclaredProperties) -> None:
-        super().__init__(props)
+        sides = mi.BSDFFlags.FrontSide.value | mi.BSDFFlags.BackSide.value
+        kinds = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.DiffuseTransmission
+        super().__init__(props, *(kind.value | sides for kind in kinds))
         self.reflectance, self.transmittance = props.read("reflectance"), props.read("transmittance")
         if self.reflectance + self.transmittance > 1:
             raise UserError(
                 f"reflectance = {self.reflectance:g} and transmittance = {self.transmittance:g} of a leaf must be at "
                 "most 1 together"
             )
-        sides = mi.BSDFFlags.FrontSide.value | mi.BSDFFlags.BackSide.value
-        kinds = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.DiffuseTransmission
-        self.m_components = [kind.value | sides for kind in kinds]
-        self.m_flags = self.m_components[0] | self.m_components[1]
 
-    def sample(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
-        """Sample a side, and a direction in proportion to its cosine; return it and BSDF times cosine over density."""
+    def draw(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Draw a side, and a direction in proportion to its cosine."""
         reflected, transmitted = self._shares(ctx)
         back = sample1 * (reflected + transmitted) < reflected
-        bs = dr.zeros(mi.BSDFSample3f)
         wo = mi.warp.square_to_cosine_hemisphere(sample2)
         up = (mi.Frame3f.cos_theta(si.wi) > 0) == back
-        bs.wo = mi.Vector3f(wo.x, wo.y, dr.select(up, wo.z, -wo.z))
-        bs.eta = 1.0
-        bs.sampled_component = dr.select(back, mi.UInt32(0), mi.UInt32(1))
-        bs.sampled_type = dr.select(back, *(mi.UInt32(component) for component in self.m_components))
-        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
-        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
-
-    def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Color1f:
-        """Return BSDF times cosine [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> mi.Float:
-        """Return the density with which `sample` draws a direction [1/sr]."""
-        return self.eval_pdf(ctx, si, wo, active)[1]
+        return mi.Vector3f(wo.x, wo.y, dr.select(up, wo.z, -wo.z)), dr.select(back, mi.UInt32(0), mi.UInt32(1))
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

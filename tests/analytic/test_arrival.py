@@ -12,7 +12,7 @@ from scipy.stats import norm
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.refraction import surface_time_ns
+from mitransient_lidar.physics.lidar.level_sea import surface_time_ns
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.paths.histogram import TransientHistogram
 

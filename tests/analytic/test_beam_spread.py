@@ -11,8 +11,8 @@ from oracles.echo_times import layered_time_ns
 from significance import largest_error, largest_z
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell
-from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.physics.lidar.level_sea import fresnel, snell
+from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath

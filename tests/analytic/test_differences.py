@@ -9,7 +9,7 @@ import significance
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.parameters import with_value
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
-from mitransient_lidar.rendering.differences import Differences
+from mitransient_lidar.rendering.derivatives import Differences
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

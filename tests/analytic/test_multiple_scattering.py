@@ -15,7 +15,7 @@ from oracles.refracted_path import refracted_path
 from significance import assert_same, largest_error, mean_and_error
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
+from mitransient_lidar.physics.lidar.level_sea import fresnel, solid_angle_per_area
 
 HEIGHT, G = 200.0, 0.9
 HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface

@@ -8,7 +8,7 @@ from oracles.half_space import phase_moments, water_leaving_reflectance
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.lidar.level_sea import fresnel, snell
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.transport.paths.path import ConnectedPath
 from mitransient_lidar.transport.rng import pass_streams

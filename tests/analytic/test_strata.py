@@ -6,7 +6,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.lidar.level_sea import fresnel
 
 HEIGHT, THETA, AREA = 200.0, np.radians(20.0), 0.025
 INDEX, GROUP, THICKNESS = np.array([1.34, 1.6, 1.2]), np.array([1.36, 1.25, 1.2]), np.array([2.0, 3.0, 3.0])

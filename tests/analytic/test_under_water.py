@@ -13,9 +13,9 @@ from significance import largest_error, largest_z
 import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.lidar.level_sea import fresnel
 from mitransient_lidar.rendering.accumulators import placed_gates
-from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+from mitransient_lidar.rendering.describe import lines_of_sight
 from mitransient_lidar.rendering.scene_checks import check_scene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
+from mitransient_lidar.physics.lidar.level_sea import snell, surface_time_ns
 
 
 def bottom_time_ns(

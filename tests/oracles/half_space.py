@@ -10,7 +10,7 @@ from numpy.polynomial.legendre import leggauss, legvander
 from scipy.special import roots_legendre
 
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
-from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.lidar.level_sea import fresnel
 
 # Trapezoid rule of the double exponential quadrature; halving the step changes H by less than 1e-11.
 _ABSCISSAE = np.linspace(-3.4, 3.4, 137)

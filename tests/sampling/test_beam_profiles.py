@@ -11,8 +11,7 @@ from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from rows import each_row
 from significance import assert_distribution, largest_z
 
-from mitransient_lidar.transport.laser.beam_profiles import GaussianBeam, ImageBeam, TopHatBeam
-from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.laser import BeamSampler, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.rng import pass_streams
 
 MRAD = 1e-3

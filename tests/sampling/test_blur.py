@@ -10,8 +10,7 @@ from scipy.special import erf
 from significance import assert_same, largest_z
 
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.sensor.point_spread import MeasuredPointSpread
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.receiver import MeasuredPointSpread, SensorSampler
 
 MRAD = 1e-3
 COUNT = 2**20

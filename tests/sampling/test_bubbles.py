@@ -9,8 +9,7 @@ from frequencies import assert_counts
 from significance import assert_same
 
 from mitransient_lidar.physics.water.bubbles import WindBubbles
-from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
 
 PLUME, LAYER = BubblePlume(0.8, 3.0, -2.0, np.radians(35), 20.0, 6.0, 2.5), BubbleLayer(0.8, 1.2)
 

@@ -10,7 +10,7 @@ from oracles.refracted_path import refracted_path
 from rows import each_row
 from significance import largest_chi2
 
-from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.lidar.level_sea import fresnel
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.transport.paths.refracted_connection import RefractedLaserSampler
 from mitransient_lidar.transport.pose import KernelPose

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import cos_in_water, fresnel
+from mitransient_lidar.physics.lidar.level_sea import cos_in_water, fresnel
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
+import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -201,6 +203,32 @@ class Plugin:
         for row in rows:
             lines += [f"   {'* - ' if not number else '  - '}{cell}".rstrip() for number, cell in enumerate(row)]
         return "\n".join(lines)
+
+    def manual(self, text: str, kind: str) -> str:
+        """Return the manual of a plugin of a kind, in whose text ``.. parameters::`` and ``.. example::`` stand.
+
+        The example, a dict, is the last part; it is shown in XML, too.
+        """
+        prose, _, given = text.replace(".. parameters::", self.table().replace("\n", "\n    ")).partition(
+            ".. example::"
+        )
+        blocks = {"xml": self._xml(kind, ast.literal_eval(given.strip())), "python": textwrap.dedent(given).strip()}
+        parts = [f".. code-block:: {name}\n\n{textwrap.indent(block, ' ' * 8)}\n" for name, block in blocks.items()]
+        return prose + "\n    ".join(parts) + "    "
+
+    def _xml(self, kind: str, values: Mapping[str, Any]) -> str:
+        """Return the XML of an object of a kind with values; of an object in it, its type alone."""
+        # The water is the interior of the sea.
+        names = {one: ' name="interior"' if one == "medium" else "" for one in (kind, "medium", "film")}
+        lines = []
+        for name, value in values.items():
+            if isinstance(value, dict):
+                inner = next((one.kind for one in self if one.name == name), name)
+                lines.append(f'    <{inner}{names[inner]} type="{value["type"]}"/>')
+            elif name != "type":
+                lines.append(f'    <{self[name].tag} name="{name}" value="{_shown(value)}"/>')
+        start = f'<{kind} type="{self.name}"{names[kind]}'
+        return "\n".join([f"{start}>", *lines, f"</{kind}>"]) if lines else f"{start}/>"
 
 
 def plugin(name: str, *parameters: Parameter, alternatives: tuple[tuple[tuple[str, ...], ...], ...] = ()) -> Plugin:

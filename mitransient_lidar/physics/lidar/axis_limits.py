@@ -1,4 +1,4 @@
-"""First and last arrival times in a lidar: the limits of a time axis that are not given."""
+"""First and last arrival times in a lidar: the limits of a time axis that are not given. System attenuation."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, non_negative_array
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -45,21 +47,11 @@ _NS_PER_M = 1e9 / C0
 
 @dataclass(frozen=True, eq=False)
 class Cone:
-    """Directions in the air within a laser beam or a field of view.
+    """Directions in the air within a laser beam or a field of view."""
 
-    Parameters
-    ----------
-    pose
-        Position above the sea level, and axis.
-    half_angles
-        Half angles along the two tangent-plane angles [rad].
-    is_round
-        Whether the cross-section is an ellipse instead of a rectangle.
-    """
-
-    pose: Pose
-    half_angles: tuple[float, float]
-    is_round: bool = True
+    pose: Pose  #: Position above the sea level, and axis.
+    half_angles: tuple[float, float]  #: Half angles along the two tangent-plane angles [rad].
+    is_round: bool = True  #: Whether the cross-section is an ellipse instead of a rectangle.
 
     def places(self, z: float, reach: float) -> FloatArray:
         """Return where its directions meet a height [m], x, y [m]; beyond `reach` [m] and above the horizon there."""
@@ -134,28 +126,17 @@ class AxisLimits:
 
 @dataclass(frozen=True, eq=False)
 class LidarView:
-    """Lidar geometry over a sea.
+    """Lidar geometry over a sea."""
 
-    Parameters
-    ----------
-    view, beam
-        Field of view with its blur, and beam.
-    sea, decay
-        Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
-    heights
-        Lowest and highest sea height [m].
-    reach
-        Horizontal distance to the end of the scene [m], where light towards the horizon ends.
-    column
-        Least depth of the last light from water without a bottom [m], such as light from bubbles; None without water.
-    """
-
+    #: Field of view with its blur, and beam.
     view: Cone
     beam: Cone
+    #: Index layers of the water below z = 0, and layers of system attenuation by which its signal decays.
     sea: LevelSea
     decay: WaterColumn
-    heights: tuple[float, float]
-    reach: float
+    heights: tuple[float, float]  #: Lowest and highest sea height [m].
+    reach: float  #: Horizontal distance to the end of the scene [m], where light towards the horizon ends.
+    #: Least depth of the last light from water without a bottom [m], such as light from bubbles; None without water.
     column: float | None
 
     def limits(self, solids: Sequence[Solid], direct: bool = False, dry: bool = False) -> AxisLimits:
@@ -272,3 +253,49 @@ class LidarView:
 def _sine(rays: FloatArray) -> FloatArray:
     """Return the sines of ray angles from the vertical, shape (n,)."""
     return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) / np.linalg.norm(rays, axis=1))
+
+
+SPOT_COEFFICIENT = 0.85
+"""Rate at which the system attenuation falls from c to Kd with the spot diameter in attenuation lengths."""
+
+
+def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diameter: npt.ArrayLike) -> FloatArray:
+    """One-way attenuation coefficient of a lidar's column signal.
+
+    Parameters
+    ----------
+    attenuation : array_like
+        Beam attenuation coefficient c [1/m], at least `kd`.
+    kd : array_like
+        Diffuse attenuation coefficient Kd of downwelling irradiance [1/m], at least 0.
+    spot_diameter : array_like
+        Diameter D of the spot on the sea surface that the lidar illuminates and views [m], at least 0.
+
+    Returns
+    -------
+    ndarray
+        K = Kd + (c - Kd) exp(-0.85 c D) [1/m], in the broadcast shape of the parameters. Without its geometric factors
+        the signal is proportional to exp(-2 K s) with the distance s in the water.
+
+    Notes
+    -----
+    Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996, solved the transfer by Monte Carlo for a level sea.
+    The signal decays exponentially over four attenuation lengths. It decays with c where the radius R of the spot in
+    view is far below 1/c, and with Kd where c R is above 5 to 6. Between them K depends on c and the whole volume
+    scattering function. The formula is a fit by which later authors represent such results, such as Churnside (2013),
+    Opt. Eng. 53, 051405, doi:10.1117/1.OE.53.5.051405, eq. 5. It uses the spot's diameter and therefore reaches Kd to
+    within 1 % of c - Kd at c R = 2.7 already.
+
+    The result is an order of magnitude. The formula does not distinguish the field of view from the beam. Nor is Kd a
+    strict limit: by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, the signal in a large field of view decays with
+    the absorption coefficient, which is below Kd.
+    """
+    c, diffuse, diameter = np.broadcast_arrays(
+        non_negative_array("attenuation", attenuation),
+        non_negative_array("kd", kd),
+        non_negative_array("spot_diameter", spot_diameter),
+    )
+    if np.any(diffuse > c):
+        worst = np.argmax(diffuse - c)
+        raise UserError(f"kd = {diffuse.flat[worst]:g} must not exceed attenuation = {c.flat[worst]:g}")
+    return np.asarray(diffuse + (c - diffuse) * np.exp(-SPOT_COEFFICIENT * c * diameter))

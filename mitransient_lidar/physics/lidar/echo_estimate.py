@@ -25,11 +25,11 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.lidar.level_sea import fresnel, snell, surface_time_ns, turn_by_slope
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_time_ns, turn_by_slope
-from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.two_way_spread import LARGEST_ANGLE, scattering_angles
 
 #: Nodes of phase functions at the angles by which paths turn, in sin^2(theta/2).
 _BACKWARD = np.linspace(0.05, 1, 192)

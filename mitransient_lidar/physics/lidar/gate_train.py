@@ -57,17 +57,6 @@ class GateShape:
 
     Build one with `edges`, `sampled` or `from_file`.
 
-    Parameters
-    ----------
-    width_ns : float
-        Time between the half heights of the two edges [ns].
-    rise_ns, fall_ns : float
-        Rising edge time from 10 to 90 %, and falling edge time from 90 to 10 % [ns].
-    times_ns, values : ndarray, shape (S,)
-        Samples of a measured gate, linear between them and 0 outside; empty for a gate with raised-cosine edges.
-    jitter_ns : float
-        Standard deviation of the gate's opening [ns], which the samples include.
-
     Notes
     -----
     An edge with full length L is sin^2(pi u / (2 L)) for 0 <= u <= L, half open in its middle. It is smooth and finite,
@@ -76,12 +65,15 @@ class GateShape:
     bins are, [0, width).
     """
 
-    width_ns: float
+    width_ns: float  #: Time between the half heights of the two edges [ns].
+    #: Rising edge time from 10 to 90 %, and falling edge time from 90 to 10 % [ns].
     rise_ns: float
     fall_ns: float
+    #: Samples of a measured gate, linear between them and 0 outside; empty for a gate with raised-cosine edges, shape
+    #: (S,).
     times_ns: FloatArray
     values: FloatArray
-    jitter_ns: float = 0.0
+    jitter_ns: float = 0.0  #: Standard deviation of the gate's opening [ns], which the samples include.
 
     @classmethod
     def edges(cls, width_ns: float, rise_ns: float = 0.0, fall_ns: float = 0.0) -> GateShape:
@@ -197,32 +189,18 @@ class GateTrain(Checked):
 
     Times count from the moment when the pulse peak leaves the transmitter. `measured` builds a train from a measured
     gate.
-
-    Parameters
-    ----------
-    start_ns : float
-        Half-height time of the first gate's rising edge [ns].
-    width_ns : float
-        Time between the half heights of a gate's edges [ns], greater than 0.
-    step_ns : float
-        Time from gate to gate [ns], greater than 0: gates overlap when it is below their width.
-    count : int
-        Number of gates, 1 to 100 000.
-    rise_ns, fall_ns : float
-        10-90 % times of the raised-cosine edges [ns], at least 0 and together at most 1.18 width_ns; 0 is sharp.
-    pulses : int
-        Pulses that each gate accumulates, 1 to 10^9.
-    profile : GateShape, optional
-        Measured gate instead of raised-cosine edges; `width_ns`, `rise_ns` and `fall_ns` must equal its own values.
     """
 
-    start_ns: float = checked(finite)
-    width_ns: float = checked(positive)
+    start_ns: float = checked(finite)  #: Half-height time of the first gate's rising edge [ns].
+    width_ns: float = checked(positive)  #: Time between the half heights of a gate's edges [ns], greater than 0.
+    #: Time from gate to gate [ns], greater than 0: gates overlap when it is below their width.
     step_ns: float = checked(positive)
-    count: int = checked(integer, 1, 100_000)
+    count: int = checked(integer, 1, 100_000)  #: Number of gates, 1 to 100 000.
+    #: 10-90 % times of the raised-cosine edges [ns], at least 0 and together at most 1.18 width_ns; 0 is sharp.
     rise_ns: float = checked(non_negative, default=0.0)
     fall_ns: float = checked(non_negative, default=0.0)
-    pulses: int = checked(integer, 1, 10**9, default=1)
+    pulses: int = checked(integer, 1, 10**9, default=1)  #: Pulses that each gate accumulates, 1 to 10^9.
+    #: Measured gate instead of raised-cosine edges; `width_ns`, `rise_ns` and `fall_ns` must equal its own values.
     profile: GateShape | None = None
 
     def __post_init__(self) -> None:

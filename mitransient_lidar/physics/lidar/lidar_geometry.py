@@ -1,4 +1,4 @@
-"""Co-located lidar over a level sea: ranges, depths and times along its axis, and parameters of the lidar equation."""
+"""Co-located lidar over a level sea: ranges, depths, times, and the lidar equation; definitions of divergence."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.fields import Read
 from mitransient_lidar.core.validation import Checked, FloatArray, checked, finite_array, in_range, positive
-from mitransient_lidar.physics.lidar import refraction
+from mitransient_lidar.physics.lidar.level_sea import fresnel, snell, solid_angle_per_area, surface_time_ns
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 
 
 def _below_horizon(name: str, value: float) -> float:
@@ -42,7 +42,7 @@ class LidarGeometry(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if math.isnan(self.surface_time_ns):
-            level = float(refraction.surface_time_ns(self.height, self.off_nadir))
+            level = float(surface_time_ns(self.height, self.off_nadir))
             object.__setattr__(self, "surface_time_ns", level)
 
     @classmethod
@@ -54,7 +54,7 @@ class LidarGeometry(Checked):
     @property
     def angle_in_water(self) -> float:
         """Angle of the axis from the vertical in the water [rad]."""
-        return float(refraction.snell(self.off_nadir, self.refractive_index))
+        return float(snell(self.off_nadir, self.refractive_index))
 
     @property
     def cos_water(self) -> float:
@@ -96,7 +96,7 @@ class LidarGeometry(Checked):
     def solid_angle_per_area(self, path: npt.ArrayLike) -> FloatArray:
         """Return the solid angle of the aperture per area [sr/m^2] at one-way paths in the water [m]."""
         depth = np.asarray(path, dtype=np.float64) * self.cos_water
-        return refraction.solid_angle_per_area(self.height, depth, self.off_nadir, self.refractive_index)
+        return solid_angle_per_area(self.height, depth, self.off_nadir, self.refractive_index)
 
     def spreading(self, path: npt.ArrayLike) -> FloatArray:
         """Return the solid angle of the aperture at paths in the water [m] over that at the surface; 1 above it."""
@@ -132,3 +132,38 @@ class LidarSystem(LidarGeometry):
     def column_gain(self) -> float:
         """Power of the column's signal at the surface over the backscatter at 180 degrees, b p(pi) [W m sr]."""
         return float(self.water_gain(0.0, self.off_nadir)) * 1e9 * self.metres_per_ns
+
+
+#: Ratio of each definition's full width to a Gaussian beam's e^-1/2 full width (2 sigma).
+WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": math.sqrt(2 * math.log(2)), "divergence_1e2_mrad": 2.0}
+
+
+def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
+    """Read a beam's divergence from one of its three parameters.
+
+    Parameters
+    ----------
+    read
+        Reader of the plugin parameters.
+    is_top_hat
+        Whether the irradiance is even up to the beam's edge instead of Gaussian.
+
+    Returns
+    -------
+    float or None
+        Full angle [rad] between the points where the irradiance has fallen to e^-1/2 of its peak; None if no parameter
+        is given.
+
+    Raises
+    ------
+    UserError
+        If the value is out of range.
+
+    Notes
+    -----
+    A Gaussian exp(-r^2/(2 sigma^2)) has fallen to e^-1/2, to a half and to e^-2 at diameters of 2 sigma, 2 sqrt(2 ln 2)
+    sigma = 2.355 sigma and 4 sigma. A top-hat beam has its full irradiance up to its edge and none beyond: all three
+    are its full angle.
+    """
+    given = read.given(*WIDTHS)
+    return 1e-3 * read(given[0]) / (1.0 if is_top_hat else WIDTHS[given[0]]) if given else None

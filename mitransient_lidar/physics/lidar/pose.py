@@ -31,16 +31,10 @@ class Pose:
     A tangent-plane point about the axis is (angle_x, angle_y), in radians. Its direction is the unit vector along
     ``axis + angle_x * far + angle_y * left``. The angle_x axis points away from nadir, and angle_y along +y for the
     default pose.
-
-    Parameters
-    ----------
-    origin
-        Position [m], shape (3,) or (shots, 3).
-    axis, far, left
-        Orthonormal directions: the optical axis, the +angle_x direction and the +angle_y direction.
     """
 
-    origin: FloatArray
+    origin: FloatArray  #: Position [m], shape (3,) or (shots, 3).
+    #: Orthonormal directions: the optical axis, the +angle_x direction and the +angle_y direction.
     axis: FloatArray
     far: FloatArray
     left: FloatArray

@@ -41,24 +41,14 @@ class Pulse:
     """Pulse with unit energy whose peak leaves the transmitter at t = 0.
 
     Build one with `gaussian`, `sampled` or `from_file`.
-
-    Parameters
-    ----------
-    shape : {'gaussian', 'sampled'}
-        Selects which of the fields below apply.
-    fwhm_ns : float
-        Full width at half maximum [ns]; for a sampled pulse, the time from first to last crossing of half the largest
-        sample.
-    times_ns : ndarray, shape (S,)
-        Times of the samples [ns] with the largest sample at 0.
-    power : ndarray, shape (S,)
-        Power at the samples [1/ns]: linear between them, 0 outside, unit area.
     """
 
-    shape: Literal["gaussian", "sampled"]
+    shape: Literal["gaussian", "sampled"]  #: Selects which of the fields below apply.
+    #: Full width at half maximum [ns]; for a sampled pulse, the time from first to last crossing of half the largest
+    #: sample.
     fwhm_ns: float
-    times_ns: FloatArray
-    power: FloatArray
+    times_ns: FloatArray  #: Times of the samples [ns] with the largest sample at 0, shape (S,).
+    power: FloatArray  #: Power at the samples [1/ns]: linear between them, 0 outside, unit area, shape (S,).
 
     @classmethod
     def gaussian(cls, fwhm_ns: float) -> Pulse:

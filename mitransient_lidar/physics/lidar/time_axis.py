@@ -44,10 +44,7 @@ class TimeAxis:
         Start and number of bins, unless given, are multiples of 1, 2 or 5 times a power of ten of bins: at most a
         twentieth of these times.
 
-        Raises
-        ------
-        UserError
-            If there are more than 1 000 000 bins, or the length is automatic and more than 10 ms.
+        Raises UserError if there are more than 1 000 000 bins, or the length is automatic and more than 10 ms.
         """
         begin = first_ns if start_ns is None else start_ns
         bins = max(last_ns - min(begin, first_ns), 0.0) / bin_width_ns

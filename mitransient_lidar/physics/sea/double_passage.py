@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import turn_by_slope
+from mitransient_lidar.physics.lidar.level_sea import turn_by_slope
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState, WaveSpectrum
 
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
@@ -40,17 +40,10 @@ _FAR_APART = 8.0
 
 @dataclass(frozen=True, eq=False)
 class SlopeStructure:
-    """Slope structure functions of an isotropic sea against distance.
+    """Slope structure functions of an isotropic sea against distance."""
 
-    Attributes
-    ----------
-    distance
-        Point distances [m], equally spaced in their logarithm.
-    along, across
-        Mean square difference of the slopes along the distance and across it [1].
-    """
-
-    distance: FloatArray
+    distance: FloatArray  #: Point distances [m], equally spaced in their logarithm.
+    #: Mean square difference of the slopes along the distance and across it [1].
     along: FloatArray
     across: FloatArray
 
@@ -84,18 +77,10 @@ class SlopeStructure:
 
 @dataclass(frozen=True, eq=False)
 class EnhancementTable:
-    """Enhancement by depth and displacement.
+    """Enhancement by depth and displacement."""
 
-    Attributes
-    ----------
-    depths
-        Depths [m], ascending, shape (depths,).
-    values
-        Enhancements [1], shape (depths, displacements).
-    """
-
-    depths: FloatArray
-    values: FloatArray
+    depths: FloatArray  #: Depths [m], ascending, shape (depths,).
+    values: FloatArray  #: Enhancements [1], shape (depths, displacements).
 
     @classmethod
     def of(cls, structure: SlopeStructure, depths: FloatArray, spread_per_depth: float) -> EnhancementTable:

@@ -19,17 +19,14 @@ SURROUNDINGS = 2.0
 def foam_cover(foam: str, wind_speed: float) -> float:
     """Return the share of the sea that foam covers [1].
 
+    Raises UserError if `foam` is none of what it may be.
+
     Parameters
     ----------
     foam
         ``none``, a number from 0 to 1, or the name of a law.
     wind_speed
         Wind speed U at 10 m [m/s].
-
-    Raises
-    ------
-    UserError
-        If it is none of these.
 
     Notes
     -----

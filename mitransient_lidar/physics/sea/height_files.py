@@ -53,10 +53,7 @@ _GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
 def length_unit(name: str, unit: str) -> float:
     """Return a unit in metres; `name` is the quantity, for the message.
 
-    Raises
-    ------
-    UserError
-        If it is no unit of length.
+    Raises UserError if it is no unit of length.
     """
     key = re.sub(r"[\s_.]+", "", unit.lower())
     if key not in METRES:
@@ -74,6 +71,9 @@ def heights_in_metres(
 ) -> FloatArray:
     """Return heights above the mean sea level [m], positive up, NaN where there is none.
 
+    Raises UserError if the unit is unknown, contradicts the file's, or is not stated beside positions that are not in
+    metres; or heights are beyond 12 000 m, or look like a value for no data.
+
     Parameters
     ----------
     path : Path
@@ -88,12 +88,6 @@ def heights_in_metres(
         Their unit, where the file does not state it. Default: metres.
     no_data : float, optional
         Value without a height, which the file does not declare.
-
-    Raises
-    ------
-    UserError
-        If the unit is unknown, contradicts the file's, or is not stated beside positions that are not in metres; or
-        heights are beyond 12 000 m, or look like a value for no data.
     """
     if sign not in (None, "heights", "depths"):
         raise UserError(f"map_values = {sign!r} must be heights or depths")
@@ -185,10 +179,7 @@ def read_netcdf_heights(path: Path) -> Grid:
     as (y, x). The reader uses ``units`` of all three, ``positive`` or ``standard_name`` of the heights, and a grid
     mapping.
 
-    Raises
-    ------
-    UserError
-        If it has no such variable or several, or positions in degrees.
+    Raises UserError if it has no such variable or several, or positions in degrees.
     """
     dataset = read_netcdf(path)
     variables = {str(name): variable for name, variable in dataset.variables.items()}
@@ -250,18 +241,15 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     `core.tables.long_tables.read_long_table` describes the format. A heading names the columns x, y and z, or easting,
     northing, and height, elevation or depth, with or without a unit of length. Without one they are the first three.
 
+    Raises UserError as `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y
+    have different units; or a position is not finite.
+
     Returns
     -------
     points : ndarray, shape (points, 3)
         x, y and z as in the file; z is NaN where it is missing.
     stated : Stated
         Units that the heading states, and whether z is called depth.
-
-    Raises
-    ------
-    UserError
-        As `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y have
-        different units; or a position is not finite.
     """
 
     def choose(names: list[str]) -> list[tuple[int, Heading]]:
@@ -285,6 +273,9 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
 def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float | None) -> Grid:
     """Return points on a grid: their own, if they have one, or else interpolated.
 
+    Raises UserError if there are fewer than 3 points, they are on a line, or too many; or the cell is more than half of
+    their extent.
+
     Parameters
     ----------
     path : Path
@@ -295,12 +286,6 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
         Statements of the file about them.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m].
-
-    Raises
-    ------
-    UserError
-        If there are fewer than 3 points, they are on a line, or too many; or the cell is more than half of their
-        extent.
     """
     if missing := int(np.isnan(points[:, 2]).sum()):
         logger.warning("%s: %d of %d points have no height and are left out", path, missing, len(points))

@@ -78,6 +78,8 @@ def wave_coefficients(
 ) -> npt.NDArray[np.complex128]:
     """Realise a periodic square patch of sea surface as a Gaussian random field; see `heights_of`.
 
+    Raises UserError if `period` is not positive, or `cells` not even and positive.
+
     Parameters
     ----------
     spectrum : WaveSpectrum or SeaState
@@ -99,11 +101,6 @@ def wave_coefficients(
     ndarray, shape (cells, cells/2 + 1)
         Complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
         Nyquist wavenumbers have amplitude 0.
-
-    Raises
-    ------
-    UserError
-        If `period` is not positive, or `cells` not even and positive.
     """
     ix, iy, dk = wave_numbers(period, cells)
     time = motion.time

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mitransient_lidar.core.parameters.fields import AUTO, Read
-from mitransient_lidar.physics.lidar.divergence import read_divergence
+from mitransient_lidar.physics.lidar.lidar_geometry import read_divergence
 
 #: Shortest wave, and sides of cell and patch without a lidar [m].
 _DEFAULT_WAVE, _DEFAULT_CELL, _DEFAULT_SIZE = 1.0, 0.125, 32.0
@@ -100,6 +100,8 @@ class Resolution:
     def read(cls, read: Read, footprints: Sequence[Footprint]) -> Resolution:
         """Read the parameters of the plugin ``ocean_surface``, and choose those that are ``auto``.
 
+        Raises UserError if a value is not positive or out of range.
+
         Parameters
         ----------
         read
@@ -107,11 +109,6 @@ class Resolution:
         footprints
             Footprints of the lasers and receivers above the sea. Values of the parameters ``altitude``,
             ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
-
-        Raises
-        ------
-        UserError
-            If a value is not positive or out of range.
         """
         names = ("cell_size", "refined_size", "size", "shortest_wave")
         cell, side, size, wave = (None if value == AUTO else value for value in map(read, names))

@@ -30,6 +30,8 @@ class SeaMesh:
 def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int = 1) -> IntArray:
     """Return grid line positions in cells of the fine patch, counted from its centre.
 
+    Raises UserError if the meshes exceed the memory.
+
     Parameters
     ----------
     cells
@@ -45,11 +47,6 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
     -------
     ndarray of int
         Symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
-
-    Raises
-    ------
-    UserError
-        If the meshes exceed the memory.
     """
     outer, step, end = [], 1.0, cells // 2
     while end < extent / 2:

@@ -111,6 +111,8 @@ class SeaSurface:
     ) -> SeaSurface:
         """Build a sea from the parameters of the plugin ``ocean_surface``.
 
+        Raises UserError if a parameter is out of range, or a file cannot be read.
+
         Parameters
         ----------
         read
@@ -121,11 +123,6 @@ class SeaSurface:
             Whether to check the parameters only, and return a sea without waves.
         depths
             Depths that waves shall follow (see `followed_depths`), None for deep water.
-
-        Raises
-        ------
-        UserError
-            If a parameter is out of range, or a file cannot be read.
         """
         spectrum, wind_speed = read("spectrum"), read("wind_speed")
         wind_speed = wind_speed if wind_speed >= _CALM else 0.0
@@ -133,7 +130,11 @@ class SeaSurface:
             math.radians(read(name)) for name in ("wind_direction_deg", "current_direction_deg")
         )
         state = _read_waves(read, spectrum, wind_speed, wind_direction)
-        _check_shoaling(read("shoaling"), spectrum)
+        foam, surf_foam = read("foam"), read("surf_foam")
+        if read("shoaling") == "bottom" and spectrum in ("flat", "height_map"):
+            raise UserError(f"shoaling = 'bottom' needs a spectrum of waves, not {spectrum!r}")
+        if surf_foam > 0 and foam == "none":
+            raise UserError(f"surf_foam = {surf_foam:g} needs foam: give its cover of the open sea, 0 or more")
         slope_variance, seed, time, current = map(read, ("slope_variance", "surface_seed", "time", "current_speed"))
         wake = _read_wake(read)
         slope = tuple(math.tan(math.radians(read(name))) for name in ("slope_x_deg", "slope_y_deg"))
@@ -163,11 +164,11 @@ class SeaSurface:
                 given = state, period, cell, seed
                 rest = wind_direction, resolution.shortest_wave, bands
                 waves, cell, resolved = realise_heights(*given, motion, *rest)
-                waves_at = partial(_waves_at, given, motion, rest, None)
+                bottom = None
                 if depths is not None and bands is not None:
-                    response = DepthResponse.of_state(state, bands)
-                    waves_at = partial(_waves_at, given, motion, rest, (response, depths))
-                    waves = ShoalingHeights(waves, response, depths)
+                    bottom = DepthResponse.of_state(state, bands), depths
+                    waves = ShoalingHeights(waves, *bottom)
+                waves_at = partial(_waves_at, given, motion, rest, bottom)
             elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
@@ -207,8 +208,8 @@ class SeaSurface:
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
             (slope[0], slope[1]),
-            foam_cover(read("foam"), wind_speed),
-            _read_surf_foam(read),
+            foam_cover(foam, wind_speed),
+            surf_foam,
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -416,12 +417,6 @@ def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | N
     return depths
 
 
-def _check_shoaling(shoaling: str, spectrum: str) -> None:
-    """Refuse waves that shall follow the bottom without a spectrum of waves."""
-    if shoaling == "bottom" and spectrum in ("flat", "height_map"):
-        raise UserError(f"shoaling = 'bottom' needs a spectrum of waves, not {spectrum!r}")
-
-
 def _read_series(distribution: str, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
     """Return the series for all sea slopes, None for Gaussian ones."""
     if distribution == "gaussian":
@@ -485,14 +480,6 @@ def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, f
     along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
     across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
     return along, across
-
-
-def _read_surf_foam(read: Read) -> float:
-    """Return the share of surf with foam; none without foam."""
-    surf: float = read("surf_foam")
-    if surf > 0 and read("foam") == "none":
-        raise UserError(f"surf_foam = {surf:g} needs foam: give its cover of the open sea, 0 or more")
-    return surf
 
 
 def _read_wake(read: Read) -> Wake | None:

@@ -17,29 +17,17 @@ _REACH = 6.0  # half width of the hump in standard deviations, which neglects 2e
 
 @dataclass(frozen=True)
 class SwellSpectrum(WaveSpectrum):
-    """Swell as a Gaussian hump in wavenumber and in direction.
+    """Swell as a Gaussian hump in wavenumber and in direction."""
 
-    Parameters
-    ----------
-    height : float
-        Significant wave height [m], 0 to a fifteenth of the wavelength: steeper seas break (DNV-RP-C205; a single wave
-        breaks at a seventh).
-    wavelength : float
-        Mean wavelength [m], positive. In a realisation it is rounded to a fraction of the period, and swell more than
-        twice as long as the period is missing.
-    direction : float
-        Mean travel direction [rad], counter-clockwise from +x.
-    relative_bandwidth : float
-        Standard deviation of the wavenumber over its mean [1], above 0 up to 0.3.
-    directional_spread : float
-        Standard deviation of the direction [rad], above 0 up to 0.6.
-    """
-
+    #: Significant wave height [m], 0 to a fifteenth of the wavelength: steeper seas break (DNV-RP-C205; a single wave
+    #: breaks at a seventh).
     height: float
+    #: Mean wavelength [m], positive. In a realisation it is rounded to a fraction of the period, and swell more than
+    #: twice as long as the period is missing.
     wavelength: float
-    direction: float = 0.0
-    relative_bandwidth: float = 0.1
-    directional_spread: float = 0.15
+    direction: float = 0.0  #: Mean travel direction [rad], counter-clockwise from +x.
+    relative_bandwidth: float = 0.1  #: Standard deviation of the wavenumber over its mean [1], above 0 up to 0.3.
+    directional_spread: float = 0.15  #: Standard deviation of the direction [rad], above 0 up to 0.6.
 
     def __post_init__(self) -> None:
         wavelength = positive("wavelength", self.wavelength)

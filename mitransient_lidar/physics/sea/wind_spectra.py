@@ -82,15 +82,6 @@ class WindSpectrum(CosineSpectrum):
 class ElfouhailySpectrum(WindSpectrum):
     """Unified spectrum of wind-driven gravity and capillary waves.
 
-    Parameters
-    ----------
-    wind_speed : float
-        Wind speed at 10 m [m/s], 0 to 30. 0 gives a flat sea.
-    inverse_wave_age : float
-        Omega: 0.84 for a fully developed sea, up to 5 for a young one; see `inverse_wave_age` for a fetch.
-    direction : float
-        Direction the wind blows towards [rad], counter-clockwise from +x.
-
     Notes
     -----
     Elfouhaily, Chapron, Katsaros and Vandemark (1997), J. Geophys. Res. 102, 15781, doi:10.1029/97JC00467, with the
@@ -98,9 +89,10 @@ class ElfouhailySpectrum(WindSpectrum):
     light winds would be tens of metres high. A negative capillary amplitude in eq. 44 (below 2.2 m/s) is replaced by 0.
     """
 
-    wind_speed: float
+    wind_speed: float  #: Wind speed at 10 m [m/s], 0 to 30. 0 gives a flat sea.
+    #: Omega: 0.84 for a fully developed sea, up to 5 for a young one; see `inverse_wave_age` for a fetch.
     inverse_wave_age: float = _OLDEST
-    direction: float = 0.0
+    direction: float = 0.0  #: Direction the wind blows towards [rad], counter-clockwise from +x.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,17 +171,13 @@ class SaturatedSpectrum(WindSpectrum):
 class PiersonMoskowitzSpectrum(SaturatedSpectrum):
     """Gravity wave spectrum of a fully developed sea.
 
-    Parameters
-    ----------
-    wind_speed, direction : float
-        As for `ElfouhailySpectrum`. Below 0.14 m/s there are no gravity waves and the sea is flat.
-
     Notes
     -----
     Pierson and Moskowitz (1964), J. Geophys. Res. 69, 5181, doi:10.1029/JZ069i024p05181: alpha = 8.1e-3, beta = 0.74
     and the wind at 19.5 m, here 1.026 times that at 10 m. Measured at 10 to 20 m/s.
     """
 
+    #: As for `ElfouhailySpectrum`. Below 0.14 m/s there are no gravity waves and the sea is flat.
     wind_speed: float
     direction: float = 0.0
 
@@ -265,13 +253,6 @@ class JonswapSpectrum(SaturatedSpectrum):
 class ShallowSpectrum(CosineSpectrum):
     """Wind waves in water of finite depth, which limits the long ones.
 
-    Parameters
-    ----------
-    deep : CosineSpectrum
-        Spectrum for the same wind over deep water.
-    depth : float
-        Water depth [m], positive.
-
     Notes
     -----
     TMA spectrum by Bouws, Guenther, Rosenthal and Vincent (1985), J. Geophys. Res. 90, 975,
@@ -280,8 +261,8 @@ class ShallowSpectrum(CosineSpectrum):
     omega^2/g)/2 for long waves to 1.
     """
 
-    deep: CosineSpectrum
-    depth: float
+    deep: CosineSpectrum  #: Spectrum for the same wind over deep water.
+    depth: float  #: Water depth [m], positive.
     direction: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -44,6 +44,8 @@ class WindBubbles:
     def of_wind(cls, wind_speed: float) -> WindBubbles:
         """Return the bubbles below a wind of a speed at 10 m height [m/s], 0 to 20.
 
+        Raises UserError if the wind speed lies outside its range.
+
         Notes
         -----
         The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4. G = (a_r / a)^4 from a radius of 10
@@ -52,11 +54,6 @@ class WindBubbles:
         Eng. 23, 423, doi:10.1109/48.725236. They also change the sizes with depth: a_r by 1.984 um per metre and the
         upper exponent by (z / 2.55 m)^2. These changes are left out: they raise the void fraction by at most 7 % down
         to 3 m, and the scattering by 14 % at 1 m and 28 % at 2 m.
-
-        Raises
-        ------
-        UserError
-            If the wind speed lies outside its range.
         """
         wind = in_range("wind_speed", wind_speed, 0.0, STRONGEST_WIND)
         volume = 4 / 3 * math.pi * _moment(3)
@@ -72,16 +69,13 @@ class WindBubbles:
     def backscatter_ratio(self, backscatter: float = CLEAN_BACKSCATTER) -> float:
         """Return bb/b of the Fournier-Forand function that scatters at 180 degrees as the bubbles do.
 
+        Raises UserError if the number lies outside its range.
+
         Parameters
         ----------
         backscatter
             Volume scattering at 180 degrees over void fraction [1/(m sr)], 100 to 1445. 233 for clean bubbles, 1445 for
             a thick coating: Churnside (2010), Opt. Express 18, 8294, doi:10.1364/OE.18.008294.
-
-        Raises
-        ------
-        UserError
-            If the number lies outside its range.
         """
         wanted = in_range("backscatter", backscatter, 100.0, 1445.0) * self.radius / 1.5
         low, high = _RATIOS

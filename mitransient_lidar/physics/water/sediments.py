@@ -40,10 +40,7 @@ _CHECKED_DEG = (0.0, 45.0, 70.0, 80.0, 88.0)
 class HapkeSurface(Checked):
     """Reflection by a particle layer.
 
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
+    Raises UserError if a value lies outside its range.
     """
 
     albedo: float = checked(in_range, 0, 1)  #: Single-scattering albedo w of the particles, 0 to 1.
@@ -109,11 +106,8 @@ class HapkeSurface(Checked):
     def of_reflectance(self, name: str, value: float) -> HapkeSurface:
         """Return the surface with the single-scattering albedo that reflects a share of vertical light, 0 to 1.
 
-        Raises
-        ------
-        UserError
-            If particles of no albedo reflect so much, or the surface would reflect more than it receives at another
-            angle. The message calls the value `name`.
+        Raises UserError if particles of no albedo reflect so much, or the surface would reflect more than it receives
+        at another angle. The message calls the value `name`.
         """
         wanted = in_range(name, value, 0.0, 1.0)
         low, high = 0.0, 1.0
@@ -148,6 +142,8 @@ def _gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
 def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -> float:
     """Return a bottom's reflectance given as a number or by name.
 
+    Raises UserError if the value is none of these, or a number lies outside its range.
+
     Parameters
     ----------
     name
@@ -161,11 +157,6 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
     -------
     float
         Reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
-
-    Raises
-    ------
-    UserError
-        If the value is none of these, or a number lies outside its range.
 
     Notes
     -----

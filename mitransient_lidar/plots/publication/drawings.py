@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.refraction import refract
+from mitransient_lidar.physics.lidar.level_sea import LevelSea, refract
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, System, outlines

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mitransient_lidar.physics.lidar.refraction import refract
+from mitransient_lidar.physics.lidar.level_sea import refract
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
 from mitransient_lidar.plots.studies.shots import draw_sea

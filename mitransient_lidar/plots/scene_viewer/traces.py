@@ -18,8 +18,7 @@ from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
 from mitransient_lidar.results.variables import PointClass
 
 if TYPE_CHECKING:
-    from mitransient_lidar.rendering.geometry.bundles import Bundle
-    from mitransient_lidar.rendering.geometry.shapes import Relief, SceneGeometry, Solid
+    from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid
 
 #: Colours that colour-blind readers tell apart (Okabe and Ito 2008), of four pixels by their published names.
 _FOUR = ("#d55e00", "#009e73", "#0072b2", "#222222")

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
+from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.studies.panels import finish
 

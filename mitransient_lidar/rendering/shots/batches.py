@@ -24,7 +24,7 @@ from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, reach_of_maps
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
@@ -58,26 +58,17 @@ class ShotPoses:
 
     A shot's frame is turned about the vertical, so that its receiver differs least from the lidar's. It is also
     displaced, so that the receiver's axis meets the mean sea level at the same point as the lidar's.
-
-    Attributes
-    ----------
-    places
-        Points (x, y) in the scene where the receiver's axes meet the mean sea level [m], shape (shots, 2).
-    turns
-        Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
-    receiver, transmitter
-        Poses in each shot's frame; None where all are the lidar's.
-    in_scene
-        Receiver poses in the scene; None where they follow from the locations.
-    times_s
-        Times at which shots meet the waves [s], shape (shots,); None for the scene's time.
     """
 
+    #: Points (x, y) in the scene where the receiver's axes meet the mean sea level [m], shape (shots, 2).
     places: FloatArray
+    #: Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
     turns: FloatArray | None = None
+    #: Poses in each shot's frame; None where all are the lidar's.
     receiver: KernelPose | None = None
     transmitter: KernelPose | None = None
-    in_scene: Pose | None = None
+    in_scene: Pose | None = None  #: Receiver poses in the scene; None where they follow from the locations.
+    #: Times at which shots meet the waves [s], shape (shots,); None for the scene's time.
     times_s: FloatArray | None = None
 
     @classmethod
@@ -178,34 +169,20 @@ def _vectors(horizontal: FloatArray) -> mi.Vector3f:
 
 @dataclass(frozen=True)
 class ReceivedShots:
-    """Means over the passes of shots, and their standard errors.
+    """Means over the passes of shots, and their standard errors."""
 
-    Attributes
-    ----------
-    whole
-        Mean energy [J per bin], its standard error, mean power after the pulse and the receiver's response [W], and its
-        standard error, shape (shots, pixels, bins).
-    lost
-        Energy lost at the surface mesh's edges [J], mean over the passes of all shots.
-    passes
-        Passes per shot, shape (shots,).
-    parts
-        The same four arrays of light by origin, (shots, pixels, origins, bins); none unless the renderer separates it.
-    derivatives
-        The same four arrays for derivatives, shape (shots, parameters, pixels, bins); none unless the renderer has
-        perturbations.
-    missed
-        Number of shots whose passes ended before the requested error.
-    errors
-        Relative standard errors of the bins that count (`ErrorWindow`), one row.
-    """
-
+    #: Mean energy [J per bin], its standard error, mean power after the pulse and the receiver's response [W], and its
+    #: standard error, shape (shots, pixels, bins).
     whole: tuple[FloatArray, ...]
-    lost: float
-    passes: IntArray
+    lost: float  #: Energy lost at the surface mesh's edges [J], mean over the passes of all shots.
+    passes: IntArray  #: Passes per shot, shape (shots,).
+    #: The same four arrays of light by origin, (shots, pixels, origins, bins); none unless the renderer separates it.
     parts: tuple[FloatArray, ...] = ()
+    #: The same four arrays for derivatives, shape (shots, parameters, pixels, bins); none unless the renderer has
+    #: perturbations.
     derivatives: tuple[FloatArray, ...] = ()
-    missed: int = 0
+    missed: int = 0  #: Number of shots whose passes ended before the requested error.
+    #: Relative standard errors of the bins that count (`ErrorWindow`), one row.
     errors: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene

@@ -1,4 +1,4 @@
-"""Index layers: runs of water layers with one refractive and one group index, between which light is refracted."""
+"""Index layers: runs of water layers with the same indices, and refraction between them and at the sea."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.medium.snell import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque
 
 #: Largest number of index layers: connections are traced through each.
@@ -23,17 +22,14 @@ class IndexLayers:
     Light at the boundary of two index layers is refracted by Snell's law, or reflected totally. The partial reflection
     (5e-6 at vertical incidence between fresh and sea water) is neglected.
 
+    Raises UserError if there are more than 16 index layers.
+
     Parameters
     ----------
     layer_tops
         Upper edge depths of the water layers [m], shape (layers,).
     refractive_index, group_index
         Indices of the water layers, shape (layers,).
-
-    Raises
-    ------
-    UserError
-        If there are more than 16 index layers.
     """
 
     def __init__(self, layer_tops: np.ndarray, refractive_index: np.ndarray, group_index: np.ndarray) -> None:
@@ -95,3 +91,35 @@ class IndexLayers:
 def coinciding(length: mi.Float) -> mi.Float:
     """Return the vertical distance [m] within which a solid lies in a boundary plane, for rays with a length."""
     return dr.fma(length, _SAME_PER_LENGTH, _SAME)
+
+
+def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: mi.Float | float) -> mi.Vector3f:
+    """Refract at a facet: return the unit direction, beyond the facet, from which light arrives at it.
+
+    Parameters
+    ----------
+    direction
+        Unit direction from the facet to the light source, on the side of the normal.
+    normal
+        Unit normal of the facet.
+    eta
+        Refractive index on the side of the normal over the index beyond, at most 1.
+    """
+    cosine = dr.dot(direction, normal)
+    root = dr.safe_sqrt(1 - eta * eta * (1 - cosine * cosine))
+    return eta * direction + (root - eta * cosine) * mi.Vector3f(normal)
+
+
+def refract_level(direction: mi.Vector3f, eta: mi.Float | float) -> tuple[mi.Vector3f, mi.Bool]:
+    """Return a propagation direction beyond a horizontal plane, and whether light passes it.
+
+    Parameters
+    ----------
+    direction
+        Unit propagation direction.
+    eta
+        Refractive index before the plane over the index behind it. Where it exceeds 1, light may be totally reflected.
+    """
+    x, y = direction.x * eta, direction.y * eta
+    cosine2 = 1 - x * x - y * y
+    return mi.Vector3f(x, y, dr.copysign(dr.safe_sqrt(cosine2), direction.z)), cosine2 > 0

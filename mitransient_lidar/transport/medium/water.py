@@ -10,8 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
-from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases
@@ -19,42 +18,22 @@ from mitransient_lidar.transport.medium.water_phases import LayerPhases, Scatter
 
 @dataclass(frozen=True, eq=False)
 class Water:
-    """Water in horizontal layers, with or without bubbles behind a ship or below a windy sea.
+    """Water in horizontal layers, with or without bubbles behind a ship or below a windy sea."""
 
-    Attributes
-    ----------
-    column
-        Layer coefficients; equal neighbours are joined.
-    layers
-        The layers as given, and their phase functions for changed coefficients.
-    phases
-        Phase functions of the layers, and last of the bubbles.
-    index_layers
-        Runs of layers with one refractive and one group index.
-    water_scattering
-        Scattering by water molecules in each layer, a part of b [1/m]; 0 where it is not known.
-    plume
-        Bubbles, or None.
-    from_profile
-        Whether the layers approximate a profile from a file.
-    wavelength_nm
-        Wavelength of the water [nm]; None where its coefficients and indices are given as numbers without one.
-    by_name
-        Whether the water is computed at this wavelength; a water by numbers at a green wavelength represents green
-        lasers.
-    flight, scattering_flight, absorption_flight
-        Free flights by attenuation, scattering and absorption.
-    """
-
-    column: WaterColumn
-    layers: LayerPhases
-    phases: ScattererPhases
-    index_layers: IndexLayers
+    column: WaterColumn  #: Layer coefficients; equal neighbours are joined.
+    layers: LayerPhases  #: The layers as given, and their phase functions for changed coefficients.
+    phases: ScattererPhases  #: Phase functions of the layers, and last of the bubbles.
+    index_layers: IndexLayers  #: Runs of layers with one refractive and one group index.
+    #: Scattering by water molecules in each layer, a part of b [1/m]; 0 where it is not known.
     water_scattering: np.ndarray
-    plume: BubblePlume | BubbleLayer | None = None
-    from_profile: bool = False
+    plume: BubblePlume | BubbleLayer | None = None  #: Bubbles, or None.
+    from_profile: bool = False  #: Whether the layers approximate a profile from a file.
+    #: Wavelength of the water [nm]; None where its coefficients and indices are given as numbers without one.
     wavelength_nm: float | None = None
+    #: Whether the water is computed at this wavelength; a water by numbers at a green wavelength represents green
+    #: lasers.
     by_name: bool = False
+    #: Free flights by attenuation, scattering and absorption.
     flight: LayeredFlight = field(init=False)
     scattering_flight: LayeredFlight = field(init=False)
     absorption_flight: LayeredFlight = field(init=False)

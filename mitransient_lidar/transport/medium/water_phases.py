@@ -74,41 +74,22 @@ class ScattererPhases:
 
 @dataclass(frozen=True)
 class LayerPhases:
-    """Phase functions of layers as they follow from their coefficients.
+    """Phase functions of layers as they follow from their coefficients."""
 
-    Attributes
-    ----------
-    column
-        The layers.
-    nested
-        Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
-    kind
-        Choice by the parameter ``phase_function``, used where none is nested.
-    phase_g
-        Mean cosine for ``hg``.
-    water_scattering
-        Scattering by pure water [1/m], shape (layers,), a part of the column's scattering.
-    chi_p
-        bb/(2 pi p(pi) b) of the particles in each layer, shape (layers,), or None for their function's value.
-    tabulated
-        Constructor that makes a phase function from a table.
-    """
-
-    column: WaterColumn
+    column: WaterColumn  #: The layers.
+    #: Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     nested: dict[str, mi.PhaseFunction]
-    kind: str
-    phase_g: float
-    water_scattering: np.ndarray
+    kind: str  #: Choice by the parameter ``phase_function``, used where none is nested.
+    phase_g: float  #: Mean cosine for ``hg``.
+    water_scattering: np.ndarray  #: Scattering by pure water [1/m], shape (layers,), a part of the column's scattering.
+    #: bb/(2 pi p(pi) b) of the particles in each layer, shape (layers,), or None for their function's value.
     chi_p: np.ndarray | None
-    tabulated: Callable[[PowerLawTable], mi.PhaseFunction]
+    tabulated: Callable[[PowerLawTable], mi.PhaseFunction]  #: Constructor that makes a phase function from a table.
 
     def functions(self) -> list[mi.PhaseFunction]:
         """Return one phase function a layer, the same object where layers share it.
 
-        Raises
-        ------
-        UserError
-            When nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
+        Raises UserError when nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
         """
         column, nested, count = self.column, self.nested, self.column.count
         share = np.divide(self.water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)

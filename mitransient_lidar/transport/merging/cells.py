@@ -53,18 +53,12 @@ ORIGIN = 1 << 20
 
 @dataclass(frozen=True)
 class Cell:
-    """Cells that contain points.
+    """Cells that contain points."""
 
-    Attributes
-    ----------
-    bucket, tag
-        Bucket number, and the tag that tells its cells apart.
-    volume, volume_of_unscattered
-        Volume [m^3], and the volume that divides unscattered light.
-    """
-
+    #: Bucket number, and the tag that tells its cells apart.
     bucket: mi.UInt32
     tag: mi.UInt32
+    #: Volume [m^3], and the volume that divides unscattered light.
     volume: mi.Float
     volume_of_unscattered: mi.Float
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL
@@ -86,43 +86,27 @@ class MergingOptions:
 
 @dataclass
 class MergingLayout:
-    """Points, cells and patches in a scene, and buffer capacities per path.
-
-    Attributes
-    ----------
-    entry
-        Where the beam meets the sea, relative to where it meets its mean level [m], shape (3,).
-    cells, patches
-        Cells in the water, and patches on solids.
-    spacing, reach
-        Distance between points along a path [m], and mean distance in the water along the axis to a solid or to the
-        record's end [m].
-    light_segments, sensor_segments, hits
-        Capacities for segments and solid hits per path; they grow when a pass needs more.
-    least_segments
-        Segments per path of light and of sensors that a pass has needed, or one.
-    spread
-        Distance from the view, on the sea, from which light reaches the view in the water [m].
-    photons_of_cell
-        Number of photons kept in full cells.
-    widens
-        Whether cells and patches are wider for shots with few photons: their width is automatic.
-    """
+    """Points, cells and patches in a scene, and buffer capacities per path."""
 
     OF_SHOTS = ("cells", "patches")
 
-    entry: FloatArray
+    entry: FloatArray  #: Where the beam meets the sea, relative to where it meets its mean level [m], shape (3,).
+    #: Cells in the water, and patches on solids.
     cells: WaterCells | SphericalCells
     patches: SolidPatches
+    #: Distance between points along a path [m], and mean distance in the water along the axis to a solid or to the
+    #: record's end [m].
     spacing: float
     reach: float
+    #: Capacities for segments and solid hits per path; they grow when a pass needs more.
     light_segments: float
     sensor_segments: float
     hits: float = 2.0
+    #: Segments per path of light and of sensors that a pass has needed, or one.
     least_segments: tuple[float, float] = (1.0, 1.0)
-    spread: float = 0.0
-    photons_of_cell: int = PHOTONS_OF_CELL
-    widens: bool = True
+    spread: float = 0.0  #: Distance from the view, on the sea, from which light reaches the view in the water [m].
+    photons_of_cell: int = PHOTONS_OF_CELL  #: Number of photons kept in full cells.
+    widens: bool = True  #: Whether cells and patches are wider for shots with few photons: their width is automatic.
 
     def of_shots(self, scene: LidarScene, shots: int, photons: int) -> MergingLayout:
         """Return the layout for shots that meet a scene in parts, each with a number of photons."""

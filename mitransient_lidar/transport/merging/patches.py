@@ -55,38 +55,20 @@ _MOST_COVERAGE_SAMPLES = 1000
 
 @dataclass(frozen=True)
 class SolidPatch:
-    """Piece of a solid's surface.
+    """Piece of a solid's surface."""
 
-    Attributes
-    ----------
-    bucket, tag
-        Bucket of its photons; patches in one bucket differ in tag.
-    area
-        Surface area over the patch's projection, if it covers all of it [m^2].
-    corner
-        Corner of that square, and start of the level over it, in the projection's coordinates (u, v, w) [m]. Along the
-        beam, w is z.
-    height
-        Level height [m].
-    sector
-        Ring sector that replaces the square in projections along the beam.
-    axis
-        Projection direction: 0, 1 or 2 for x, y or the beam.
-    faces
-        Sign of the normal's component against that direction.
-    cosine
-        Size of that component.
-    """
-
+    #: Bucket of its photons; patches in one bucket differ in tag.
     bucket: mi.UInt32
     tag: mi.UInt32
-    area: mi.Float
+    area: mi.Float  #: Surface area over the patch's projection, if it covers all of it [m^2].
+    #: Corner of that square, and start of the level over it, in the projection's coordinates (u, v, w) [m]. Along the
+    #: beam, w is z.
     corner: mi.Point3f
-    height: mi.Float
-    sector: RingSector
-    axis: mi.UInt32
-    faces: mi.Float
-    cosine: mi.Float
+    height: mi.Float  #: Level height [m].
+    sector: RingSector  #: Ring sector that replaces the square in projections along the beam.
+    axis: mi.UInt32  #: Projection direction: 0, 1 or 2 for x, y or the beam.
+    faces: mi.Float  #: Sign of the normal's component against that direction.
+    cosine: mi.Float  #: Size of that component.
 
 
 def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
@@ -132,43 +114,21 @@ class SolidPatches:
     In projection along the refracted beam, patches are sectors of rings about it, whatever their depth; along x or y
     they are squares. Light from one direction is even over areas across that direction, however curved the surface is
     (`foreshortening`).
-
-    Parameters
-    ----------
-    scene
-        Scene with the solids.
-    region
-        Region that is lit or seen.
-    rings
-        Rings about the beam.
-    depth
-        Depth of the plane in which rings are cut [m], and the largest at which their core is taken.
-    width
-        Side of a square, and of a sector on the axis at the surface [m].
-    uneven
-        Solids that `solids_of_several_levels` found.
-    side_bits
-        Base-2 logarithm of the number of buckets per shot along one side.
-    least
-        Least side of squares, and of sectors on the solids [m].
-    growth
-        Growth of unscattered light with depth by ripples [1/m]; None for patches that grow as the rings.
-    widening
-        Largest further growth with depth of sectors that a narrow view limits at the surface.
     """
 
     OF_SHOTS = ("scene", "rings", "_shift", "_start")
 
-    scene: LidarScene
-    region: Region
-    rings: BeamRings
-    depth: float
-    width: float
-    uneven: Sequence[mi.Shape] = ()
-    side_bits: int = MOST_SIDE_BITS
-    least: float = 0.0
+    scene: LidarScene  #: Scene with the solids.
+    region: Region  #: Region that is lit or seen.
+    rings: BeamRings  #: Rings about the beam.
+    depth: float  #: Depth of the plane in which rings are cut [m], and the largest at which their core is taken.
+    width: float  #: Side of a square, and of a sector on the axis at the surface [m].
+    uneven: Sequence[mi.Shape] = ()  #: Solids that `solids_of_several_levels` found.
+    side_bits: int = MOST_SIDE_BITS  #: Base-2 logarithm of the number of buckets per shot along one side.
+    least: float = 0.0  #: Least side of squares, and of sectors on the solids [m].
+    #: Growth of unscattered light with depth by ripples [1/m]; None for patches that grow as the rings.
     growth: float | None = None
-    widening: float = 1.0
+    widening: float = 1.0  #: Largest further growth with depth of sectors that a narrow view limits at the surface.
 
     def __post_init__(self) -> None:
         self._shift, self._start = mi.Point2f(0), mi.UInt32(0)

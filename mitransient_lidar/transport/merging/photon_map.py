@@ -7,8 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.merging.patches import SolidPatch
+from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.paths.path import PathPoint
 from mitransient_lidar.transport.paths.path_classes import PathClasses

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refract_level
+from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_vector
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
 from mitransient_lidar.transport.rng import Lanes, starts, unit_points
@@ -170,28 +170,18 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Grids with equal cells over a region, one per shot location, and values in their cells.
-
-    Attributes
-    ----------
-    values, kind
-        Values in all cells, and their type.
-    low, per_metre
-        Grid corner for each shot [m], and inverse cell sides [1/m].
-    cells
-        Cells per side.
-    start
-        First cell number for each shot.
-    """
+    """Grids with equal cells over a region, one per shot location, and values in their cells."""
 
     OF_SHOTS = ("low", "start")
 
+    #: Values in all cells, and their type.
     values: mi.Float
     kind: type[mi.Float] | type[mi.UInt32]
+    #: Grid corner for each shot [m], and inverse cell sides [1/m].
     low: mi.Point2f
     per_metre: mi.Point2f
-    cells: int
-    start: mi.UInt32
+    cells: int  #: Cells per side.
+    start: mi.UInt32  #: First cell number for each shot.
 
     def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or at the nearest point; and offsets from the cell centres [m]."""

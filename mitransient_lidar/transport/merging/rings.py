@@ -11,9 +11,9 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.level_sea import refract as refract_at_facet
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.physics.lidar.refraction import refract as refract_at_facet
-from mitransient_lidar.transport.medium.snell import refract
+from mitransient_lidar.transport.medium.index_layers import refract
 from mitransient_lidar.transport.opaque import aligned, changed, opaque
 
 #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
@@ -40,6 +40,8 @@ _LONGEST, _WIDEST_BEAM = 0.3, 500.0
 def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float, float]:
     """Return the nearest possible cell width for rings about a beam, and the largest width in water.
 
+    Raises UserError if the beam is too wide for automatic cells.
+
     Parameters
     ----------
     given
@@ -48,11 +50,6 @@ def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float,
         Beam standard deviation there [m].
     attenuation
         Beam attenuation of the water [1/m].
-
-    Raises
-    ------
-    UserError
-        If the beam is too wide for automatic cells.
     """
     core = CORE_PER_SPREAD * spread
     if given:
@@ -68,23 +65,15 @@ def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float,
 
 @dataclass(frozen=True)
 class RingSector:
-    """Sector of a ring.
+    """Sector of a ring."""
 
-    Attributes
-    ----------
-    ring, number
-        Ring number, counted outwards, and number of the sector in it.
-    inner, outer
-        Ring radii [m].
-    share
-        Inverse of the number of sectors in the ring.
-    """
-
+    #: Ring number, counted outwards, and number of the sector in it.
     ring: mi.UInt32
     number: mi.UInt32
+    #: Ring radii [m].
     inner: mi.Float
     outer: mi.Float
-    share: mi.Float
+    share: mi.Float  #: Inverse of the number of sectors in the ring.
 
 
 class BeamRings:

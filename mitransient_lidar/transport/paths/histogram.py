@@ -78,6 +78,8 @@ class TransientHistogram:
 
     Energies are summed as integers of two units, so that the sums do not depend on their order.
 
+    Raises UserError when pixels times bins, or pixels times gates, with the perturbations exceed 2^28.
+
     Parameters
     ----------
     axis
@@ -92,11 +94,6 @@ class TransientHistogram:
         Length that is left out of path lengths [m], so that they are accurate in single precision.
     perturbations
         Perturbations, each of which is summed as the energies are.
-
-    Raises
-    ------
-    UserError
-        When pixels times bins, or pixels times gates, with the perturbations exceed 2^28.
     """
 
     #: Memory per bin, or per gate [bytes]: two sums and a mark.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.opaque import changed
 from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.paths.path_classes import PathClasses
@@ -19,7 +18,6 @@ from mitransient_lidar.transport.perturbations import Perturbation, Perturbation
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class ReceivedLight:
@@ -152,10 +150,7 @@ class PassRenderer(ABC):
         Passes with different seeds are independent. Energy is summed over `gates` instead of time bins if they are
         given, or `beside` them. The pixels of several shots are one row, shot after shot.
 
-        Raises
-        ------
-        UserError
-            When the histogram would be too large.
+        Raises UserError when the histogram would be too large.
         """
         pixels, shots = self.scene.receiver.pixels, Shots(seed if isinstance(seed, Sequence) else [seed])
         flat = (shots.count * pixels.count * self.classes.count,)
@@ -181,16 +176,5 @@ class LidarIntegrator(Protocol):
 
     plugin: str
     passive: bool
-
-    def prepare(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        *,
-        classes: PathClasses | None = None,
-        receiver: Receiver | None = None,
-        layout_of: PassRenderer | None = None,
-        connections: bool = True,
-        axis: TimeAxis | None = None,
-    ) -> PassRenderer:
-        """Return the pass renderer for a scene, as `LidarMerging.prepare`."""
+    #: Returns the pass renderer for a scene, as `LidarPassIntegrator.prepare`.
+    prepare: Callable[..., PassRenderer]

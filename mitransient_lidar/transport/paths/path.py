@@ -22,52 +22,36 @@ NO_SURFACE = 1e9
 
 @dataclass(kw_only=True)
 class PathPoint:
-    """A point on a path from the receiver or from the laser, with the numbers of the path's part up to it.
+    """A point on a path from the receiver or from the laser, with the numbers of the path's part up to it."""
 
-    Attributes
-    ----------
-    point, direction
-        Position [m], and unit direction in which the path passes it.
-    length
-        Optical length up to it [m]: distance times group index, summed over the segments, minus the distance from the
-        start to the scene's reference point (`RelativePose`).
-    throughput
-        Product of the part's factors, 0 or more: light energy from the laser [J]; for paths from the receiver, received
-        energy per radiance at their end [m^2 sr]. At points along segments, times track length [m].
-    lost
-        Whether the part has entered the water outside the surface mesh, as if the sea were level there: its complete
-        paths measure the loss, and are not received.
-    sums
-        Sums of the `Perturbations` along the part.
-    pixel
-        Pixel of the path; 0 for light from the laser.
-    scatterings, reversals
-        Number of scattering events in the water, and of changes between going down and going up.
-    surface_length
-        Optical length from the start, by the path's first point on the sea, to the other end [m], as `length`; far
-        beyond any record if its first segment has ended elsewhere.
-    mis_partial_sum
-        Sum of the densities, up to a common factor, with which the part's merges and connections make the same path.
-        With the scattering coefficient b [1/m] and the phase function p [1/sr] at events, it is V / (b p) for a merge
-        in cells with volume V. For a connection over the distance d with the scattering transmittance T, it is d^2 / (T
-        b p b' p') times a rate.
-    inverse_density
-        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]: 1 /
-        (b p) times its squared distance, divided by the scattering transmittance on the way; 0 if the segment starts
-        elsewhere.
-    """
-
+    #: Position [m], and unit direction in which the path passes it.
     point: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
     direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    #: Optical length up to it [m]: distance times group index, summed over the segments, minus the distance from the
+    #: start to the scene's reference point (`RelativePose`).
     length: mi.Float = field(default_factory=lambda: mi.Float(0))
+    #: Product of the part's factors, 0 or more: light energy from the laser [J]; for paths from the receiver, received
+    #: energy per radiance at their end [m^2 sr]. At points along segments, times track length [m].
     throughput: mi.Float = field(default_factory=lambda: mi.Float(0))
+    #: Whether the part has entered the water outside the surface mesh, as if the sea were level there: its complete
+    #: paths measure the loss, and are not received.
     lost: mi.Bool = field(default_factory=lambda: mi.Bool(False))
-    sums: Sums = field(default_factory=list)
-    pixel: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    sums: Sums = field(default_factory=list)  #: Sums of the `Perturbations` along the part.
+    pixel: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  #: Pixel of the path; 0 for light from the laser.
+    #: Number of scattering events in the water, and of changes between going down and going up.
     scatterings: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
     reversals: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    #: Optical length from the start, by the path's first point on the sea, to the other end [m], as `length`; far
+    #: beyond any record if its first segment has ended elsewhere.
     surface_length: mi.Float = field(default_factory=lambda: mi.Float(NO_SURFACE))
+    #: Sum of the densities, up to a common factor, with which the part's merges and connections make the same path.
+    #: With the scattering coefficient b [1/m] and the phase function p [1/sr] at events, it is V / (b p) for a merge in
+    #: cells with volume V. For a connection over the distance d with the scattering transmittance T, it is d^2 / (T b p
+    #: b' p') times a rate.
     mis_partial_sum: mi.Float = field(default_factory=lambda: mi.Float(0))
+    #: Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]: 1 /
+    #: (b p) times its squared distance, divided by the scattering transmittance on the way; 0 if the segment starts
+    #: elsewhere.
     inverse_density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
     @property
@@ -88,30 +72,16 @@ class PathPoint:
 
 @dataclass(kw_only=True)
 class Path(PathPoint):
-    """A path up to its last vertex, which is offset from surfaces against self-intersection.
+    """A path up to its last vertex, which is offset from surfaces against self-intersection."""
 
-    Attributes
-    ----------
-    in_water
-        Whether the next segment lies in water.
-    at_start
-        Whether the next segment is the first one.
-    index_layer
-        Index layer of the next segment, if it lies in water.
-    before_first_solid
-        Whether the path has met no solid (bottom or target) yet.
-    rays
-        Number of rays traced so far, for the benchmark.
-    active
-        Whether the path continues.
-    """
-
-    in_water: mi.Bool
-    at_start: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    in_water: mi.Bool  #: Whether the next segment lies in water.
+    at_start: mi.Bool = field(default_factory=lambda: mi.Bool(True))  #: Whether the next segment is the first one.
+    #: Index layer of the next segment, if it lies in water.
     index_layer: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    #: Whether the path has met no solid (bottom or target) yet.
     before_first_solid: mi.Bool = field(default_factory=lambda: mi.Bool(True))
-    rays: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
-    active: mi.Bool
+    rays: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  #: Number of rays traced so far, for the benchmark.
+    active: mi.Bool  #: Whether the path continues.
 
     @classmethod
     def start(
@@ -149,59 +119,32 @@ class Path(PathPoint):
 
 @dataclass(kw_only=True)
 class ConnectedPath(Path):
-    """A path whose vertices are connected to an emitter.
+    """A path whose vertices are connected to an emitter."""
 
-    Attributes
-    ----------
-    emitter_ratio
-        Density of the sampled connection over the path's own sampling density, for the direction of the next segment; 0
-        where no connection was sampled.
-    specular
-        Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
-        receiver: the last vertex could not be connected.
-    reflected_by_sea
-        Whether the next segment was reflected by the dry side of the sea surface.
-    solid
-        Number of the first solid met, as `PathClasses.solid`.
-    """
-
+    #: Density of the sampled connection over the path's own sampling density, for the direction of the next segment; 0
+    #: where no connection was sampled.
     emitter_ratio: mi.Float = field(default_factory=lambda: mi.Float(0))
+    #: Whether the next segment has the one direction that a mirror or a smooth interface allows, or starts at the
+    #: receiver: the last vertex could not be connected.
     specular: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    #: Whether the next segment was reflected by the dry side of the sea surface.
     reflected_by_sea: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    #: Number of the first solid met, as `PathClasses.solid`.
     solid: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
 
 @dataclass
 class Vertex:
-    """Segment end.
+    """Segment end."""
 
-    Attributes
-    ----------
-    si
-        Ray intersection, valid or not.
-    reach
-        Distance to the surface or to the boundary of index layers, whichever is nearer [m].
-    length
-        Segment length [m]: `reach`, or less up to a scattering event.
-    scattered
-        Whether the segment ends with a scattering event.
-    at_boundary
-        Whether it ends at an index layer boundary.
-    outside
-        Whether it ends where it enters the water outside the surface mesh.
-    in_water
-        Whether the segment lies in water.
-    at_sea, on_solid
-        Whether it ends on the sea surface, or on a solid; set by `PathStep.arrive`.
-    """
-
-    si: mi.SurfaceInteraction3f
-    reach: mi.Float
-    length: mi.Float
-    scattered: mi.Bool
-    at_boundary: mi.Bool
-    outside: mi.Bool
-    in_water: mi.Bool
+    si: mi.SurfaceInteraction3f  #: Ray intersection, valid or not.
+    reach: mi.Float  #: Distance to the surface or to the boundary of index layers, whichever is nearer [m].
+    length: mi.Float  #: Segment length [m]: `reach`, or less up to a scattering event.
+    scattered: mi.Bool  #: Whether the segment ends with a scattering event.
+    at_boundary: mi.Bool  #: Whether it ends at an index layer boundary.
+    outside: mi.Bool  #: Whether it ends where it enters the water outside the surface mesh.
+    in_water: mi.Bool  #: Whether the segment lies in water.
+    #: Whether it ends on the sea surface, or on a solid; set by `PathStep.arrive`.
     at_sea: mi.Bool
     on_solid: mi.Bool
 

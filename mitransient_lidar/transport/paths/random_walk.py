@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.medium.snell import refract_level
+from mitransient_lidar.transport.medium.index_layers import refract_level
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.paths.path import Path, PathStep, Vertex
 from mitransient_lidar.transport.pose import KernelPose
@@ -21,22 +21,14 @@ _SMALLEST_DISTANCE = 1e-9
 
 @dataclass(kw_only=True)
 class RandomWalkPath(Path):
-    """A random-walk path; `inverse_density` belongs to the end of its last segment.
+    """A random-walk path; `inverse_density` belongs to the end of its last segment."""
 
-    Attributes
-    ----------
-    lane, points
-        Number of the path, and of its points in the water so far.
-    inverse_scattering_density
-        1 / (b p) of the last vertex [m sr] if it is a scattering event in the water, else 0 (see `mis_partial_sum`).
-    offset
-        Distance from the last vertex to the next point along the path [m].
-    """
-
+    #: Number of the path, and of its points in the water so far.
     lane: mi.UInt32
     points: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    #: 1 / (b p) of the last vertex [m sr] if it is a scattering event in the water, else 0 (see `mis_partial_sum`).
     inverse_scattering_density: mi.Float = field(default_factory=lambda: mi.Float(0))
-    offset: mi.Float
+    offset: mi.Float  #: Distance from the last vertex to the next point along the path [m].
 
     @classmethod
     def walking(

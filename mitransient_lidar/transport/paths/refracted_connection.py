@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.medium.index_layers import coinciding
-from mitransient_lidar.transport.medium.snell import refract
+from mitransient_lidar.transport.medium.index_layers import coinciding, refract
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
@@ -24,18 +23,10 @@ _SMALLEST_DEPTH = 1e-4
 
 @dataclass
 class EmitterDirection:
-    """Direction of an emitter in the air, seen from a point under water through a flat mean surface.
+    """Direction of an emitter in the air, seen from a point under water through a flat mean surface."""
 
-    Attributes
-    ----------
-    in_air
-        Unit direction from the surface to the emitter.
-    in_water
-        Unit direction from the point up to the surface, refracted by Snell's law.
-    """
-
-    in_air: mi.Vector3f
-    in_water: mi.Vector3f
+    in_air: mi.Vector3f  #: Unit direction from the surface to the emitter.
+    in_water: mi.Vector3f  #: Unit direction from the point up to the surface, refracted by Snell's law.
 
 
 class RefractedEmitterSampler(ABC):
@@ -167,26 +158,16 @@ def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Floa
 
 @dataclass
 class TopLayerRay:
-    """A ray from a vertex, refracted up to the top index layer.
+    """A ray from a vertex, refracted up to the top index layer."""
 
-    Attributes
-    ----------
-    ray
-        The ray where it enters the top index layer, or starts in it.
-    optical_length, optical_depth, absorption_depth
-        Optical length [m], optical depth, and absorption depth alone below the top index layer.
-    factor
-        Radiance factor: squared ratio between the refractive indices, times the share that no shape blocks.
-    sums
-        Perturbation sums below the top index layer.
-    """
-
-    ray: mi.Ray3f
+    ray: mi.Ray3f  #: The ray where it enters the top index layer, or starts in it.
+    #: Optical length [m], optical depth, and absorption depth alone below the top index layer.
     optical_length: mi.Float
     optical_depth: mi.Float
     absorption_depth: mi.Float
+    #: Radiance factor: squared ratio between the refractive indices, times the share that no shape blocks.
     factor: mi.Float
-    sums: Sums
+    sums: Sums  #: Perturbation sums below the top index layer.
 
 
 def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, active: mi.Bool) -> TopLayerRay:
@@ -219,20 +200,11 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
 
 @dataclass
 class StraightConnection:
-    """Straight lines from points to the laser, in the medium of the laser; whether they are blocked is not known.
+    """Straight lines from points to the laser, in the medium of the laser; whether they are blocked is not known."""
 
-    Attributes
-    ----------
-    direction
-        Unit direction to the laser.
-    irradiance
-        Energy per area normal to the line [J/m^2].
-    distance, length
-        Distance [m], and relative optical length [m].
-    """
-
-    direction: mi.Vector3f
-    irradiance: mi.Float
+    direction: mi.Vector3f  #: Unit direction to the laser.
+    irradiance: mi.Float  #: Energy per area normal to the line [J/m^2].
+    #: Distance [m], and relative optical length [m].
     distance: mi.Float
     length: mi.Float
 

@@ -11,16 +11,16 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.level_sea import snell
 from mitransient_lidar.physics.sea.double_passage import (
     LEAST_DEPTH,
     EnhancementTable,
     slope_spread,
     slope_structures,
 )
-from mitransient_lidar.physics.water.forward_scattering import displacements
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.two_way_spread import displacements
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.perturbations import Perturbation, Sums
@@ -38,18 +38,11 @@ _SAMPLES = 1000
 
 @dataclass(frozen=True)
 class Echo:
-    """Where paths have turned.
+    """Where paths have turned."""
 
-    Attributes
-    ----------
-    surface_length
-        Relative optical length by the point of the sea that the path has crossed [m], `Path.surface_length`.
-    on_solid
-        Whether they have met a solid.
-    """
-
+    #: Relative optical length by the point of the sea that the path has crossed [m], `Path.surface_length`.
     surface_length: mi.Float
-    on_solid: mi.Bool | bool
+    on_solid: mi.Bool | bool  #: Whether they have met a solid.
 
 
 class RippleFocusing:

@@ -53,48 +53,30 @@ BYTES_PER_PATH = 18  #: Memory per path: the state of its random numbers [bytes]
 
 @dataclass(frozen=True)
 class VolpathOptions:
-    """Path tracer options; the plugins ``lidar_volpath`` and ``passive_volpath`` document most of them.
-
-    Attributes
-    ----------
-    samples_emitter
-        Whether directions towards the emitter are sampled, besides the path's own: the balance heuristic combines both.
-    solid_guiding_probability
-        Guiding probability on solids below water that scatters all light; None is the probability at scattering events,
-        with the same lobe.
-    expects_emitter
-        Whether the roulette counts throughput times the radiance expected under water, which is largest about the
-        emitter's direction, instead of throughput alone.
-    weights_absorption
-        Whether absorption reduces path weights, instead of the number of paths that scatter or arrive.
-    connects_solids
-        Whether `complement_only` has the paths whose first solid is under water, too.
-    """
+    """Path tracer options; the plugins ``lidar_volpath`` and ``passive_volpath`` document most of them."""
 
     max_scatterings: int = -1
     roulette_threshold: float = 0.001
     guiding_probability: float = 0.4
+    #: Whether directions towards the emitter are sampled, besides the path's own: the balance heuristic combines both.
     samples_emitter: bool = True
     complement_only: bool = False
+    #: Guiding probability on solids below water that scatters all light; None is the probability at scattering events,
+    #: with the same lobe.
     solid_guiding_probability: float | None = None
+    #: Whether the roulette counts throughput times the radiance expected under water, which is largest about the
+    #: emitter's direction, instead of throughput alone.
     expects_emitter: bool = False
+    #: Whether absorption reduces path weights, instead of the number of paths that scatter or arrive.
     weights_absorption: bool = False
-    connects_solids: bool = False
+    connects_solids: bool = False  #: Whether `complement_only` has the paths whose first solid is under water, too.
 
 
 class PathLight:
-    """Emitters to which the vertices of paths are connected, and the light received from them.
+    """Emitters to which the vertices of paths are connected, and the light received from them."""
 
-    Attributes
-    ----------
-    sampler
-        Samples directions under water towards the emitter.
-    weight
-        Light weight of each path.
-    """
-
-    sampler: RefractedEmitterSampler
-    weight: mi.Float
+    sampler: RefractedEmitterSampler  #: Samples directions under water towards the emitter.
+    weight: mi.Float  #: Light weight of each path.
 
     #: Whether the emitter is under water, where straight lines reach it.
     submerged = False

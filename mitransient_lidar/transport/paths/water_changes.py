@@ -37,10 +37,8 @@ def coefficient_derivative(water: Water, name: str, layer: int, focusing: Ripple
     the phase function's logarithmic derivative, which follows from b and bb; so does the derivative of the ripple
     factors.
 
-    Raises
-    ------
-    UserError
-        If the light does not depend on the coefficient, or the derivative at its value cannot be estimated.
+    Raises UserError if the light does not depend on the coefficient, or the derivative at its value cannot be
+    estimated.
     """
     column = water.layers.column
     top, bottom = _limits(column.layer_tops, layer)

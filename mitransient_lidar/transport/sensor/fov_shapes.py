@@ -62,23 +62,15 @@ class FovShape(ABC):
 
 @dataclass(frozen=True)
 class Sector(FovShape):
-    """Circle, ring or sector of a ring about a centre.
+    """Circle, ring or sector of a ring about a centre."""
 
-    Parameters
-    ----------
-    outer, inner
-        Radii [rad], 0 <= inner < outer.
-    start, extent
-        Azimuth at which the sector begins, from +angle_x towards +angle_y, and its size [rad], up to 2 pi.
-    centre
-        (angle_x, angle_y) of the centre [rad].
-    """
-
+    #: Radii [rad], 0 <= inner < outer.
     outer: float
     inner: float = 0.0
+    #: Azimuth at which the sector begins, from +angle_x towards +angle_y, and its size [rad], up to 2 pi.
     start: float = 0.0
     extent: float = 2 * np.pi
-    centre: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)  #: (angle_x, angle_y) of the centre [rad].
 
     def __post_init__(self) -> None:
         _convert_to_float(self, "outer", "inner", "start", "extent")

@@ -105,10 +105,7 @@ class HexPixels(PixelArray):
 def hexagon_count(layout: str) -> int:
     """Return the number of hexagons in a layout such as ``hex7``.
 
-    Raises
-    ------
-    UserError
-        When the number is not one hexagon plus complete rings around it, or is above 2^20.
+    Raises UserError when the number is not one hexagon plus complete rings around it, or is above 2^20.
     """
     match = re.fullmatch(r"hex([1-9]\d*)", layout)
     count = int(match.group(1)) if match else 0

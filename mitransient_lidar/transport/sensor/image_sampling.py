@@ -21,10 +21,7 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
 
     Values of PNG files are integers from 0 to 255 or 65535. Messages call the file the parameter `name`.
 
-    Raises
-    ------
-    UserError
-        When the file cannot be read, or does not hold finite real numbers in two dimensions.
+    Raises UserError when the file cannot be read, or does not hold finite real numbers in two dimensions.
     """
     where = f"{name} = {path!r}"
     try:

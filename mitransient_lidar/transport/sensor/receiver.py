@@ -1,19 +1,21 @@
-"""A receiver's pose, aperture and losses, and the sampling of its field of view."""
+"""A receiver's pose, aperture, losses and blur, and the sampling of its field of view."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, interleaved_point, pass_streams, stratified_point, unit_points
-from mitransient_lidar.transport.sensor.octaves import Octaves
+from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 from mitransient_lidar.transport.sensor.pixels import PixelArray
-from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
 #: The laser's footprint is sampled when the field of view contains more than this share of it.
 _SMALLEST_FOOTPRINT_SHARE = 0.05
@@ -31,27 +33,14 @@ IMAGE_PIXELS = 4096
 
 @dataclass(frozen=True)
 class ReceiverOptics:
-    """Receiver aperture and losses.
+    """Receiver aperture and losses."""
 
-    Parameters
-    ----------
-    aperture_area
-        Area [m^2] normal to every ray of the (small) field of view, 1e-12 to 1000.
-    optical_efficiency
-        Share of the collected light that reaches the detector, above 0 to 1.
-    two_way_atmospheric_transmittance
-        Share of the light that the air transmits both ways, above 0 to 1.
-    response_time_ns
-        Time constant of the receiver's exponential (single-pole) impulse response [ns], at most 1e6; 0 is ideal.
-    obscuration
-        Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
-    """
-
-    aperture_area: float
-    optical_efficiency: float
-    two_way_atmospheric_transmittance: float
+    aperture_area: float  #: Area [m^2] normal to every ray of the (small) field of view, 1e-12 to 1000.
+    optical_efficiency: float  #: Share of the collected light that reaches the detector, above 0 to 1.
+    two_way_atmospheric_transmittance: float  #: Share of the light that the air transmits both ways, above 0 to 1.
+    #: Time constant of the receiver's exponential (single-pole) impulse response [ns], at most 1e6; 0 is ideal.
     response_time_ns: float
-    obscuration: float = 0.0
+    obscuration: float = 0.0  #: Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
 
     @property
     def collection(self) -> float:
@@ -106,20 +95,13 @@ def solid_angle_factor(angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True)
 class SensorSample:
-    """One field-of-view sample for every path.
+    """One field-of-view sample for every path."""
 
-    Attributes
-    ----------
-    angles, direction, pixel
-        Tangent-plane angles and unit direction of the ray, and index of the pixel that sees it.
-    weight
-        Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
-    """
-
+    #: Tangent-plane angles and unit direction of the ray, and index of the pixel that sees it.
     angles: mi.Point2f
     direction: mi.Vector3f
     pixel: mi.UInt32
-    weight: mi.Float
+    weight: mi.Float  #: Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
 
     @classmethod
     def at(cls, pose: KernelPose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
@@ -190,3 +172,93 @@ class SensorSampler:
         weight = collection * solid_angle_factor(angle_x, angle_y) / density
         weight = dr.select(pixels_here > 0, weight, 0)
         return SensorSample.at(self.receiver.pose, angle_x, angle_y, pixel, weight)
+
+
+class Octaves:
+    """Sampling of the tangent plane about a centre: even in a core, beyond it as much in each octave of distance.
+
+    The density is 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)) at the distance r, with the core q, up to the edge R.
+
+    Parameters
+    ----------
+    centre
+        (angle_x, angle_y) of the centre [rad], shape (2,).
+    core, edge
+        Radii of the core and of all samples [rad], positive.
+    """
+
+    def __init__(self, centre: FloatArray, core: float, edge: float) -> None:
+        self._centre = [opaque(angle) for angle in centre]
+        self._core, self._edge, self._log_range = opaque(core), opaque(edge), opaque(np.log1p((edge / core) ** 2))
+
+    def around(self, radius: mi.Float, turn: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return points at distances from the centre [rad] and azimuths [turns]."""
+        sin, cos = dr.sincos(dr.two_pi * turn)
+        return dr.fma(radius, cos, self._centre[0]), dr.fma(radius, sin, self._centre[1])
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points."""
+        return self.around(self._core * dr.sqrt(dr.maximum(dr.exp(u.x * self._log_range) - 1, 0)), u.y)
+
+    def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the density in `sample` [1/rad^2]."""
+        radius2 = dr.square(angle_x - self._centre[0]) + dr.square(angle_y - self._centre[1])
+        density = dr.inv_pi / (self._log_range * (radius2 + self._core * self._core))
+        return dr.select(radius2 <= self._edge * self._edge, density, 0)
+
+    def in_core(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Bool:
+        """Return whether points lie in the core."""
+        radius2 = dr.square(angle_x - self._centre[0]) + dr.square(angle_y - self._centre[1])
+        return radius2 <= self._core * self._core
+
+
+class PointSpread(ABC):
+    """Displacement on the detector of light from one direction, against the focus of sharp optics."""
+
+    #: Angle that contains all of the light but 4e-6 [rad].
+    reach: float
+
+    @abstractmethod
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad] that are distributed as the light is."""
+
+
+class GaussianPointSpread(PointSpread):
+    """Circular Gaussian, of a standard deviation [rad] along each axis."""
+
+    def __init__(self, sigma: float) -> None:
+        self.sigma, self.reach = sigma, 5 * sigma
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad].
+
+        Box and Muller 1958, doi:10.1214/aoms/1177706645.
+        """
+        radius = opaque(self.sigma) * dr.sqrt(-2 * dr.log(1 - u.x))
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        return radius * cos, radius * sin
+
+
+class MeasuredPointSpread(PointSpread):
+    """Measured point-spread function, constant in each square cell of an image about the focus of sharp optics.
+
+    Parameters
+    ----------
+    values
+        Values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x), column
+        0 the left one (+angle_y).
+    width
+        Extent of the columns along angle_y [rad], positive.
+    """
+
+    def __init__(self, values: NDArray[np.float64], width: float) -> None:
+        self._sampler = ImageSampler(values)
+        self._cell = width / values.shape[1]
+        self.reach = 0.5 * self._cell * float(np.hypot(*values.shape))
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad]."""
+        row, column = self._sampler.sample(u)
+        rows, columns = self._sampler.shape
+        cell = opaque(self._cell)
+        return (0.5 * rows - row) * cell, (0.5 * columns - column) * cell

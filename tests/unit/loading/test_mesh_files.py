@@ -9,7 +9,7 @@ import pytest
 from array_inputs import mesh
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.mesh_files import check_ply
+from mitransient_lidar.loading.checks import check_ply
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene
 

@@ -15,8 +15,7 @@ from mitransient_lidar.flights.las import write_points
 from mitransient_lidar.plots import viewer
 from mitransient_lidar.plots.scene_viewer import traces
 from mitransient_lidar.plots.scene_viewer.page import page_text
-from mitransient_lidar.rendering.geometry.bundles import Bundle
-from mitransient_lidar.rendering.geometry.shapes import Relief, SceneGeometry, Solid
+from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid
 from mitransient_lidar.results.variables import PointClass
 
 RING = np.array([[1.0, 0.0], [0.0, 2.0], [-1.0, 0.0], [0.0, -2.0], [1.0, 0.0]])

@@ -7,7 +7,7 @@ import pytest
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.rendering.differences import Differences, default_step
+from mitransient_lidar.rendering.derivatives import Differences, default_step
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
 

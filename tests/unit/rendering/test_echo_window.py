@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.rendering.lines_of_sight import lines_of_sight
+from mitransient_lidar.rendering.describe import lines_of_sight
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 N, GROUP = 1.34, 1.364

@@ -12,8 +12,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import passive
 from mitransient_lidar.results import save
-from mitransient_lidar.transport.daylight.renderer import DaylightLight
-from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
+from mitransient_lidar.transport.daylight.renderer import DaylightLight, pixel_solid_angles
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels

@@ -9,7 +9,7 @@ import pytest
 from oracles.echo_times import bottom_time_ns
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.level_sea import snell
 from mitransient_lidar.rendering.scene_checks import check_scene
 
 THETA, N = np.radians(20), 1.34

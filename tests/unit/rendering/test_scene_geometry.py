@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.rendering.geometry.shapes import scene_geometry, thinned
+from mitransient_lidar.rendering.geometry import scene_geometry, thinned
 
 HEIGHT, OFF_NADIR, INDEX, DEPTH = 200.0, np.radians(20.0), 1.34, 8.0
 STILL = {"wind_speed": 0}

@@ -6,8 +6,8 @@ import pytest
 
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
-from mitransient_lidar.transport.bottom_depths import bottom_depths
 from mitransient_lidar.transport.scene_parts import seas_of
+from mitransient_lidar.transport.solids import bottom_depths
 
 SLOPE = {"type": "seabed", "depth": 2.0, "slope_x_deg": np.degrees(np.arctan(0.1)), "size": 80.0}
 PIER = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([-10, 0, 0]).scale([1, 1, 5])}

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 from kernel_arrays import array, vector
 
-from mitransient_lidar.transport.merging.packed_store import PackedStore
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
+from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.paths.path import PathPoint
 from mitransient_lidar.transport.paths.path_classes import PathClasses

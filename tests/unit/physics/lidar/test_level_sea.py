@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from oracles.refracted_path import refracted_path
 
-from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.level_sea import LevelSea, snell
 
 HEIGHT, N = 200.0, 1.34
 ORIGIN = np.array([3.0, -2.0, HEIGHT])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns, layered_time_ns
 
-from mitransient_lidar.physics.lidar.refraction import (
+from mitransient_lidar.physics.lidar.level_sea import (
     fresnel,
     refract,
     refract_level,

@@ -3,7 +3,7 @@
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
+from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 
 
 def test_narrow_spot_decays_with_c():

@@ -5,9 +5,9 @@ import pytest
 import significance
 from oracles.phase import henyey_greenstein
 
-from mitransient_lidar.physics.water.forward_scattering import displacements
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.two_way_spread import displacements
 
 THETA = np.linspace(0, np.radians(80), 100_001)
 

@@ -8,8 +8,7 @@ from oracles.phase import henyey_greenstein
 from rows import each_row
 
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio, petzold_average_particle
-from mitransient_lidar.physics.water.phase_file import read_phase_table
-from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.phase_table import PowerLawTable, read_phase_table
 
 
 def uneven_angles():

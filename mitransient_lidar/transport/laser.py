@@ -1,4 +1,4 @@
-"""Laser beam profiles in tangent-plane angles: energy density, sampling, widths and contours."""
+"""The laser's beam in tangent-plane angles: profiles with density, widths and contours, and sampling for a view."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import positive
 from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.rng import interleaved_point, stratified_point, unit_points
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
+from mitransient_lidar.transport.sensor.receiver import Octaves, Receiver
 
 #: Shares of the peak irradiance at which a beam's outlines are drawn.
 OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
@@ -27,24 +29,14 @@ _SMALLEST_ISLAND = 0.02
 
 
 class BeamProfile(ABC):
-    """Beam energy over the tangent plane, normalised to 1.
+    """Beam energy over the tangent plane, normalised to 1."""
 
-    Attributes
-    ----------
-    spreads
-        Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
-    rotation
-        Azimuth of the first axis, from +angle_x towards +angle_y [rad].
-    divergence
-        Full angles along these axes [rad], as defined for the transmitter parameter ``divergence_mrad``.
-    reach
-        Angle from the optical axis that contains all of the energy but 4e-6 [rad].
-    """
-
+    #: Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
     spreads: tuple[float, float]
-    rotation: float
+    rotation: float  #: Azimuth of the first axis, from +angle_x towards +angle_y [rad].
+    #: Full angles along these axes [rad], as defined for the transmitter parameter ``divergence_mrad``.
     divergence: tuple[float, float]
-    reach: float
+    reach: float  #: Angle from the optical axis that contains all of the energy but 4e-6 [rad].
 
     @abstractmethod
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
@@ -220,3 +212,52 @@ class ImageBeam(BeamProfile):
             large = _SMALLEST_ISLAND * max(areas)
             found.append((level, [loop for loop, area in zip(loops, areas, strict=True) if area >= large]))
         return found
+
+
+#: The field of view is sampled separately when it contains less than this share of the beam.
+_SMALLEST_SHARE = 0.5
+
+#: Core radius of the sampled region relative to the field of view, as light around it scatters into it.
+_ROOM = 1.5
+
+#: Width around that core beyond which there is little light, over the beam's standard deviation.
+_BEAM_EDGE = 3.0
+
+
+class BeamSampler:
+    """Samples the beam by its energy; half the samples lie about the field of view when that is much narrower.
+
+    Light that enters the water farther from the view the deeper reaches it, so that those samples are distributed in
+    `Octaves`. Both halves are weighted by the balance heuristic. Samples are stratified.
+
+    Parameters
+    ----------
+    spread
+        Distance from the view, on the sea, from which light reaches the view in the water [m].
+    """
+
+    def __init__(self, transmitter: mi.Emitter, receiver: Receiver, spread: float = 0.0) -> None:
+        self.transmitter = transmitter
+        spot = receiver.pose.ground_point()
+        centre = transmitter.pose.angles_of(spot - transmitter.pose.origin)
+        ranges = [float(np.linalg.norm(spot - pose.origin)) for pose in (receiver.pose, transmitter.pose)]
+        core = _ROOM * 0.5 * receiver.pixels.field_of_view * ranges[0] / ranges[1]
+        edge = core + min(spread / ranges[1], _BEAM_EDGE * transmitter.widest_angular_spread)
+        self._view = Octaves(centre, core, edge)
+        share = dr.mean(dr.select(self._view.in_core(*transmitter.sample_tangent(unit_points(4096))), mi.Float(1), 0))
+        self.use_view = float(share[0]) < _SMALLEST_SHARE
+
+    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Point2f, mi.Float]:
+        """Return tangent-plane angles of photons number `index` of `count`, and the energy [J] that each represents."""
+        transmitter = self.transmitter
+        if not self.use_view:
+            angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))
+            return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count)
+        point = interleaved_point(index, count, 2, rng)
+        of_view, of_beam = self._view.sample(point), transmitter.sample_tangent(point)
+        angle_x, angle_y = (dr.select(index % 2 == 1, *pair) for pair in zip(of_view, of_beam, strict=True))
+        density = transmitter.tangent_density(angle_x, angle_y)
+        mixture = dr.lerp(density, self._view.density(angle_x, angle_y), opaque(count // 2 / count))
+        # A sample of the beam's rim may lie outside both by rounding.
+        share = dr.select(density > 0, density / mixture, 0)
+        return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count) * share

@@ -1,1 +1,0 @@
-"""Shapes, beam and pixels of a loaded scene as arrays in its three dimensions."""

@@ -1,1 +1,0 @@
-"""The laser's beam: profiles and sampling."""
