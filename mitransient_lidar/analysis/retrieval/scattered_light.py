@@ -19,9 +19,8 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RA
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
+from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, water_and_bottoms
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
-from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function, water_scattering
@@ -232,15 +231,15 @@ def _curves(
     """Return path and signal of the column, and path and logarithm of bottoms, for `ScatteredLight`."""
     from scipy.ndimage import gaussian_filter1d
 
-    column = WaterColumn(*(np.array([one]) for one in (0.0, a + b, b, bb)))
-    model = EchoEstimate(view.system, column, [phase], np.eye(2) * 0.5 * view.slope_variance, depth, np.pi)
-    rng = np.random.default_rng(0)
-    water, bottoms = model.water_and_bottom(np.zeros((paths, 2)), _STEPS, rng, every_depth=True)
-    geometry = view.system
+    geometry, rng = view.system, np.random.default_rng(0)
+    water, bottoms = water_and_bottoms(
+        geometry, (a + b - b, b), phase, view.slope_variance, depth, (paths, _STEPS), rng
+    )
 
     def seen(light: Arrivals) -> tuple[FloatArray, FloatArray]:
-        shift = np.hypot(light.angle_x, light.angle_y)
-        return geometry.path_of_time(light.time_ns), light.energy * view.share(shift)
+        return geometry.path_of_time(light.time_ns), light.energy * view.share(
+            np.hypot(light.shift.real, light.shift.imag)
+        )
 
     path, energy = seen(water)
     step = depth / _STEPS / geometry.cos_water
