@@ -77,12 +77,8 @@ class Comparison:
 def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Return two results with time bins; where one has gates alone, both results' gates are bins at their middles.
 
-    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes.
-
-    Raises
-    ------
-    UserError
-        If one has gates or a record alone and the other has none, or a record has a single shot.
+    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes. Raises
+    `UserError` if one has gates or a record alone and the other has none, or a record has a single shot.
     """
     results = first, second
     if all("impulse_response" in one for one in results):
@@ -117,11 +113,7 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     energy error as if they had one sign.
 
     Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
-
-    Raises
-    ------
-    UserError
-        If pixels or bins differ, or no bin is included.
+    Raises `UserError` if pixels or bins differ, or no bin is included.
     """
     results = as_bins(first, second)
     times = [result["time"].values for result in results]

@@ -179,12 +179,7 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     A notebook shows the progress of a function that has the parameter ``progress``, unless one is given.
 
     Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
-    Python.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range; the sentence names the parameter.
+    Python. Raises `UserError` if a number is out of range; the sentence names the parameter.
     """
     signature, options = inspect.signature(function), declared(function)
 

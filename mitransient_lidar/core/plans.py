@@ -53,6 +53,8 @@ class Plan:
     def of(cls, given: object, where: str = "", prefix: str = "", **others: Any) -> Self:
         """Return the object for a table in a file.
 
+        Raises `UserError` if it is no table, a key is unknown or missing, or a value is not allowed.
+
         Parameters
         ----------
         given
@@ -63,11 +65,6 @@ class Plan:
             Beginning of value names in messages, such as ``design.``.
         others
             Fields that are no keys.
-
-        Raises
-        ------
-        UserError
-            If it is no table, a key is unknown or missing, or a value is not allowed.
         """
         where = where or f"[{cls.__name__.lower()}]"
         values = table(where, given)

@@ -130,10 +130,7 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
 def number_list(name: str, given: object) -> FloatArray:
     """Return one number, a sequence, or a text with numbers separated by commas or spaces, shape (N,), N > 0.
 
-    Raises
-    ------
-    UserError
-        If there is no number, an entry is empty or not a number, or a number is not finite.
+    Raises `UserError` if there is no number, an entry is empty or not a number, or a number is not finite.
     """
     values: Any = given
     if isinstance(given, str):

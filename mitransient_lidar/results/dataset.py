@@ -50,7 +50,8 @@ def build(
 ) -> xr.Dataset:
     """Label a render's arrays as a result.
 
-    Non-finite values are kept; a warning lists their pixels.
+    Non-finite values are kept; a warning lists their pixels. Raises `ValueError` if shapes disagree, names repeat, a
+    number is out of range or an attribute has an unsupported type.
 
     Parameters
     ----------
@@ -68,11 +69,6 @@ def build(
         Rows and columns of an imager, with pixels in row-major order.
     attributes : mapping of str to int, float, str or a list of those
         Parameters and outcome of the render; they override the attributes set here (``title``, ``history``, ...).
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, names repeat, a number is out of range or an attribute has an unsupported type.
     """
     arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
     values = {name: np.array(array, dtype=np.float64) for name, array in zip(LIGHT, arrays, strict=True)}
@@ -208,10 +204,8 @@ def _add(
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
     """Return the dimensions of a variable, (pixel, time) or (row, column, time), with `shots` also after ``shot``.
 
-    Raises
-    ------
-    UserError
-        If the variable or a coordinate is missing, the dimensions are others or empty, or the times are invalid.
+    Raises `UserError` if the variable or a coordinate is missing, the dimensions are others or empty, or the times are
+    invalid.
     """
     if name not in dataset:
         raise UserError(f"the dataset has no variable {name}: it must be a result with a record in time")
@@ -229,13 +223,9 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
 def time_axis(dataset: xr.Dataset) -> TimeAxis:
     """Return a dataset's time bins.
 
-    They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with
-    them, else from the coordinate, as after a selection of bins.
-
-    Raises
-    ------
-    UserError
-        If the dataset has no coordinate ``time``, or a single bin of unknown width.
+    They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with them,
+    else from the coordinate, as after a selection of bins. Raises `UserError` if the dataset has no coordinate
+    ``time``, or a single bin of unknown width.
     """
     if "time" not in dataset.coords:
         raise UserError("the dataset has no coordinate time")
@@ -257,12 +247,8 @@ def pixel_coordinates(
 ) -> dict[str, Any]:
     """Return pixel coordinates: their names, or rows and columns, and their centres angle_x and angle_y.
 
-    Arguments as for `build`.
-
-    Raises
-    ------
-    ValueError
-        If names repeat, or the number of names or grid cells differs from the number of centres.
+    Arguments as for `build`. Raises `ValueError` if names repeat, or the number of names or grid cells differs from the
+    number of centres.
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)

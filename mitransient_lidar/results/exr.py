@@ -100,10 +100,8 @@ class Part(NamedTuple):
 def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
     """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts for a file, or for a sequence of files.
 
-    Raises
-    ------
-    UserError
-        If the dataset has variables that the file cannot store, or so many channels do not fit into the memory.
+    Raises `UserError` if the dataset has variables that the file cannot store, or so many channels do not fit into the
+    memory.
     """
     types = {name: dataset[name].dtype.name for name in _OF_FRAMES if name in dataset}
     if content == "frames":
@@ -244,12 +242,8 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
     """Write a gate stack as numbered files in a folder, one per gate: ``<stem>_gate000.exr`` and so on.
 
     The folder is created if it is missing, and existing files of the same names are replaced. The first file is written
-    last, so that `read` rejects an interrupted sequence.
-
-    Raises
-    ------
-    UserError
-        If `stem` is no file name, or a file cannot be written.
+    last, so that `read` rejects an interrupted sequence. Raises `UserError` if `stem` is no file name, or a file cannot
+    be written.
     """
     if not stem or Path(stem).name != stem:
         raise UserError(f"stem = {stem!r} must be the start of a file name, without folders")
@@ -271,10 +265,7 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
 def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
     """Write one or more images into one file, which is overwritten if it exists.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises `OSError` if the file cannot be written.
     """
     kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
@@ -292,10 +283,7 @@ def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
 def read(path: Path) -> xr.Dataset:
     """Read a dataset from a file, the first file of a sequence, or a folder with one sequence.
 
-    Raises
-    ------
-    UserError
-        If a file is missing, damaged or truncated, or was not written by this package.
+    Raises `UserError` if a file is missing, damaged or truncated, or was not written by this package.
     """
     if path.is_dir():
         path = _first_of_folder(path)
@@ -397,11 +385,8 @@ def _first_of_folder(folder: Path) -> Path:
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
     """Read all images in a file.
 
-    Raises
-    ------
-    UserError
-        If the file is damaged, truncated, or larger than half of the memory, or a part has another checksum than its
-        own. Files by other programs have none.
+    Raises `UserError` if the file is damaged, truncated, or larger than half of the memory, or a part has another
+    checksum than its own. Files by other programs have none.
     """
     check_exr(path, _damaged(path), largest_result())
     with damaged_file(_damaged(path)), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
@@ -429,10 +414,7 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
 def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a part's exact metadata.
 
-    Raises
-    ------
-    UserError
-        If they are missing or damaged.
+    Raises `UserError` if they are missing or damaged.
     """
     foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
     if _EXACT not in attributes:

@@ -155,6 +155,8 @@ def kinds_of(dataset: xr.Dataset) -> set[str]:
 def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
     """Return a dataset that is given itself, or by its file's path.
 
+    Raises `UserError` if it is neither, or of none of these kinds, or the file cannot be read.
+
     Parameters
     ----------
     name
@@ -163,11 +165,6 @@ def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
         The dataset, or a path for `open`.
     kinds
         Kinds from `kinds_of`, of which it must be one.
-
-    Raises
-    ------
-    UserError
-        If it is neither, or of none of these kinds, or the file cannot be read.
     """
     if isinstance(given, xr.Dataset):
         dataset, place = given, name

@@ -123,6 +123,8 @@ def build_gates(
 ) -> xr.Dataset:
     """Label the energies in gates as a gate stack.
 
+    Raises `UserError` if the energies have another shape.
+
     Parameters
     ----------
     energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
@@ -132,11 +134,6 @@ def build_gates(
         The gates.
     coords, attributes : mapping
         Coordinates and attributes of a result; the coordinate ``time`` is ignored.
-
-    Raises
-    ------
-    UserError
-        If the energies have another shape.
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
@@ -235,12 +232,8 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
     """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
-    Several frames give their mean, `average_frames`.
-
-    Raises
-    ------
-    UserError
-        If it has no gates, or dimensions other than (row, column, gate) or (pixel, gate); `place` names it.
+    Several frames give their mean, `average_frames`. Raises `UserError` if it has no gates, or dimensions other than
+    (row, column, gate) or (pixel, gate); `place` names it.
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
         raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}")
@@ -268,12 +261,7 @@ def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Datase
     """Return gates to draw and to analyse as a gate stack, with a name and unit for ``gate_energy`` in its attributes.
 
     Camera frames become their mean above the dark level [DN], with this mean's standard error; a stack with a sea for
-    each frame becomes the mean over the frames.
-
-    Raises
-    ------
-    UserError
-        As for `check_stack`.
+    each frame becomes the mean over the frames. Raises `UserError` as for `check_stack`.
     """
     if not has_frames(dataset):
         stack = check_stack(dataset, place)

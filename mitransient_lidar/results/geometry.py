@@ -66,7 +66,8 @@ class LinesOfSight:
         """Read the lines of sight in a result or gate stack.
 
         Without their coordinates, they go to the pixel centres, with the mean arrival in the attribute
-        ``surface_time_ns`` if it is known.
+        ``surface_time_ns`` if it is known. Raises `UserError` if coordinates and attributes do not determine the
+        geometry.
 
         Parameters
         ----------
@@ -74,11 +75,6 @@ class LinesOfSight:
             A dataset over ``pixel``, or ``row`` and ``column``.
         dims
             Dimensions of the arrays, flattened to one; by default the pixels' own.
-
-        Raises
-        ------
-        UserError
-            If coordinates and attributes do not determine the geometry.
         """
         if dims is None:
             dims = ("row", "column") if "row" in dataset.dims else ("pixel",)
@@ -166,6 +162,9 @@ class LinesOfSight:
 def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
     """Read a lidar's geometry from a result's attributes.
 
+    Raises `UserError` if an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under
+    water.
+
     Parameters
     ----------
     attributes
@@ -174,11 +173,6 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
     surface
         Surface echo time: ``measured`` is ``surface_time_ns``, ``level`` the time of the mean sea level on the axis,
         ``any`` the first of these that is known.
-
-    Raises
-    ------
-    UserError
-        If an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under water.
     """
     if surface == "measured":
         required_number(attributes, "surface_time_ns")
@@ -195,12 +189,8 @@ def lidar_system(attributes: Attributes, efficiency: float | None = None) -> Lid
     """Return the lidar equation's system, with the whole beam's energy and the open aperture area.
 
     The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default it is
-    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
-
-    Raises
-    ------
-    UserError
-        If the efficiency is out of range or unknown, or another attribute is missing.
+    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see. Raises
+    `UserError` if the efficiency is out of range or unknown, or another attribute is missing.
     """
     energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
     geometry = lidar_geometry(attributes)

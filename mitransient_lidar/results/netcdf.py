@@ -40,14 +40,8 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
     It goes by way of memory, because HDF5 ends the process where the disk is full. Signals behind a converter are
-    written as its codes.
-
-    Raises
-    ------
-    ValueError
-        If an attribute is no number, text or list of one of these.
-    OSError
-        If the file cannot be written.
+    written as its codes. Raises `ValueError` if an attribute is no number, text or list of one of these. Raises
+    `OSError` if the file cannot be written.
     """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
@@ -125,10 +119,7 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
 def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
     """Read a NetCDF-4 file into memory, and return whether another program than `write` has written it.
 
-    Raises
-    ------
-    UserError
-        If the file is damaged, truncated, or larger than half of the memory.
+    Raises `UserError` if the file is damaged, truncated, or larger than half of the memory.
     """
     damaged = f"{path} is damaged or truncated: its NetCDF data cannot be read."
     check_sum(path)

@@ -105,10 +105,7 @@ class SumErrors:
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
         """Return a result's statement, None without one.
 
-        Raises
-        ------
-        UserError
-            If the result states another kind of correlation.
+        Raises `UserError` if the result states another kind of correlation.
         """
         curve = _curve(dataset.attrs)
         if VARIABLE not in dataset:

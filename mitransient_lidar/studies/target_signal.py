@@ -175,16 +175,13 @@ def target_gates(
 ) -> xr.Dataset:
     """Render a scene's gates with and without a target, on the same random numbers, for any number of pixels.
 
+    Raises `UserError` if the scene has no gates, or as for `target_signal`.
+
     Returns
     -------
     xarray.Dataset
         A gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
         without), ``half`` (of the passes), and its dimensions.
-
-    Raises
-    ------
-    UserError
-        If the scene has no gates, or as for `target_signal`.
     """
     chosen, *renderers = _pair(session, target_id, integrator, None)
     lidar = renderers[0].scene
@@ -225,10 +222,7 @@ def _pair(
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
     """Return the target's shape.
 
-    Raises
-    ------
-    UserError
-        If there is no such shape, or it is the sea, or completely above the sea or below the bottom.
+    Raises `UserError` if there is no such shape, or it is the sea, or completely above the sea or below the bottom.
     """
     shapes = list(scene.shapes())
     names = [shape.id() for shape in shapes]

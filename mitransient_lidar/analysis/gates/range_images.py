@@ -55,6 +55,8 @@ def range_from_gates(
 ) -> RangeImage:
     """Find every pixel's echo above the water column's backscatter.
 
+    Raises `UserError` if shapes disagree or a value is out of range.
+
     Parameters
     ----------
     energy, stderr : array_like, shape (..., gate)
@@ -69,11 +71,6 @@ def range_from_gates(
     -------
     RangeImage
         Arrays of shape (...); pixels with non-finite energies have NaN depth and confidence 0.
-
-    Raises
-    ------
-    UserError
-        If shapes disagree or a value is out of range.
 
     Notes
     -----

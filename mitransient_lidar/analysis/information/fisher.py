@@ -67,6 +67,9 @@ def fisher_information(
 ) -> xr.Dataset:
     """Return the Fisher information in one shot's record about scene parameters, and Cramer-Rao bounds.
 
+    Raises `UserError` if a dataset has no derivatives, renders differ, no sample has both signal and noise, a nuisance
+    is unknown, or as for `detect_waveforms`.
+
     Parameters
     ----------
     dataset : xarray.Dataset or sequence of xarray.Dataset
@@ -92,12 +95,6 @@ def fisher_information(
         the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method``
         and ``prior`` (a nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on
         parameters that the record does not determine, one per line.
-
-    Raises
-    ------
-    UserError
-        If a dataset has no derivatives, renders differ, no sample has both signal and noise, a nuisance is unknown, or
-        as for `detect_waveforms`.
 
     Notes
     -----
@@ -184,10 +181,7 @@ def _check(renders: Sequence[xr.Dataset]) -> tuple[str, ...]:
 def priors(nuisances: Mapping[str, float]) -> dict[str, float]:
     """Return the standard deviations to which nuisances are known, as numbers.
 
-    Raises
-    ------
-    UserError
-        If a name is not in `NUISANCES`, or a number not above 0.
+    Raises `UserError` if a name is not in `NUISANCES`, or a number not above 0.
     """
     for name, known in nuisances.items():
         if name not in NUISANCES:

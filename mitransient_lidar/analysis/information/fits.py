@@ -59,6 +59,9 @@ class _Rendered(NamedTuple):
 class WaveformFit:
     """Fit of a model's parameters to waveforms.
 
+    Raises `UserError` if a start or bounds are invalid, there is nothing to fit, no sample lies within the model's
+    time, or the waveforms have no light where the model has.
+
     Parameters
     ----------
     found
@@ -72,12 +75,6 @@ class WaveformFit:
         Lowest and highest values by name; see `free_parameters`.
     free_scale, free_time
         Whether scale and time offset of the waveforms are unknown, by default only for uncalibrated waveforms.
-
-    Raises
-    ------
-    UserError
-        If a start or bounds are invalid, there is nothing to fit, no sample lies within the model's time, or the
-        waveforms have no light where the model has.
     """
 
     def __init__(

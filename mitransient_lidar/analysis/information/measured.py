@@ -98,10 +98,7 @@ class Measured:
     def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
         """Return the scale of a model's samples, in the same shape, by least squares with variances `noise`.
 
-        Raises
-        ------
-        UserError
-            If the waveforms have no light where the model has.
+        Raises `UserError` if the waveforms have no light where the model has.
         """
         weight = np.where(np.isfinite(self.values), 1.0, 0.0)
         if noise is not None:
@@ -135,10 +132,7 @@ class Prediction(NamedTuple):
 def with_waveforms(source: Given) -> Given:
     """Return the dataset of a result or of signals, given itself or by its file; a table's path unchanged.
 
-    Raises
-    ------
-    UserError
-        If it is another dataset, or its file cannot be read.
+    Raises `UserError` if it is another dataset, or its file cannot be read.
     """
     is_path = isinstance(source, (str, os.PathLike)) and not waveform_files.is_waveform_file(source)
     if is_path and Path(source).suffix.lower() not in (".nc", ".exr", ""):
@@ -154,6 +148,9 @@ def measured(
 ) -> Measured:
     """Return the waveforms in a result, a recorded signal, or a table.
 
+    Raises `UserError` if the file cannot be read, a series has more than one shot, the receiver is unknown, or a value
+    is out of range.
+
     Parameters
     ----------
     source
@@ -167,12 +164,6 @@ def measured(
         Receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
         receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
         samples are volts, which are expanded; limits and rounding are found from the samples.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read, a series has more than one shot, the receiver is unknown, or a value is out of
-        range.
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
@@ -204,12 +195,8 @@ def measured(
 def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Prediction:
     """Return a render's prediction, with derivatives, for the pixels of waveforms, after their receiver if any.
 
-    Derivatives after a receiver are central differences of its closed form in the direction of the derivative.
-
-    Raises
-    ------
-    UserError
-        If the render has other pixels, lacks a derivative, or holds values that are not finite.
+    Derivatives after a receiver are central differences of its closed form in the direction of the derivative. Raises
+    `UserError` if the render has other pixels, lacks a derivative, or holds values that are not finite.
     """
     dataset = _same_pixels(found, dataset)
     dims = (*found.pixel_dims, "time")

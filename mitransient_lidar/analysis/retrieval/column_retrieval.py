@@ -127,6 +127,7 @@ def bottom_class(
     """Return the names of bottom classes, and their probabilities, shape (..., classes).
 
     A probability is the fraction of a Gaussian about the reflectance in the class; values below 0 count as the first.
+    Raises `UserError` if classes are out of order.
 
     Parameters
     ----------
@@ -136,11 +137,6 @@ def bottom_class(
         Names and lower edges, increasing from 0. By default: dark (mud, vegetation), medium from 0.1 (gravel, rock,
         mixed bottoms), bright from 0.2 (sand, shell). These edges are a convention: bottoms of one kind vary by a
         factor of 2, and a single wavelength does not resolve more classes.
-
-    Raises
-    ------
-    UserError
-        If classes are out of order.
     """
     from scipy.special import ndtr
 

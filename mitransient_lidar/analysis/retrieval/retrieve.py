@@ -56,6 +56,8 @@ def surface_slopes(
 ) -> xr.Dataset:
     """Estimate slope, direction and height of the surface from times and strengths of the pixels' surface echoes.
 
+    Raises `UserError` if the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -84,11 +86,6 @@ def surface_slopes(
         ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
         Without a sea model, a slope beyond 5 standard deviations of the sea's slopes (attribute
         ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
-
-    Raises
-    ------
-    UserError
-        If the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
     Notes
     -----
@@ -179,6 +176,8 @@ def bottom(
 ) -> xr.Dataset:
     """Estimate depth and reflectance of the bottom, without and with the surface's slope and height.
 
+    Raises `UserError` if the dataset lacks an attribute or a number is out of range.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -202,11 +201,6 @@ def bottom(
         ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance
         ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where a flag is
         set, without a column with a warning. Depth and energy are NaN if the echo comes from a target.
-
-    Raises
-    ------
-    UserError
-        If the dataset lacks an attribute or a number is out of range.
 
     Notes
     -----
@@ -332,6 +326,8 @@ def water(
 ) -> xr.Dataset:
     """Estimate absorption, backscattering, Kd and bounds of c from the column.
 
+    Raises `UserError` if the view is too narrow, the dataset lacks an attribute or a number is out of range.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -351,11 +347,6 @@ def water(
         ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
         `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the
         beam.
-
-    Raises
-    ------
-    UserError
-        If the view is too narrow, the dataset lacks an attribute or a number is out of range.
     """
     lidar = lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)

@@ -162,6 +162,8 @@ class SeaShots:
 def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed: int = 2**40) -> SeaShots:
     """Return the surface echoes of 600 shots at random locations on four seas.
 
+    Raises `UserError` if the wind speed is out of range, or waves move the light by too many beam widths.
+
     Parameters
     ----------
     lidar : SeaLidar
@@ -172,11 +174,6 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
         Direction that the wind blows towards, counter-clockwise from the lidar's azimuth [rad].
     seed : int
         Seed of seas and locations, at least 0.
-
-    Raises
-    ------
-    UserError
-        If the wind speed is out of range, or waves move the light by too many beam widths.
 
     Notes
     -----

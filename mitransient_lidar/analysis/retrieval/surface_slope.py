@@ -46,12 +46,8 @@ class PixelLight:
     def of_outlines(cls, outlines: Sequence[Sequence[npt.ArrayLike]], sigma: float) -> PixelLight:
         """Integrate a Gaussian beam with a standard deviation [rad] over the area inside the outlines of each pixel.
 
-        Outlines are closed lines of points (angle_x, angle_y) [rad]; a line inside another one is a hole.
-
-        Raises
-        ------
-        UserError
-            If `sigma` is not positive, a line has fewer than three points, or the beam misses a pixel.
+        Outlines are closed lines of points (angle_x, angle_y) [rad]; a line inside another one is a hole. Raises
+        `UserError` if `sigma` is not positive, a line has fewer than three points, or the beam misses a pixel.
         """
         width = positive("sigma", sigma)
         found = []
@@ -103,6 +99,8 @@ def fit_plane(
 ) -> SurfacePlane:
     """Fit a plane to the surface echoes in each shot's pixels.
 
+    Raises `UserError` if `facets` is not positive.
+
     Parameters
     ----------
     time_ns : array_like, shape (n, pixels)
@@ -121,11 +119,6 @@ def fit_plane(
     SurfacePlane
         Both slopes with three echoes that are not collinear; with two at different angle_x, the slope along, assuming
         that across is 0; otherwise neither.
-
-    Raises
-    ------
-    UserError
-        If `facets` is not positive.
 
     Notes
     -----

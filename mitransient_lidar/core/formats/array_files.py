@@ -32,10 +32,7 @@ Array = npt.NDArray[Any]
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
     """Return a file's suffix in lower case; `kind` is the file kind, for the message.
 
-    Raises
-    ------
-    UserError
-        If the suffix is not one of `suffixes`, or the file cannot be opened, or is no regular one.
+    Raises `UserError` if the suffix is not one of `suffixes`, or the file cannot be opened, or is no regular one.
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:

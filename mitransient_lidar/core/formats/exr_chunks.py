@@ -62,10 +62,7 @@ class Part:
 def read_headers(path: str | os.PathLike[str]) -> list[Part]:
     """Return the parts of an OpenEXR file.
 
-    Raises
-    ------
-    ValueError, KeyError, IndexError, struct.error
-        If a header is damaged.
+    Raises `ValueError`, `KeyError`, `IndexError` or `struct.error` if a header is damaged.
     """
     with open_file(path) as file:
         return _headers(file)[0]
@@ -74,12 +71,8 @@ def read_headers(path: str | os.PathLike[str]) -> list[Part]:
 def check_chunks(path: str | os.PathLike[str]) -> None:
     """Raise an error if scan line chunks are not where the file states, or do not decompress.
 
-    Tiles are not checked, nor the data of other compressions than ZIP, ZIPS and PXR24.
-
-    Raises
-    ------
-    ValueError, KeyError, IndexError, struct.error, zlib.error
-        If the file is damaged.
+    Tiles are not checked, nor the data of other compressions than ZIP, ZIPS and PXR24. Raises `ValueError`, `KeyError`,
+    `IndexError`, `struct.error` or `zlib.error` if the file is damaged.
     """
     with open_file(path) as file:
         parts, several = _headers(file)

@@ -71,10 +71,7 @@ class PacketFile:
     def take(self, start: int, count: int, whose: str, *, begins: bool = False) -> bytes:
         """Return bytes of `whose` from a position on, where its samples begin or go on.
 
-        Raises
-        ------
-        UserError
-            If the samples begin outside the file, or it ends before the last byte.
+        Raises `UserError` if the samples begin outside the file, or it ends before the last byte.
         """
         if begins and not HEADER <= start < max(self._size, HEADER + 1):
             raise UserError(

@@ -120,11 +120,8 @@ def is_east_north(system: Any) -> bool:
 def map_system(path: object, text: Any, name: object = None) -> MapSystem:
     """Return a map's system from a code, a WKT or attributes, which belong to `name` or to the map's own file.
 
-    Raises
-    ------
-    UserError
-        If pyproj does not know it, its coordinates are degrees or geocentric, or its axes do not point to east and
-        north.
+    Raises `UserError` if pyproj does not know it, its coordinates are degrees or geocentric, or its axes do not point
+    to east and north.
     """
     system = parsed_system(path if name is None else name, text)
     horizontal, vertical = system, None

@@ -84,10 +84,7 @@ class Parameter:
     def checked(self, value: Any) -> Any:
         """Return a value of this parameter: a float, an integer or a truth value within its range; others as given.
 
-        Raises
-        ------
-        UserError
-            If it is not allowed; the sentence names the parameter, the value and the allowed values.
+        Raises `UserError` if it is not allowed; the sentence names the parameter, the value and the allowed values.
         """
         if value is None or (self.may_be_auto and value == AUTO) or self.is_list:
             return value

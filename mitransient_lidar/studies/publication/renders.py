@@ -52,6 +52,8 @@ _APART_M, _SEED_STEP = 6.0, 1000
 class Renders:
     """Results for the publication's scenes.
 
+    Raises `UserError` if a number is out of range.
+
     Parameters
     ----------
     target_error
@@ -60,11 +62,6 @@ class Renders:
         Seed of all random numbers, 0 to 10^6.
     progress
         Called with a `passes.Progress` after every batch of shots.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range.
     """
 
     target_error: float = 0.01
