@@ -34,22 +34,15 @@ _LARGEST_RELATIVE_ERROR = 0.3
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences between two results.
+    """Differences between two results."""
 
-    Attributes
-    ----------
-    z
-        Difference between the impulse responses in standard errors, second minus first, shape (pixel, time), converted
-        to the normal distribution for few passes; NaN in excluded bins.
-    limit
-        Critical ``abs(z)`` for the largest difference over all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
-    energy_ratio, energy_ratio_stderr
-        Energy in the included bins, second over first, and its standard error. Where the results state the correlation
-        between bin errors (`results.sum_errors`), it is the error of the power in these bins; pixels are independent.
-    """
-
+    #: Difference between the impulse responses in standard errors, second minus first, shape (pixel, time), converted
+    #: to the normal distribution for few passes; NaN in excluded bins.
     z: FloatArray
+    #: Critical ``abs(z)`` for the largest difference over all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
     limit: float
+    #: Energy in the included bins, second over first, and its standard error. Where the results state the correlation
+    #: between bin errors (`results.sum_errors`), it is the error of the power in these bins; pixels are independent.
     energy_ratio: float
     energy_ratio_stderr: float
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import re
 import textwrap
 import types
@@ -15,15 +16,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.progress import progress_of
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    in_range,
-    integer,
-    non_negative,
-    number_list,
-    positive,
-    relative_error,
-)
+from mitransient_lidar.core.validation import FloatArray, integer, number_list, number_within, relative_error
 
 #: Annotations as texts that may have an `Option`.
 _MAY_HAVE = re.compile(r"\w+$|Annotated\[")
@@ -40,49 +33,30 @@ NumberOrAuto = float | Literal["auto"] | None
 
 @dataclass(frozen=True)
 class Option:
-    """Meaning and range of a parameter, in the annotation of a public function.
+    """Meaning and range of a parameter, in the annotation of a public function."""
 
-    Attributes
-    ----------
-    meaning
-        Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
-    low, high
-        Limits of a number, or of each number in a list; None where there is none. `low` itself is excluded if `above`.
-    unit
-        Unit of numbers.
-    ascending
-        Whether the numbers in a list must increase.
-    form
-        Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
-        they are.
-    flag
-        Option name in commands, where it differs from the parameter's name.
-    is_argument
-        Whether commands take it by its place.
-    """
-
-    meaning: str
+    meaning: str  #: Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
+    #: Limits of a number, or of each number in a list; None where there is none. `low` itself is excluded if `above`.
     low: float | None = None
     high: float | None = None
-    unit: str = ""
+    unit: str = ""  #: Unit of numbers.
     above: bool = False
-    ascending: bool = False
+    ascending: bool = False  #: Whether the numbers in a list must increase.
+    #: Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
+    #: they are.
     form: str = ""
-    flag: str = ""
-    is_argument: bool = False
+    flag: str = ""  #: Option name in commands, where it differs from the parameter's name.
+    is_argument: bool = False  #: Whether commands take it by its place.
 
     def range(self) -> str:
         """Return the allowed numbers as text, empty without limits."""
         if self.low is None:
             return ""
+        low, high = _number(self.low), "" if self.high is None else _number(self.high)
         if self.above:
-            text = f"greater than {_number(self.low)}" + (
-                "" if self.high is None else f", at most {_number(self.high)}"
-            )
+            text = f"greater than {low}" + (f", at most {high}" if high else "")
         else:
-            text = (
-                f"at least {_number(self.low)}" if self.high is None else f"{_number(self.low)} to {_number(self.high)}"
-            )
+            text = f"{low} to {high}" if high else f"at least {low}"
         return text + ", ascending" * self.ascending
 
     def help(self) -> str:
@@ -98,21 +72,19 @@ class Option:
             return value
         if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
             return self._check_list(name, value)
-        if int in kinds:
-            assert isinstance(self.low, int)
-            assert isinstance(self.high, int)
-            return integer(name, value, self.low, self.high)
-        # Errors for other limits would state the range that these functions allow.
-        assert self.low == 0 or not (self.above or self.high is None)
-        assert not self.above or self.high in (None, 1)
-        if self.above:
-            return positive(name, value) if self.high is None else relative_error(name, value)
-        if self.high is None:
-            return non_negative(name, value)
-        return in_range(name, value, self.low, self.high)
+        return self.number(name, value, int in kinds)
+
+    def number(self, name: str, value: Any, whole: bool = False) -> float | int:
+        """Return a number, or a whole one; raise `UserError` if it is out of range."""
+        low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        if whole:
+            return integer(name, value, int(low), int(high))
+        if self.above and high == 1 and name.endswith("error"):
+            return relative_error(name, value)
+        return number_within(name, value, low, high, above=self.above)
 
     def _check_list(self, name: str, values: Any) -> list[float]:
-        numbers, low = number_list(name, values), np.float64(-np.inf if self.low is None else self.low)
+        numbers, low = number_list(name, values), self.low or 0
         inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
         if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
             raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")

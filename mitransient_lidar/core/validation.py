@@ -41,10 +41,7 @@ def finite(name: str, value: object) -> float:
 
 def positive(name: str, value: object) -> float:
     """Return `value` as a float above 0."""
-    number = finite(name, value)
-    if number <= 0:
-        raise UserError(f"{name} = {number:g} must be greater than 0")
-    return number
+    return number_within(name, value, 0, above=True)
 
 
 def non_negative(name: str, value: object) -> float:

@@ -36,30 +36,19 @@ _SIGHT = {
 
 @dataclass(frozen=True)
 class LinesOfSight:
-    """Pixel lines of sight over a level sea: arrays with one shape, such as (pixels,).
+    """Pixel lines of sight over a level sea: arrays with one shape, such as (pixels,)."""
 
-    Attributes
-    ----------
-    sight_x, sight_y
-        Tangent-plane angles about the receiver's axis [rad].
-    off_nadir
-        Angle from the vertical in air [rad].
-    surface_time, surface_spread
-        Echo arrival from the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's direct
-        light.
-    depth_per_ns
-        Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one location.
-    beam_share
-        Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
-    """
-
+    #: Tangent-plane angles about the receiver's axis [rad].
     sight_x: FloatArray
     sight_y: FloatArray
-    off_nadir: FloatArray
+    off_nadir: FloatArray  #: Angle from the vertical in air [rad].
+    #: Echo arrival from the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's direct
+    #: light.
     surface_time: FloatArray
     surface_spread: FloatArray
+    #: Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one location.
     depth_per_ns: FloatArray
-    beam_share: FloatArray
+    beam_share: FloatArray  #: Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset, dims: tuple[str, ...] | None = None) -> LinesOfSight:

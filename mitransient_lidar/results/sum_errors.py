@@ -28,21 +28,13 @@ _CURVE = ("error_inflation_bins", "error_inflation")
 
 @dataclass(frozen=True)
 class BlockCorrelation:
-    """Correlation between bin errors, the same for all bins in two blocks.
+    """Correlation between bin errors, the same for all bins in two blocks."""
 
-    Attributes
-    ----------
-    correlation
-        Mean correlation between a bin in one block and a bin in another, shape (blocks, blocks); on the diagonal,
-        between different bins in a block.
-    block
-        Block of each bin, ascending, shape (time,).
-    inflation
-        Ratio of given errors to bin errors, shape () or (time,).
-    """
-
+    #: Mean correlation between a bin in one block and a bin in another, shape (blocks, blocks); on the diagonal,
+    #: between different bins in a block.
     correlation: FloatArray
-    block: np.ndarray[Any, np.dtype[np.intp]]
+    block: np.ndarray[Any, np.dtype[np.intp]]  #: Block of each bin, ascending, shape (time,).
+    #: Ratio of given errors to bin errors, shape () or (time,).
     inflation: FloatArray = field(default_factory=lambda: np.ones(()))
 
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
@@ -87,18 +79,11 @@ class BlockCorrelation:
 
 @dataclass(frozen=True)
 class SumErrors:
-    """Correlation between bin errors, from a render's passes.
+    """Correlation between bin errors, from a render's passes."""
 
-    Attributes
-    ----------
-    shared
-        The correlation; None where only the curve is known, as from an EXR file.
-    curve
-        Numbers of bins, and the median ratios between their sums' errors and independent bins', shape (2, n); empty
-        where nothing is known.
-    """
-
-    shared: BlockCorrelation | None
+    shared: BlockCorrelation | None  #: The correlation; None where only the curve is known, as from an EXR file.
+    #: Numbers of bins, and the median ratios between their sums' errors and independent bins', shape (2, n); empty
+    #: where nothing is known.
     curve: FloatArray
 
     @classmethod

@@ -33,23 +33,17 @@ _PASSES = 12
 
 @dataclass(frozen=True)
 class RenderedShots:
-    """Shots in a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level.
-
-    Attributes
-    ----------
-    azimuth, beam_spread
-        Beam azimuth [rad], and standard deviations of its footprint along and across it [m].
-    pixel_lines, pixel_map, pixel_count
-        Grid lines of a map about a shot [m], shape (n,), the pixel index at each node, shape (n, n), rows along y, and
-        the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
-    """
+    """Shots in a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level."""
 
     scene: str
     shots: tuple[Shot, ...]
     results: list[xr.Dataset]
     sea: SeaMap
+    #: Beam azimuth [rad], and standard deviations of its footprint along and across it [m].
     azimuth: float
     beam_spread: tuple[float, float]
+    #: Grid lines of a map about a shot [m], shape (n,), the pixel index at each node, shape (n, n), rows along y, and
+    #: the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
     pixel_lines: FloatArray
     pixel_map: npt.NDArray[np.int64]
     pixel_count: int

@@ -43,46 +43,27 @@ class ReceiverSettings:
 
 @dataclass(frozen=True)
 class Measured:
-    """Waveforms to fit.
+    """Waveforms to fit."""
 
-    Attributes
-    ----------
-    values
-        Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
-    stderr
-        Their standard errors in the same unit and shape; None where they are unknown or the model's.
-    time_ns
-        Sample times [ns], shape (time,), increasing strictly.
-    correlation
-        Correlation between errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
-    template
-        Array with dimensions, coordinates and attributes of the waveforms.
-    calibrated
-        Whether values and times are a model's, so that neither scale nor offset are unknown.
-    receiver, shots
-        Receiver of a signal, None for waveforms, and number of averaged records.
-    render_variance
-        Variance of the render whose record a signal is, which `stderr` and the receiver's noise leave out, shape
-        (pixel, time); None without one.
-    rounding
-        Sample variance by the converter in a table with a receiver, shape (pixel, time); None without one.
-    estimated
-        Whether `stderr` is from the spread of a few passes.
-    batches
-        Deviations of the waveforms in pass batches, shape (batch, pixel, time); see `batch_deviations`.
-    """
-
+    #: Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
     values: FloatArray
+    #: Their standard errors in the same unit and shape; None where they are unknown or the model's.
     stderr: FloatArray | None
-    time_ns: FloatArray
+    time_ns: FloatArray  #: Sample times [ns], shape (time,), increasing strictly.
+    #: Correlation between errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
     correlation: FloatArray
-    template: xr.DataArray
-    calibrated: bool = True
+    template: xr.DataArray  #: Array with dimensions, coordinates and attributes of the waveforms.
+    calibrated: bool = True  #: Whether values and times are a model's, so that neither scale nor offset are unknown.
+    #: Receiver of a signal, None for waveforms, and number of averaged records.
     receiver: ReceiverSettings | None = None
     shots: int = 1
-    estimated: bool = False
+    estimated: bool = False  #: Whether `stderr` is from the spread of a few passes.
+    #: Deviations of the waveforms in pass batches, shape (batch, pixel, time); see `batch_deviations`.
     batches: FloatArray | None = None
+    #: Variance of the render whose record a signal is, which `stderr` and the receiver's noise leave out, shape (pixel,
+    #: time); None without one.
     render_variance: FloatArray | None = None
+    #: Sample variance by the converter in a table with a receiver, shape (pixel, time); None without one.
     rounding: FloatArray | None = None
 
     @property

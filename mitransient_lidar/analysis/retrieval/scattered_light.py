@@ -78,30 +78,20 @@ class View:
 
 @dataclass(frozen=True)
 class ScatteredLight:
-    """Column and bottom in a water, over singly scattered light that absorption alone attenuates.
+    """Column and bottom in a water, over singly scattered light that absorption alone attenuates."""
 
-    Attributes
-    ----------
-    absorption, backscattering
-        Water coefficients [1/m].
-    path, column
-        Paths [m], and the column's signal there over b p(pi) exp(-2 a s), with a bottom at the last depth.
-    bottom_path, bottom
-        Bottom echo paths [m], and logarithm of their energy over exp(-2 a s).
-    fitted
-        Paths of the bins in the column's exponential [m].
-    start, excess, level
-        The column's exponential: its level at the surface over b p(pi), its attenuation minus the absorption [1/m], and
-        its level as a backscatter over bb/(2 pi).
-    """
-
+    #: Water coefficients [1/m].
     absorption: float
     backscattering: float
+    #: Paths [m], and the column's signal there over b p(pi) exp(-2 a s), with a bottom at the last depth.
     path: FloatArray
     column: FloatArray
+    #: Bottom echo paths [m], and logarithm of their energy over exp(-2 a s).
     bottom_path: FloatArray
     bottom: FloatArray
-    fitted: FloatArray
+    fitted: FloatArray  #: Paths of the bins in the column's exponential [m].
+    #: The column's exponential: its level at the surface over b p(pi), its attenuation minus the absorption [1/m], and
+    #: its level as a backscatter over bb/(2 pi).
     start: float
     excess: float
     level: float
@@ -232,14 +222,12 @@ def _curves(
     from scipy.ndimage import gaussian_filter1d
 
     geometry, rng = view.system, np.random.default_rng(0)
-    water, bottoms = water_and_bottoms(
-        geometry, (a + b - b, b), phase, view.slope_variance, depth, (paths, _STEPS), rng
-    )
+    shape, absorption = (paths, _STEPS), a + b - b
+    water, bottoms = water_and_bottoms(geometry, (absorption, b), phase, view.slope_variance, depth, shape, rng)
 
     def seen(light: Arrivals) -> tuple[FloatArray, FloatArray]:
-        return geometry.path_of_time(light.time_ns), light.energy * view.share(
-            np.hypot(light.shift.real, light.shift.imag)
-        )
+        share = view.share(np.hypot(light.shift.real, light.shift.imag))
+        return geometry.path_of_time(light.time_ns), light.energy * share
 
     path, energy = seen(water)
     step = depth / _STEPS / geometry.cos_water

@@ -17,19 +17,12 @@ from mitransient_lidar.physics.lidar.refraction import cos_in_water, fresnel
 
 @dataclass(frozen=True)
 class SlopeRefraction:
-    """Ray refracted into the water by a sloping surface; arrays of one shape.
+    """Ray refracted into the water by a sloping surface; arrays of one shape."""
 
-    Attributes
-    ----------
-    cos_air, cos_water
-        Cosines of the ray's angles from the facet's normal in air and water.
-    cos_vertical
-        Cosine of the ray's angle from the vertical in the water.
-    """
-
+    #: Cosines of the ray's angles from the facet's normal in air and water.
     cos_air: FloatArray
     cos_water: FloatArray
-    cos_vertical: FloatArray
+    cos_vertical: FloatArray  #: Cosine of the ray's angle from the vertical in the water.
 
     @classmethod
     def of(cls, along: npt.ArrayLike, across: npt.ArrayLike, off_nadir: float, n: float) -> SlopeRefraction:

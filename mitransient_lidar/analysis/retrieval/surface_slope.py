@@ -73,24 +73,17 @@ def _midpoints(low: float, high: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class SurfacePlane:
-    """Planes through the surface echoes of shots; shape (n,) each, NaN where the pixels do not determine them.
+    """Planes through the surface echoes of shots; shape (n,) each, NaN where the pixels do not determine them."""
 
-    Attributes
-    ----------
-    along, across, along_stderr, across_stderr
-        Slopes along the lidar's azimuth and to its left, and their standard errors [1].
-    range_m, range_stderr
-        Distance to the plane along the receiver's axis and its standard error [m].
-    misfit_ns
-        Root mean square deviation of the echoes from the plane over the degrees of freedom [ns]; NaN without any.
-    """
-
+    #: Slopes along the lidar's azimuth and to its left, and their standard errors [1].
     along: FloatArray
     across: FloatArray
     along_stderr: FloatArray
     across_stderr: FloatArray
+    #: Distance to the plane along the receiver's axis and its standard error [m].
     range_m: FloatArray
     range_stderr: FloatArray
+    #: Root mean square deviation of the echoes from the plane over the degrees of freedom [ns]; NaN without any.
     misfit_ns: FloatArray
 
 
@@ -223,46 +216,29 @@ def _planes(
 
 @dataclass(frozen=True)
 class PixelEchoes:
-    """Surface echoes in the pixels of shots; shape (n, pixels) each.
+    """Surface echoes in the pixels of shots; shape (n, pixels) each."""
 
-    Attributes
-    ----------
-    time_ns, time_stderr_ns
-        Two-way times and their standard errors from noise [ns]; NaN for a pixel without an echo.
-    energy, energy_stderr
-        Echo energy and its standard error from noise [J], or [V s] for a signal; NaN for a pixel without an echo.
-    column_energy
-        Water column energy during an echo, which hides fainter ones, in the same unit, shape (pixels,).
-    time_spread_ns
-        Standard deviation of the light's arrival over the pixel from a level sea [ns], shape (pixels,).
-    echo_fwhm_ns
-        Full echo width at half maximum [ns].
-    """
-
+    #: Two-way times and their standard errors from noise [ns]; NaN for a pixel without an echo.
     time_ns: FloatArray
     time_stderr_ns: FloatArray
+    #: Echo energy and its standard error from noise [J], or [V s] for a signal; NaN for a pixel without an echo.
     energy: FloatArray
     energy_stderr: FloatArray
+    #: Water column energy during an echo, which hides fainter ones, in the same unit, shape (pixels,).
     column_energy: FloatArray
+    #: Standard deviation of the light's arrival over the pixel from a level sea [ns], shape (pixels,).
     time_spread_ns: FloatArray
-    echo_fwhm_ns: float
+    echo_fwhm_ns: float  #: Full echo width at half maximum [ns].
 
 
 @dataclass(frozen=True)
 class SeaEstimate:
-    """Sea slopes along and across [1] and height [m] under shots, averaged over the beam's footprint.
+    """Sea slopes along and across [1] and height [m] under shots, averaged over the beam's footprint."""
 
-    Attributes
-    ----------
-    mean, covariance
-        Estimates in this order, shape (n, 3), and the covariance of their errors, shape (n, 3, 3).
-    prior
-        Covariance of the three on the sea, shape (3, 3).
-    """
-
+    #: Estimates in this order, shape (n, 3), and the covariance of their errors, shape (n, 3, 3).
     mean: FloatArray
     covariance: FloatArray
-    prior: FloatArray
+    prior: FloatArray  #: Covariance of the three on the sea, shape (3, 3).
 
 
 def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> SeaEstimate:

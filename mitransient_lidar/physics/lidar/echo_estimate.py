@@ -66,6 +66,8 @@ def water_and_bottoms(
         Depth of the last light [m].
     shape
         Number of paths, and of steps: the shape of the results.
+    rng
+        Source of random numbers.
     """
     (a, b), (paths, steps) = coefficients, shape
     spread = _scattered(system, coefficients, phase, depth, shape, rng)

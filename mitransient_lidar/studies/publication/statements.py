@@ -40,39 +40,21 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement in the publication, reworded, and the measured quantity.
+    """A statement in the publication, reworded, and the measured quantity."""
 
-    Attributes
-    ----------
-    figure, statement, quantity
-        Name of the figure, the statement, and the measured quantity with its unit.
-    published
-        Published value, empty without a number.
-    value, error
-        Measured value and its standard error.
-    limits
-        Interval of the values for which the statement holds.
-    where
-        Measure, place and mesh.
-    share
-        Share of other locations for which it holds, None if no location was chosen.
-    places
-        Description of these locations.
-    difference
-        Reason for a difference from the publication.
-    """
-
+    #: Name of the figure, the statement, and the measured quantity with its unit.
     figure: str
     statement: str
     quantity: str
-    published: str
+    published: str  #: Published value, empty without a number.
+    #: Measured value and its standard error.
     value: float
     error: float
-    limits: tuple[float, float]
-    where: str
-    share: float | None = None
-    places: str = ""
-    difference: str = ""
+    limits: tuple[float, float]  #: Interval of the values for which the statement holds.
+    where: str  #: Measure, place and mesh.
+    share: float | None = None  #: Share of other locations for which it holds, None if no location was chosen.
+    places: str = ""  #: Description of these locations.
+    difference: str = ""  #: Reason for a difference from the publication.
 
     @property
     def holds(self) -> str:
