@@ -37,11 +37,7 @@ _NAMED_PIXELS = 5  # largest number of pixels listed in a warning
 
 
 def build(
-    impulse_response: npt.ArrayLike,
-    impulse_response_stderr: npt.ArrayLike,
-    waveform: npt.ArrayLike,
-    waveform_stderr: npt.ArrayLike,
-    *,
+    *arrays: npt.ArrayLike,
     time: TimeAxis,
     pixel_names: Sequence[str],
     pixel_centres_mrad: npt.ArrayLike,
@@ -50,15 +46,14 @@ def build(
 ) -> xr.Dataset:
     """Label a render's arrays as a result.
 
-    Non-finite values are kept; a warning lists their pixels. Raises `ValueError` if shapes disagree, names repeat, a
-    number is out of range or an attribute has an unsupported type.
+    Non-finite values are kept; a warning lists their pixels. Raises `ValueError` if names repeat, a number is out of
+    range or an attribute has an unsupported type.
 
     Parameters
     ----------
-    impulse_response, impulse_response_stderr : array-like of shape (pixel, time)
-        Received energy and its standard error [J per bin].
-    waveform, waveform_stderr : array-like of shape (pixel, time)
-        Received power after the pulse and the receiver's response, and its standard error [W].
+    arrays : array-like of shape (pixel, time)
+        Received energy and its standard error [J per bin], and received power after the pulse and the receiver's
+        response and its standard error [W].
     time : TimeAxis
         The time bins.
     pixel_names : sequence of str
@@ -70,30 +65,21 @@ def build(
     attributes : mapping of str to int, float, str or a list of those
         Parameters and outcome of the render; they override the attributes set here (``title``, ``history``, ...).
     """
-    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
-    values = {name: np.array(array, dtype=np.float64) for name, array in zip(LIGHT, arrays, strict=True)}
-    shape = values["impulse_response"].shape
-    if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"impulse_response has shape {shape}; it must be (pixel, time) with at least one of each.")
-    for name, array in values.items():
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}; it must be that of impulse_response, {shape}.")
-    if time.bin_count != shape[1]:
-        raise ValueError(f"time has {time.bin_count} bins; it must have those of impulse_response, {shape[1]}.")
-    centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
-    if centres.shape != (shape[0], 2) or not np.isfinite(centres).all():
-        raise ValueError(
-            f"pixel_centres_mrad must be {shape[0]} finite pairs (angle_x, angle_y), but has shape {centres.shape}."
-        )
     bins = {"time_start_ns": finite("time_start_ns", time.start_ns)}
     bins["bin_width_ns"] = positive("bin_width_ns", time.bin_width_ns)
-
-    coords = pixel_coordinates(pixel_names, centres, grid)
+    coords = pixel_coordinates(pixel_names, pixel_centres_mrad, grid)
     dims, layout = coords["angle_x"][0], coords["angle_x"][1].shape
     coords["time"] = ("time", time.centres_ns)
-    names = coords["pixel"][1].tolist() if grid is None else [str(divmod(i, grid[1])) for i in range(shape[0])]
-    _warn_of_non_finite(values, names)
-    data = {name: ((*dims, "time"), array.reshape(*layout, -1)) for name, array in values.items()}
+    data = {}
+    for name, array in zip(LIGHT, arrays, strict=True):
+        values = np.array(array, dtype=np.float64)
+        counts = np.count_nonzero(~np.isfinite(values), axis=1)
+        if affected := np.flatnonzero(counts).tolist():
+            names = coords["pixel"][1] if grid is None else list(np.ndindex(grid))
+            pixels = ", ".join(f"{names[index]}: {counts[index]}" for index in affected[:_NAMED_PIXELS])
+            more = f" and {len(affected) - _NAMED_PIXELS} more pixels" if len(affected) > _NAMED_PIXELS else ""
+            _LOG.warning("%s has non-finite values in pixel %s%s", name, pixels, more)
+        data[name] = ((*dims, "time"), values.reshape(*layout, -1))
     return label(xr.Dataset(data, coords, provenance({**bins, **attributes})))
 
 
@@ -247,8 +233,7 @@ def pixel_coordinates(
 ) -> dict[str, Any]:
     """Return pixel coordinates: their names, or rows and columns, and their centres angle_x and angle_y.
 
-    Arguments as for `build`. Raises `ValueError` if names repeat, or the number of names or grid cells differs from the
-    number of centres.
+    Arguments as for `build`. Raises `ValueError` if names repeat, or their number differs from that of the centres.
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)
@@ -259,9 +244,6 @@ def pixel_coordinates(
             raise ValueError(f"pixel_names = {names} must be {count} different names, one a pixel.")
         coords = {"pixel": ("pixel", np.array(names, dtype=str), described("pixel"))}
     else:
-        rows, columns = grid
-        if rows < 1 or columns < 1 or rows * columns != count:
-            raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
         coords = {
             dim: (dim, np.arange(size), described(dim)) for dim, size in zip(("row", "column"), grid, strict=True)
         }
@@ -292,12 +274,3 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
             f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly"
         )
     check_coordinates(place, dataset, name)
-
-
-def _warn_of_non_finite(values: Mapping[str, npt.NDArray[np.float64]], names: Sequence[str]) -> None:
-    for variable, array in values.items():
-        counts = np.count_nonzero(~np.isfinite(array), axis=1)
-        if affected := np.flatnonzero(counts).tolist():
-            pixels = ", ".join(f"{names[index]}: {counts[index]}" for index in affected[:_NAMED_PIXELS])
-            more = f" and {len(affected) - _NAMED_PIXELS} more pixels" if len(affected) > _NAMED_PIXELS else ""
-            _LOG.warning("%s has non-finite values in pixel %s%s", variable, pixels, more)

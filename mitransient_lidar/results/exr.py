@@ -70,16 +70,10 @@ class _Images(NamedTuple):
     header: dict[str, str]  #: Header attribute for each coordinate over the dimension.
 
 
+_OF_GATES = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IMAGES = {
-    "gates": _Images(
-        "gate",
-        3,
-        {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"},
-        {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"},
-    ),
-    "frames": _Images(
-        "gate", 3, {}, {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
-    ),
+    "gates": _Images("gate", 3, {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}, _OF_GATES),
+    "frames": _Images("gate", 3, {}, _OF_GATES),
     "radiance": _Images("frame", 4, {"radiance": "Y", "radiance_stderr": "Y.stderr"}, {"time_s": "timeS"}),
 }
 
@@ -194,16 +188,11 @@ def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
     names = sorted(channels)
     advice = "take fewer or wider bins, or a .nc file"
     require_memory(f"{len(names)} channels of an EXR file", _BYTES_PER_CHANNEL * len(names), advice)
-    several = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
+    chosen = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
+    several = [{name: channels[name] for name in part} for part in chosen]
     shared = {**_header(readable), _EXACT: json.dumps(exact)}
-    return [
-        Part(
-            chosen[0] if len(several) > 1 else "",
-            {} if number else shared,
-            {name: channels[name] for name in chosen},
-        )
-        for number, chosen in enumerate(several)
-    ]
+    one = len(several) == 1
+    return [Part("" if one else next(iter(own)), {} if i else shared, own) for i, own in enumerate(several)]
 
 
 def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any], kind: _Images) -> list[Part]:
@@ -269,12 +258,11 @@ def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
     """
     kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
-        with OpenEXR.File(
-            [
-                OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
-                for part in parts
-            ]
-        ) as file:
+        stored = [
+            OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
+            for part in parts
+        ]
+        with OpenEXR.File(stored) as file:
             file.write(os.fspath(path))
     except RuntimeError as error:
         raise OSError(str(error)) from error
@@ -292,7 +280,10 @@ def read(path: Path) -> xr.Dataset:
     if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
         first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
         raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}")
-    exact = exact_metadata(path, parts[0].attributes)
+    text = parts[0].attributes.get(_EXACT, "null")
+    exact = parse_json(text, f"the header attribute {_EXACT} of {path}")
+    if not isinstance(exact, dict):
+        raise UserError(f"{path} is an OpenEXR file, but not a result of mitransient-lidar.")
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
         images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)
@@ -409,20 +400,6 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
         if part.attributes.get(_CHECKSUM, checksum) != checksum:
             raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written")
     return parts
-
-
-def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a part's exact metadata.
-
-    Raises `UserError` if they are missing or damaged.
-    """
-    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
-    if _EXACT not in attributes:
-        raise UserError(foreign)
-    exact = parse_json(attributes[_EXACT], f"the header attribute {_EXACT} of {path}")
-    if not isinstance(exact, dict):
-        raise UserError(foreign)
-    return exact
 
 
 def _header(readable: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from mitransient_lidar.results.variables import described
 
 Attributes = Mapping[str, Any]
 
-
 #: Decimals kept in the coordinates of `LinesOfSight`.
 _SIGHT = {
     **{"sight_x": 6, "sight_y": 6, "off_nadir": 7, "surface_time": 6, "surface_spread": 6},
@@ -112,7 +111,7 @@ class LinesOfSight:
         """Return the line of sight for the pixel sum, weighted with the beam, shape (1,)."""
         known = np.isfinite(self.beam_share).all() and self.beam_share.sum() > 0
         weight = (
-            self.beam_share / self.beam_share.sum() if known else np.full(self.off_nadir.shape, 1 / self.off_nadir.size)
+            self.beam_share / self.beam_share.sum() if known else np.ones(self.off_nadir.shape) / self.off_nadir.size
         )
         mean = {name: np.array([np.sum(weight * values)]) for name, values in vars(self).items()}
         apart = np.sum(weight * (self.surface_time - mean["surface_time"]) ** 2)
@@ -183,7 +182,9 @@ def lidar_system(attributes: Attributes, efficiency: float | None = None) -> Lid
     """
     energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
     geometry = lidar_geometry(attributes)
-    return LidarSystem(**vars(geometry), energy=energy, aperture_area=open_aperture(attributes))
+    blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
+    area = required_number(attributes, "aperture_area") * (1 - blocked)
+    return LidarSystem(**vars(geometry), energy=energy, aperture_area=area)
 
 
 def spot_diameter(attributes: Attributes) -> float:
@@ -202,12 +203,6 @@ def _columns(values: FloatArray, dimensions: int) -> FloatArray:
     return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
-def open_aperture(attributes: Attributes) -> float:
-    """Return the area of the aperture [m^2] that is not obscured: ``aperture_area`` times 1 - ``obscuration``."""
-    blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
-    return required_number(attributes, "aperture_area") * (1 - blocked)
-
-
 def share_in_view(dataset: xr.Dataset) -> FloatArray:
     """Return the share of the beam's energy in all pixels of a result over ``pixel``, shape () or (shots,).
 
@@ -219,15 +214,10 @@ def share_in_view(dataset: xr.Dataset) -> FloatArray:
         share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
         if np.isfinite(share).all():
             return share
-    return np.asarray(_gaussian_share(dataset.attrs))
-
-
-def _gaussian_share(attributes: Attributes) -> float:
-    """Return the share of a Gaussian beam inside a field of view about its axis, without gaps between pixels."""
-    half = required_number(attributes, "field_of_view_mrad") / required_number(attributes, "divergence_mrad")
-    if attributes.get("field_of_view_shape", "circle") == "circle":
-        return 1 - math.exp(-0.5 * half**2)
-    return math.erf(half / math.sqrt(2)) ** 2
+    half = required_number(dataset.attrs, "field_of_view_mrad") / required_number(dataset.attrs, "divergence_mrad")
+    if dataset.attrs.get("field_of_view_shape", "circle") == "circle":
+        return np.asarray(1 - math.exp(-0.5 * half**2))
+    return np.asarray(math.erf(half / math.sqrt(2)) ** 2)
 
 
 def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:

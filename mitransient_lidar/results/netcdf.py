@@ -121,22 +121,18 @@ def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
 
     Raises `UserError` if the file is damaged, truncated, or larger than half of the memory.
     """
+    import h5py
+
     damaged = f"{path} is damaged or truncated: its NetCDF data cannot be read."
     check_sum(path)
     with damaged_file(damaged):
         check_hdf5(path)
     dataset, foreign = _group(path, None, damaged)
-    if not foreign and _has_infrared(path):
+    with h5py.File(path, "r") as file:
+        has_infrared = isinstance(file.get(INFRARED), h5py.Group)
+    if not foreign and has_infrared:
         dataset = join(dataset, _group(path, INFRARED, damaged)[0])
     return dataset, foreign
-
-
-def _has_infrared(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file has a group of the infrared channel."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return isinstance(file.get(INFRARED), h5py.Group)
 
 
 def _group(path: str | os.PathLike[str], group: str | None, damaged: str) -> tuple[xr.Dataset, bool]:

@@ -127,7 +127,6 @@ def of_columns(
     system: LidarSystem,
     share: FloatArray,
     dataset: xr.Dataset,
-    phase_factor: float | None = None,
 ) -> ScatteredLight | None:
     """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
@@ -140,24 +139,23 @@ def of_columns(
     dataset
         Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the slope
         variance and the pixel outlines.
-    phase_factor
-        As for `retrieve.water`.
     """
-    decay, backscatter = (_mean(one) for one in (echoes["attenuation"].values, backscatter_of(echoes, system, share)))
+    levels = backscatter_of(echoes, system, share)
+    decay, backscatter = (mean_of_known(one) for one in (echoes["attenuation"].values, levels))
     if not (decay > 0 and backscatter > 0):
         return None
     records, width = waveforms.records(slice(0, waveforms.count)), waveforms.echo_fwhm_ns
-    start, end = (_mean(echoes[f"column_{edge}_ns"].values) for edge in ("start", "end"))
+    start, end = (mean_of_known(echoes[f"column_{edge}_ns"].values) for edge in ("start", "end"))
     inside = (records.time_ns >= start) & (records.time_ns <= end)
     path = waveforms.geometry.path_of_time(records.time_ns[inside])
     gain = waveforms.gain(slice(0, waveforms.count)).mean(axis=0)[inside]
     noise = np.broadcast_to(records.noise, records.power.shape).mean(axis=0)[inside]
     view = View.of(dataset, system, width * waveforms.geometry.metres_per_ns)
-    bottom = _mean(echoes["time_ns"].sel(echo="bottom").values)
+    bottom = mean_of_known(echoes["time_ns"].sel(echo="bottom").values)
     # Without a bottom, the water goes on below the last bin.
     deepest = float(waveforms.geometry.path_of_time(end + _BELOW * width if math.isnan(bottom) else bottom))
     weights = gain * np.exp(-2 * decay * path) / noise
-    return light_of(view, decay, backscatter, path, weights, deepest, BACKSCATTER_RATIO, phase_factor)
+    return light_of(view, decay, backscatter, path, weights, deepest, BACKSCATTER_RATIO)
 
 
 def backscatter_of(echoes: xr.Dataset, system: LidarSystem, share: FloatArray) -> FloatArray:
@@ -168,7 +166,8 @@ def backscatter_of(echoes: xr.Dataset, system: LidarSystem, share: FloatArray) -
     return np.asarray(level / (share * system.column_gain))
 
 
-def _mean(values: FloatArray) -> float:
+def mean_of_known(values: FloatArray) -> float:
+    """Return the mean of finite values, NaN without any."""
     return float(values[known].mean()) if (known := np.isfinite(values)).any() else math.nan
 
 
@@ -180,7 +179,6 @@ def light_of(
     weights: FloatArray,
     deepest: float,
     ratio: float,
-    phase_factor: float | None,
 ) -> ScatteredLight:
     """Return the light in the water whose column has an exponential.
 
@@ -196,8 +194,6 @@ def light_of(
         Path of the bottom echo, or of the deepest light [m].
     ratio
         Particle bb/b.
-    phase_factor
-        As for `retrieve.water`.
     """
     bb, a, depth = 2 * np.pi * backscatter / _FIRST_LEVEL, decay, deepest * view.system.cos_water
     for paths in _PATHS:
@@ -205,7 +201,7 @@ def light_of(
         a = max(a, _LEAST_ABSORPTION * decay)
         b, phase = _scattering(bb, ratio)
         at, column, bottom_path, bottom = _curves(view, a, bb, b, phase, depth, paths)
-        factor = phase_factor or 2 * np.pi * float(phase.eval_s(1.0)) * b / bb
+        factor = 2 * np.pi * float(phase.eval_s(1.0)) * b / bb
         seen = np.interp(path, at, np.log(np.maximum(column, 1e-9)))
         slope, start = np.polyfit(path, seen, 1, w=weights)
         start, excess = math.exp(start), -0.5 * float(slope)

@@ -88,11 +88,9 @@ class SurfacePlane:
 
 
 def fit_plane(
-    time_ns: npt.ArrayLike, light: PixelLight, off_nadir: float, *, stderr_ns: npt.ArrayLike = 0.0, facets: float = 1.0
+    time_ns: npt.ArrayLike, light: PixelLight, off_nadir: float, *, stderr_ns: npt.ArrayLike = 0.0
 ) -> SurfacePlane:
     """Fit a plane to the surface echoes in each shot's pixels.
-
-    Raises `UserError` if `facets` is not positive.
 
     Parameters
     ----------
@@ -104,8 +102,6 @@ def fit_plane(
         Angle of the receiver's axis from the vertical [rad], 0 to below pi/2.
     stderr_ns : array_like, shape () or (n, pixels)
         Standard errors of the times from noise [ns], at least 0.
-    facets : float
-        Number of facets that cause most of a pixel's echo, above 0: the error of its centre is spread/sqrt(facets).
 
     Returns
     -------
@@ -139,14 +135,13 @@ def fit_plane(
     noise = np.broadcast_to(np.asarray(stderr_ns, dtype=np.float64), time.shape)
     safe = np.where(known, time, 1.0)
     inverse = np.sqrt(1 + x**2 + y**2) / (_NS * safe)
-    relative = spread / np.sqrt(positive("facets", facets))
     to_inverse = inverse / safe
     alone = to_inverse * np.hypot(np.nan_to_num(noise), _LEAST_ERROR_NS)
     correlation = _correlation(x, spread)
-    level = _planes(inverse, alone, inverse * np.tan(off_nadir) * relative, known, light, correlation, off_nadir)
+    level = _planes(inverse, alone, inverse * np.tan(off_nadir) * spread, known, light, correlation, off_nadir)
     tilt, unsure = (np.nan_to_num(one)[:, np.newaxis] for one in (level.along, level.along_stderr))
     steepness = np.hypot(np.tan(off_nadir - np.arctan(_LIKELY * tilt)), np.sqrt(_LIKELY) * unsure)
-    return _planes(inverse, alone, inverse * steepness * relative, known, light, correlation, off_nadir)
+    return _planes(inverse, alone, inverse * steepness * spread, known, light, correlation, off_nadir)
 
 
 def _correlation(x: FloatArray, spread: FloatArray) -> FloatArray:
