@@ -110,26 +110,10 @@ def _info(
     _print((name, str(value)) for name, value in facts.items())
 
 
-def _bench(
-    call: Call,
-    images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
-    beams: Annotated[
-        bool, typer.Option("--beams", help="Compare beams from 0.1 to 20 mrad in all views instead.")
-    ] = False,
-) -> None:
+def _bench(call: Call) -> None:
     """Run one benchmark."""
-    from mitransient_lidar.studies.bench import beams as narrow
-    from mitransient_lidar.studies.bench import images as imagers
-
-    if images and beams:
-        raise UserError("--images and --beams are alternatives: give one of them")
-    if images:
-        imagers.run(json=call.arguments["json"])
-    elif beams:
-        narrow.run(json=call.arguments["json"])
-    else:
-        with call.named():
-            call.function(**call.arguments)
+    with call.named():
+        call.function(**call.arguments)
 
 
 COMMANDS = {
@@ -143,7 +127,7 @@ COMMANDS = {
         marks parameters that are not given and have no default, or are not used.
         """,
     ),
-    "bench": Command(_HEADING, "studies.bench.integrators:run", _bench, "Measure the time to a given accuracy."),
+    "bench": Command(_HEADING, "studies.bench:run", _bench, "Measure the time to a given accuracy."),
 }
 
 SCENES = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.options import Option, Scene, checked, positive_option
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
@@ -95,11 +95,10 @@ def find_shots(
 
 def describe_found_shots(rendered: RenderedShots) -> list[str]:
     """Return table lines for locations and slopes."""
-    lines = [f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}"]
-    for shot in rendered.shots:
-        along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
-        lines.append(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
-    return lines
+    columns = (("kind", "<10"), ("aim_x", ">10.2f"), ("aim_y", ">10.2f"), ("along (deg)", ">13.2f"))
+    angles = [np.degrees(np.arctan([shot.along, shot.across])) for shot in rendered.shots]
+    rows = [(shot.kind, shot.x, shot.y, *pair) for shot, pair in zip(rendered.shots, angles, strict=True)]
+    return table_lines((*columns, ("across (deg)", ">14.2f")), rows)
 
 
 @alone
