@@ -114,8 +114,7 @@ def _echoes(
     if table:
         typer.echo("\n".join(csv_tables.describe_echoes(first)))
     if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output.parent):
             csv_tables.save_csv(itertools.chain([first], map(measured, parts)), output)
     elif selection and next(parts, None) is not None:
         typer.echo(f"these are the first {first.sizes['shot']} waveforms: write the echoes of all with --csv OUT")
@@ -150,8 +149,7 @@ def _retrieve(
     if figure is not None:
         from mitransient_lidar.plots.retrieval import plot_retrieval
 
-        figure.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(figure.parent):
             plot_retrieval(found, figure)
 
 
@@ -182,8 +180,7 @@ def _fit(
     source = results.open(file, **selection) if selection else file
     with DeferredInterrupt(at_once=False):
         fitted = call(source)
-        output.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output):
             write_netcdf(fitted, targets[0])
             write_csv(study.parameter_frame(fitted), targets[1], unknown="nan")
             plot_fit(fitted, targets[2])

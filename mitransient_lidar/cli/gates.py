@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,9 +13,6 @@ from mitransient_lidar.cli.messages import name_subject, reporting
 from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def _gates(
@@ -42,6 +39,7 @@ def _gates(
     quiet: Quiet = False,
 ) -> None:
     """Cut the gates of a train, or take those that are there, and write and draw them."""
+    from mitransient_lidar import results
     from mitransient_lidar.analysis.gates import cut as gating
     from mitransient_lidar.results.gate_stack import has_frames
 
@@ -50,47 +48,29 @@ def _gates(
     given = {"--width-ns": call.arguments["width_ns"], "--step-ns": call.arguments["step_ns"]}
     given["--count"] = None if count == 1 else count
     with reporting(quiet):
-        result = _open(stack)
+        result = results.dataset_of("FILE", stack, "result", "gates", "frames")
         is_record = has_frames(result)
         has_gates = is_record or "gate_energy" in result
         is_cut = not has_gates or any(one is not None for one in starts)
         stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")
-        files = GateFiles.of(
-            output or stack.parent,
-            stem,
-            drawings=plot,
-            sequence=sequence,
-            tiff=tiff,
-            images=images,
-            gif=gif,
-            mp4=mp4,
-            html=html,
-        )
+        wanted = {"drawings": plot, "sequence": sequence, "tiff": tiff, "images": images}
+        files = GateFiles.of(output or stack.parent, stem, **wanted, gif=gif, mp4=mp4, html=html)
         if not is_cut:
             draws_again(stack)
         files.check()
         if is_record and is_cut:
             raise UserError(f"{stack} holds frames of a camera: cut the gates of the result, and record these")
-        if not is_cut:
-            if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
-                raise UserError(
-                    f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins"
-                )
-            cut = result
-        else:
+        named = [f"{option} {value:g}" for option, value in given.items() if value is not None]
+        if named and not is_cut:
+            raise UserError(f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins")
+        cut = result
+        if is_cut:
             with call.named():
                 train = call.function(result.attrs, **call.arguments)
             cut = gating.cut_gates(result, train)
     name_subject(stack, result.attrs, quiet)
     with reporting(quiet):
         files.write(cut, result, quiet)
-
-
-def _open(path: Path) -> xr.Dataset:
-    """Open a result, a gate stack or frames of a camera."""
-    from mitransient_lidar import results
-
-    return results.dataset_of("FILE", path, "result", "gates", "frames")
 
 
 COMMANDS = {

@@ -82,9 +82,8 @@ def _instruments(
     if name is None:
         if xml:
             raise UserError("--xml needs the name of an instrument")
-        known = [shipped.read_instrument(each) for each in shipped.instrument_names()]
-        counts = [f"{len(one.channels)} channel{'s' * (len(one.channels) > 1)}" for one in known]
-        _print((one.name, f"{one.title}; {count}") for one, count in zip(known, counts, strict=True))
+        known = [(one := shipped.read_instrument(each), len(one.channels)) for each in shipped.instrument_names()]
+        _print((one.name, f"{one.title}; {count} channel{'s' * (count > 1)}") for one, count in known)
         return
     if xml:
         typer.echo(shipped.instrument_text(name), nl=False)
