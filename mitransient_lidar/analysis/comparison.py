@@ -108,6 +108,8 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
     Raises `UserError` if pixels or bins differ, or no bin is included.
     """
+    from scipy.special import ndtri, stdtr
+
     results = as_bins(first, second)
     times = [result["time"].values for result in results]
     shapes = [_by_pixel(result, "impulse_response").shape for result in results]
@@ -145,7 +147,9 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     parts = np.maximum(np.stack(relative) * common**2, variances)
     total = parts[0] + parts[1]
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
-    z = _as_normal(difference / np.sqrt(total), freedom)
+    t = difference / np.sqrt(total)
+    # Normal quantiles of Student's t (Welch 1947, doi:10.1093/biomet/34.1-2.28).
+    z = -np.sign(t) * ndtri(np.maximum(stdtr(freedom, -np.abs(t)), 1e-300))
     sums = [float(value[counted].sum()) for value in values]
     own = [_error_of_energy(result, counted) for result in results]
     spread = float(np.sqrt(np.nansum(total))) / sums[0]
@@ -191,11 +195,3 @@ def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> Float
 def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:
     values = result[name].values
     return np.asarray(values.reshape(-1, values.shape[-1]), dtype=np.float64)
-
-
-def _as_normal(t: FloatArray, freedom: FloatArray) -> FloatArray:
-    """Return the normal quantiles of Student's t (Welch 1947, doi:10.1093/biomet/34.1-2.28)."""
-    from scipy.special import ndtri, stdtr
-
-    tail: FloatArray = stdtr(freedom, -np.abs(t))
-    return np.asarray(-np.sign(t) * ndtri(np.maximum(tail, 1e-300)))

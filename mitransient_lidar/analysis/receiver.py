@@ -267,7 +267,7 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
     attributes: dict[str, Any] = {}
     for name in dict.fromkeys(name for part in parts for name in part.attrs):
         values = [part.attrs.get(name) for part in parts]
-        if all(_same(value, values[0]) for value in values):
+        if all(type(value) is type(values[0]) and np.array_equal(value, values[0]) for value in values):
             attributes[name] = values[0]
         elif name.startswith("receiver.") or None in values:
             for part in parts:
@@ -279,11 +279,6 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
             attributes[name] = [each[place] for place in order]
     joined.attrs = attributes
     return joined
-
-
-def _same(first: Any, second: Any) -> bool:
-    """Return whether two attributes are the same."""
-    return type(first) is type(second) and bool(np.array_equal(first, second))
 
 
 def _record_channel(

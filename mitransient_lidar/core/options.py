@@ -8,7 +8,7 @@ import math
 import re
 import textwrap
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -117,6 +117,13 @@ Infrared = Annotated[
 ]
 Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
 
+#: Meanings of arguments that are no options of commands, for the documentation.
+_COMMON = {
+    "params": Option("Values of the scene's parameters by name, as for `rendering.render.render`"),
+    "integrator": Option("Integrator instead of the scene's, as for `rendering.render.render`"),
+    "progress": Option("Called with a `rendering.passes.Progress` after every pass, render or case"),
+}
+
 #: Beginning of a receiver's meaning.
 RECEIVERS = (
     "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
@@ -159,7 +166,9 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
-            if name in options and not is_unset(value, signature.parameters[name].default):
+            default = signature.parameters[name].default
+            is_unset = (value is None and default is None) or (default == () and len(value) == 0)
+            if name in options and not is_unset:
                 kind, option = options[name]
                 given.arguments[name] = option.check(name, value, kind)
         if "progress" not in signature.parameters:
@@ -172,16 +181,21 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
         for name, one in signature.parameters.items()
     ]
     run.__signature__ = signature.replace(parameters=shown)  # type: ignore[attr-defined]
-    run.__doc__ = _documented(function.__doc__ or "", {name: option for name, (_, option) in options.items()})
+    meanings = {name: option for name, (_, option) in options.items()}
+    run.__doc__ = _documented(function.__doc__ or "", meanings, signature.parameters)
     return run
 
 
-def _documented(text: str, options: Mapping[str, Option]) -> str:
-    """Return a documentation whose section of parameters has all options; those that it describes stay."""
+def _documented(text: str, options: Mapping[str, Option], names: Iterable[str]) -> str:
+    """Return a documentation whose section of parameters has all options, and others by their `names`.
+
+    Those that it describes stay.
+    """
     beginning, heading, rest = text.partition("Parameters\n    ----------\n")
     described, blank, end = rest.partition("\n\n")
     known = {name for line in described.splitlines() if line[4:5].strip() for name in re.findall(r"\w+", line)}
-    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in options.items() if name not in known]
+    listed = {**options, **{name: _COMMON[name] for name in names if name in _COMMON}}
+    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in listed.items() if name not in known]
     return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
 
 
@@ -196,11 +210,6 @@ def documented_parameters(text: str, options: Mapping[str, Option]) -> str:
 
 def _indented(text: str) -> str:
     return textwrap.fill(text, 120, initial_indent=" " * 8, subsequent_indent=" " * 8)
-
-
-def is_unset(value: Any, default: Any) -> bool:
-    """Return whether a value is a default that needs no check: None, or an empty list."""
-    return (value is None and default is None) or (isinstance(default, tuple) and not default and len(value) == 0)
 
 
 def _is_list(kinds: tuple[Any, ...]) -> bool:

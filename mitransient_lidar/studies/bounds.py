@@ -101,8 +101,6 @@ def bounds(
 
     Parameters
     ----------
-    scene, params, instrument
-        As for `rendering.render.render`.
     free
         Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
     over
@@ -121,8 +119,6 @@ def bounds(
         has the number of omitted designs, with a warning.
     seed
         Random seed, at least 0; all designs use the same random numbers.
-    progress
-        Called with a `passes.Progress` after every render.
 
     Returns
     -------

@@ -145,8 +145,6 @@ def depth_bias(
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers for omitted seas are NaN,
         and the attribute ``seas_left_out`` has their number.
-    progress
-        Called with a `passes.Progress` after every sea.
 
     Returns
     -------

@@ -116,8 +116,6 @@ def detect(
     max_time
         Time after which no further depth is begun [s], above 0; all renders of the unchanged target are made. The
         attribute ``depths_left_out`` lists the omitted depths as text, and a warning names them.
-    progress
-        Called with a `passes.Progress` after every render.
 
     Returns
     -------

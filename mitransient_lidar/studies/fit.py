@@ -131,8 +131,6 @@ def fit(
     max_time
         Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
         warning. The start is always rendered.
-    progress
-        Called with a `rendering.passes.Progress` after every render.
 
     Returns
     -------

@@ -72,8 +72,6 @@ def fov_sweep(
     max_time
         Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
         out, with a warning; the narrowest one is always rendered.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------

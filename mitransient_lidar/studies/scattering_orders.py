@@ -42,12 +42,8 @@ def scattering_orders(
 
     Parameters
     ----------
-    scene, params, instrument, integrator
-        As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum over all higher ones.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------

@@ -65,15 +65,11 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, instrument, integrator
-        As for `rendering.render.render`.
     grid, max_offset
         Target positions along each axis, and their largest offset from the position in the scene: the result is
         `target_map` on a square.
     axis
         Time bins instead of automatic ones.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------

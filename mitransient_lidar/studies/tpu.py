@@ -88,8 +88,6 @@ def tpu(
     max_time
         Time after which no sea is rendered [s], above 0. Uncertainties for omitted seas are NaN; altitudes without any
         rendered sea are left out. The attribute ``seas_left_out`` has the number of both.
-    progress
-        Called with a `passes.Progress` after every table cell.
 
     Returns
     -------
