@@ -46,6 +46,13 @@ _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
+
+#: Settings of a receiver; auto is what does not saturate.
+_GAIN = "Factor of the amplifier's gain, or auto; by default the receiver's, or 1"
+Gain = Annotated[Setting | None, Option(_GAIN, 0, above=True, form="NUMBER|auto")]
+_DENSITY = "Optical density of a filter before the detector, or auto; by default the receiver's, or 0"
+OpticalDensity = Annotated[Setting | None, Option(_DENSITY, 0, DENSEST, form="NUMBER|auto")]
+
 _FAINT_W, _STEADY_BINS = 1e-9, 256  # light of which the sensitivity is measured [W], and its bins
 _BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when its record is written
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
@@ -65,23 +72,8 @@ def detect_waveforms(
         Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
     ] = 0.0,
     *,
-    gain: Annotated[
-        Setting | None,
-        Option(
-            "Factor of the amplifier's gain, or auto; by default the receiver's, or 1",
-            0,
-            above=True,
-            form="NUMBER|auto",
-        ),
-    ] = None,
-    optical_density: Annotated[
-        Setting | None,
-        Option(
-            "Optical density of a filter before the detector, or auto; by default the receiver's, or 0",
-            *(0, DENSEST),
-            form="NUMBER|auto",
-        ),
-    ] = None,
+    gain: Gain = None,
+    optical_density: OpticalDensity = None,
 ) -> xr.Dataset:
     """Record shots of a result, or of each shot in a series, with a receiver chain, or gates with a camera.
 
@@ -266,7 +258,7 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
     joined = joined.isel(pixel=order)
     attributes: dict[str, Any] = {}
     for name in dict.fromkeys(name for part in parts for name in part.attrs):
-        values = [part.attrs.get(name) for part in parts]
+        values: list[Any] = [part.attrs.get(name) for part in parts]
         if all(type(value) is type(values[0]) and np.array_equal(value, values[0]) for value in values):
             attributes[name] = values[0]
         elif name.startswith("receiver.") or None in values:

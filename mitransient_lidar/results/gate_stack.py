@@ -266,7 +266,7 @@ def as_stack(dataset: xr.Dataset) -> xr.Dataset:
     deviation = np.sqrt((dataset["signal_deviation"] ** 2).mean("frame" if "frame" in dataset["snr"].dims else ()))
     coords = {name: one for name, one in dataset.coords.items() if name != "frame"}
     coords = {name: one.mean("frame") if "frame" in one.dims else one for name, one in coords.items()}
-    energy = {"gate_energy": mean - dataset["dark_level"]}
+    energy: dict[str, Any] = {"gate_energy": mean - dataset["dark_level"]}
     energy["gate_energy_stderr"] = deviation / math.sqrt(dataset.sizes["frame"])
     stack = check_stack(xr.Dataset(coords=coords).assign(energy).assign_attrs(dataset.attrs))
     stack["gate_energy"].attrs |= {"long_name": "signal above the dark level", "units": "DN"}

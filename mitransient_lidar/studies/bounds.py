@@ -13,13 +13,12 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
 from mitransient_lidar.analysis.jackknife import jackknife_error
-from mitransient_lidar.analysis.receiver import DENSEST, chain_of
+from mitransient_lidar.analysis.receiver import Gain, OpticalDensity, chain_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
     RECEIVERS,
     BackgroundPower,
     Instrument,
-    NumberOrAuto,
     Option,
     Scene,
     Seed,
@@ -67,19 +66,8 @@ def bounds(
             form="NAME,NAME,...",
         ),
     ] = None,
-    gain: Annotated[
-        NumberOrAuto,
-        Option(
-            "Factor of the receiver's gain, or auto for the largest without saturation",
-            0,
-            above=True,
-            form="NUMBER|auto",
-        ),
-    ] = None,
-    optical_density: Annotated[
-        NumberOrAuto,
-        Option("Optical density of a filter, or auto for the least without saturation", 0, DENSEST, form="NUMBER|auto"),
-    ] = None,
+    gain: Gain = None,
+    optical_density: OpticalDensity = None,
     background_power_w: BackgroundPower = 0.0,
     nuisances: Annotated[
         Mapping[str, float] | None,

@@ -195,7 +195,8 @@ def depth_bias(
     for place in seas:
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
         shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
-        if not _is_lost(shallower):
+        seen = [bool(np.any(cell["found"] > 0)) for cell in shallower]
+        if not any(seen) or seen[-1]:
             given = {
                 "wavelength_nm": _WAVELENGTH,
                 **(params or {}),
@@ -207,18 +208,9 @@ def depth_bias(
                 **({} if wind else {"spectrum": "flat"}),
             }
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
+            options |= {"instrument": instrument, "infrared": infrared, "seed": seed, "first_seed": seed}
             error = target_error * (1 if wind else _LEVEL)
-            rendered = render_shots(
-                scene,
-                given,
-                instrument=instrument,
-                infrared=infrared,
-                target_error=error,
-                seed=seed,
-                first_seed=seed,
-                **options,
-            )
-            seas.keep(rendered)
+            rendered = seas.keep(render_shots(scene, given, target_error=error, **options))
             # Troughs may leave a shallow bottom dry.
             wet = np.isfinite(rendered["true_bottom_depth_below_surface"].values)
             if not wet.all():
@@ -275,12 +267,6 @@ def describe_depth_bias(found: xr.Dataset) -> list[str]:
                 row += [100 * own["corrected_bias"], 100 * own["corrected_spread"], own["corrected_z"]]
             rows.append(row)
     return table_lines(columns if "corrected_bias" in found else columns[:-3], rows)
-
-
-def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether a bottom was found at one of the smaller depths, and none at the last of them."""
-    found = [bool(np.any(cell["found"] > 0)) for cell in shallower]
-    return any(found) and not found[-1]
 
 
 def _check_counts(recorded: xr.Dataset) -> None:

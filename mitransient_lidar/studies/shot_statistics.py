@@ -37,21 +37,17 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
     columns: dict[str, FloatArray] = {name: series[name].values for name in ("aim_x", "aim_y")}
     columns |= {f"slope_{name}": series[f"true_slope_{name}"].values for name in ("along", "across")}
     shape = series.sizes["shot"], -1
-    for name, time in _echo_times(series).items():
+    depth = series.attrs.get("scene.bottom_depth")
+    if depth is None or "surface_time_ns" not in series.attrs:
+        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
+    geometry = lidar_geometry(series.attrs)
+    echoes = {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
+    for name, time in echoes.items():
         heights, times = highest_points(series, time - _HALF_GATE_NS, time + _HALF_GATE_NS)
         columns |= {f"{name}_peak": heights.reshape(shape), f"{name}_time": times.reshape(shape)}
     data = {name: (("shot", "pixel")[: values.ndim], values) for name, values in columns.items()}
     pixels = [str(name) for name in series["pixel"].values]
     return label(xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs), "highest")
-
-
-def _echo_times(shot: xr.Dataset) -> dict[str, float]:
-    """Return the times of surface and bottom echo from a level sea [ns]."""
-    depth = shot.attrs.get("scene.bottom_depth")
-    if depth is None or "surface_time_ns" not in shot.attrs:
-        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
-    geometry = lidar_geometry(shot.attrs)
-    return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 
 
 def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:

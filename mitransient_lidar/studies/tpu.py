@@ -114,25 +114,11 @@ def tpu(
     found: list[xr.Dataset] = []
     cases = Cases(heights.tolist(), "altitudes", unit="cell", max_time=max_time, progress=progress)
     for height in cases:
-        table = depth_bias(
-            instrument,
-            {**given, "altitude": height},
-            scene=scene,
-            receiver=receiver,
-            infrared=infrared,
-            angles_deg=angles,
-            winds=winds,
-            ripples=[RIPPLES],
-            waters=waters,
-            depths=depths,
-            estimators=[estimator],
-            shots=shots,
-            records=records,
-            seed=seed,
-            corrections=corrections,
-            max_time=cases.left,
-            progress=cases.step,
-        )
+        options: dict[str, Any] = {"scene": scene, "receiver": receiver, "infrared": infrared, "seed": seed}
+        options |= {"angles_deg": angles, "winds": winds, "ripples": [RIPPLES], "waters": waters, "depths": depths}
+        options |= {"estimators": [estimator], "shots": shots, "records": records, "corrections": corrections}
+        at_height = {**given, "altitude": height}
+        table = depth_bias(instrument, at_height, max_time=cases.left, progress=cases.step, **options)
         found.append(sounding_uncertainty(cases.keep(table), trajectory))
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
     seas = math.prod(found[0].sizes[axis] for axis in AXES)
