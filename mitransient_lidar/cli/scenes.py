@@ -8,15 +8,11 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import check_suffix, write_page
 from mitransient_lidar.cli.generator import Call, Command
-from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.written import aligned_lines
 
 _HEADING = "Scenes and system"
-
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
 
 
 def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
@@ -31,30 +27,11 @@ def list_scenes() -> None:
     _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
-def _show(
-    name: Name,
-    html: Annotated[
-        bool, typer.Option("--html", help="Write a page that shows the scene in three dimensions instead.")
-    ] = False,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="HTML file of the page; NAME.html by default.")
-    ] = None,
-) -> None:
-    """Print the XML of a scene, self-contained, or write its page."""
-    if not html:
-        if output is not None:
-            raise UserError(f"--output {output} needs --html: the XML is printed")
-        from mitransient_lidar.loading.catalogue import scene_text
+def _show(name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]) -> None:
+    """Print the XML of a scene, self-contained."""
+    from mitransient_lidar.loading.catalogue import scene_text
 
-        typer.echo(scene_text(name), nl=False)
-        return
-    path = output or Path(f"{Path(name).stem}.html")
-    check_suffix("--output", path, ".html")
-    from mitransient_lidar.plots.viewer import view_scene
-
-    with reporting(quiet=False):
-        page = view_scene(name)
-    write_page(page, path)
+    typer.echo(scene_text(name), nl=False)
 
 
 def _copy(
@@ -131,16 +108,7 @@ COMMANDS = {
 
 SCENES = {
     "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
-    "show": Command(
-        "Commands",
-        "",
-        _show,
-        """Print the XML of a scene, self-contained, or write a page that shows it.
-
-        The page, of --html, has sea, bottom, targets, layers, beam and pixels in three dimensions, to scale, with names
-        and numbers; it needs no network. view NAME opens it in the browser.
-        """,
-    ),
+    "show": Command("Commands", "", _show, "Print the XML of a scene, self-contained; view NAME shows it as a page."),
     "copy": Command("Commands", "", _copy, "Copy a scene or an example file to edit."),
     "instruments": Command(
         "Commands",

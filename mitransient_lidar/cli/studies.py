@@ -145,9 +145,9 @@ STUDIES = {
         "estimate",
         "waveforms:plot_components",
         "describe_estimate",
-        """Estimate the waveforms in one second, over a level sea and without targets.
+        """Estimate the waveforms in about a second, over a level sea.
 
-        Lidar equation with sampled forward scattering: a first look, and a second opinion on a render.
+        Looks up the light in maps of the beam: a first look, and a second opinion on a render.
         """,
     ),
     "bounds": _study(

@@ -98,14 +98,8 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
 def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.ArrayLike) -> xr.Dataset:
     """Return a result from `build` or `build_series` with its light by origin.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    origins : sequence of str
-        Unique origin names.
-    arrays : array-like of shape (pixel, origin, time)
-        The four arrays of `build` for each origin; in a series with the shots first.
+    Arrays are the four of `build`, shape (pixel, origin, time), in a series with the shots first; names of origins are
+    unique.
     """
     values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
     added = _add(dataset, "by_origin", "{}, by origin", {"origin": np.array(origins, dtype=str)}, values)
@@ -145,14 +139,7 @@ def add_derivatives(
 def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
     """Return a result from `build` with each pass batch's mean power, ``waveform_batch`` [W].
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    passes : sequence of int
-        Passes per batch.
-    waveforms : array-like of shape (batch, pixel, time)
-        Mean power in these passes [W].
+    `waveforms` have the shape (batch, pixel, time), and `passes` are the numbers of passes per batch.
     """
     waveform = dataset["waveform"]
     values = np.asarray(waveforms, dtype=np.float64).reshape(len(passes), *waveform.shape)

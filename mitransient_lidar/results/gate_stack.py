@@ -166,12 +166,7 @@ def build_gates(
 def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.ArrayLike) -> xr.Dataset:
     """Return a gate stack from `build_gates` with the derivatives of its energies by parameters.
 
-    Parameters
-    ----------
-    stack : xarray.Dataset
-        The gate stack.
-    slopes, stderr : array-like of shape (parameter, pixel, gate)
-        Derivative of each gate's energy, in J per unit of the parameter, and its standard error.
+    The derivatives and their standard errors are in J per unit of the parameter, shape (parameter, pixel, gate).
     """
     energy = stack["gate_energy"]
     arrays = {

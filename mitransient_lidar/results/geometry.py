@@ -54,15 +54,9 @@ class LinesOfSight:
         """Read the lines of sight in a result or gate stack.
 
         Without their coordinates, they go to the pixel centres, with the mean arrival in the attribute
-        ``surface_time_ns`` if it is known. Raises `UserError` if coordinates and attributes do not determine the
-        geometry.
-
-        Parameters
-        ----------
-        dataset
-            A dataset over ``pixel``, or ``row`` and ``column``.
-        dims
-            Dimensions of the arrays, flattened to one; by default the pixels' own.
+        ``surface_time_ns`` if it is known. Arrays have the dimensions `dims`, flattened to one, by default those of the
+        pixels: ``pixel``, or ``row`` and ``column``. Raises `UserError` if coordinates and attributes do not determine
+        the geometry.
         """
         if dims is None:
             dims = ("row", "column") if "row" in dataset.dims else ("pixel",)

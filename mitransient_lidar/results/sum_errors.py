@@ -40,12 +40,8 @@ class BlockCorrelation:
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
         """Return the covariances between k sums over the same bins, shape (..., k, k).
 
-        Parameters
-        ----------
-        scaled
-            Errors of neighbouring bins times their weights, shape (..., k, bins).
-        first
-            Number of their first bin in the record.
+        `scaled` are errors of neighbouring bins times their weights, shape (..., k, bins), from the bin `first` of the
+        record on.
         """
         part = slice(first, first + scaled.shape[-1])
         own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
@@ -105,16 +101,9 @@ class SumErrors:
         return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:
-        """Return the standard error of a sum over weighted bins.
+        """Return the standard error of a weighted sum over neighbouring bins, from the bin `first` of the record on.
 
-        Parameters
-        ----------
-        deviation
-            Standard errors of neighbouring bins, shape (..., bins).
-        weights
-            Their weights, shape (bins,) or the shape of `deviation`.
-        first
-            Number of the first of them in the record.
+        Standard errors have the shape (..., bins), weights this one or (bins,).
         """
         scaled = deviation * weights
         if self.shared is None:
