@@ -47,10 +47,15 @@ _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
 
-#: Settings of a receiver; auto is what does not saturate.
-_GAIN = "Factor of the amplifier's gain, or auto; by default the receiver's, or 1"
+_GAIN = (
+    "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation; by default the receiver's, or "
+    "1"
+)
 Gain = Annotated[Setting | None, Option(_GAIN, 0, above=True, form="NUMBER|auto")]
-_DENSITY = "Optical density of a filter before the detector, or auto; by default the receiver's, or 0"
+_DENSITY = (
+    "Optical density of a filter before the detector, also for daylight, or auto for the least multiple of 0.1 without "
+    "saturation; by default the receiver's, or 0"
+)
 OpticalDensity = Annotated[Setting | None, Option(_DENSITY, 0, DENSEST, form="NUMBER|auto")]
 
 _FAINT_W, _STEADY_BINS = 1e-9, 256  # light of which the sensitivity is measured [W], and its bins
@@ -90,12 +95,6 @@ def detect_waveforms(
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
-    gain : float or 'auto', optional
-        Factor on the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation. By default
-        from the receiver's channels, 1 where they have none.
-    optical_density : float or 'auto', optional
-        Optical density of a filter before the detector, 0 to 12, which also attenuates the background; 'auto' for the
-        least multiple of 0.1 without saturation. By default from the channels, 0 where they have none.
 
     Returns
     -------

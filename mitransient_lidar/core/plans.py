@@ -47,18 +47,9 @@ class Plan:
     def of(cls, given: object, where: str = "", prefix: str = "", **others: Any) -> Self:
         """Return the object for a table in a file.
 
-        Raises `UserError` if it is no table, a key is unknown or missing, or a value is not allowed.
-
-        Parameters
-        ----------
-        given
-            The table.
-        where
-            Name of the table in messages, such as ``[design]``.
-        prefix
-            Beginning of value names in messages, such as ``design.``.
-        others
-            Fields that are no keys.
+        In messages the table is `where`, such as ``[design]``, and names of values begin with `prefix`, such as
+        ``design.``. `others` are fields that are no keys. Raises `UserError` if it is no table, a key is unknown or
+        missing, or a value is not allowed.
         """
         where = where or f"[{cls.__name__.lower()}]"
         values = table(where, given)

@@ -69,9 +69,6 @@ def fov_sweep(
         XML scene's parameter ``field_of_view_mrad``, which determines the size of the surface.
     min_depth, max_depth
         Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
-    max_time
-        Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
-        out, with a warning; the narrowest one is always rendered.
 
     Returns
     -------

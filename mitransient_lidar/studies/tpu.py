@@ -79,12 +79,8 @@ def tpu(
     ----------
     params, scene
         As for `depth_bias.depth_bias`.
-    winds
-        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
     infrared
         As of `depth_bias.depth_bias`; ``auto`` corrections then are none.
-    pointing_mrad, position_m, height_m
-        Trajectory errors of the survey; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
         Time after which no sea is rendered [s], above 0. Uncertainties for omitted seas are NaN; altitudes without any
         rendered sea are left out. The attribute ``seas_left_out`` has the number of both.

@@ -130,15 +130,9 @@ def of_columns(
 ) -> ScatteredLight | None:
     """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
-    Parameters
-    ----------
-    waveforms, echoes
-        Waveforms of one pixel, and their table from `echo_table.extract` without the dimension pixel.
-    system, share
-        The lidar, and the share of the beam in view, shape () or (shots,).
-    dataset
-        Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the slope
-        variance and the pixel outlines.
+    Waveforms are of one pixel, as is their table from `echo_table.extract`. The share of the beam in view has the shape
+    () or (shots,). The result has the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if known, the slope
+    variance and the pixel outlines.
     """
     levels = backscatter_of(echoes, system, share)
     decay, backscatter = (mean_of_known(one) for one in (echoes["attenuation"].values, levels))

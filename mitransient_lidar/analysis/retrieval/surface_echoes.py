@@ -147,18 +147,8 @@ class SeaShots:
 def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed: int = 2**40) -> SeaShots:
     """Return the surface echoes of 600 shots at random locations on four seas.
 
-    Raises `UserError` if the wind speed is out of range, or waves move the light by too many beam widths.
-
-    Parameters
-    ----------
-    lidar : SeaLidar
-        Lidar.
-    wind_speed : float
-        Wind speed [m/s], 1 to 30.
-    wind_direction : float
-        Direction that the wind blows towards, counter-clockwise from the lidar's azimuth [rad].
-    seed : int
-        Seed of seas and locations, at least 0.
+    The wind, 1 to 30 m/s, blows towards a direction that is counter-clockwise from the lidar's azimuth [rad]. Raises
+    `UserError` if its speed is out of range, or waves move the light by too many beam widths.
 
     Notes
     -----

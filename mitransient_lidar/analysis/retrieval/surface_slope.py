@@ -239,14 +239,8 @@ class SeaEstimate:
 def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> SeaEstimate:
     """Estimate slopes and height of the sea from echo times and strengths, given the sea's statistics.
 
-    Parameters
-    ----------
-    echoes : PixelEchoes
-        Measured echoes.
-    shots : SeaShots
-        Echoes of the same lidar at random locations on a sea with the same statistics.
-    scale : float or None
-        Pulse energy times efficiencies and aperture area [J m^2], positive. If None, strengths are not used.
+    `shots` are echoes of the same lidar at random locations on a sea with the same statistics. `scale` is pulse energy
+    times efficiencies and aperture area [J m^2], positive; if None, strengths are not used.
 
     Notes
     -----
