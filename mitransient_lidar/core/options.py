@@ -27,9 +27,6 @@ _R = TypeVar("_R")
 #: Numbers in a list or an array, shape (N,).
 Numbers = Sequence[float] | FloatArray
 
-#: A number, or the word for one that is chosen.
-NumberOrAuto = float | Literal["auto"] | None
-
 
 @dataclass(frozen=True)
 class Option:

@@ -153,20 +153,10 @@ def kinds_of(dataset: xr.Dataset) -> set[str]:
 
 
 def dataset_of(name: str, given: Given, *kinds: str, **selection: Any) -> xr.Dataset:
-    """Return a dataset that is given itself, or by its file's path.
+    """Return a dataset of one of the kinds from `kinds_of`, given itself, or by its path for `open` with `selection`.
 
-    Raises `UserError` if it is neither, or of none of these kinds, or the file cannot be read.
-
-    Parameters
-    ----------
-    name
-        Parameter name, for messages.
-    given
-        The dataset, or a path for `open`.
-    kinds
-        Kinds from `kinds_of`, of which it must be one.
-    selection
-        For `open`, if a path is given.
+    Raises `UserError`, with the parameter's name, if it is neither, or of none of these kinds, or the file cannot be
+    read.
     """
     if isinstance(given, xr.Dataset):
         dataset, place = given, name

@@ -116,19 +116,11 @@ def build_gates(
     coords: Mapping[Any, Any],
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Label the energies in gates as a gate stack.
+    """Label the energies in gates, summed over their pulses, and their standard errors [J] as a gate stack.
 
-    Raises `UserError` if the energies have another shape.
-
-    Parameters
-    ----------
-    energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
-        Energy in each gate, summed over its pulses, and its standard error [J]. The pixels of an imager may be in one
-        axis, in row-major order. With the coordinate ``frame`` that dimension is first.
-    train : GateTrain
-        The gates.
-    coords, attributes : mapping
-        Coordinates and attributes of a result; the coordinate ``time`` is ignored.
+    They have the shape (row, column, gate) or (pixel, gate). The pixels of an imager may be in one axis, in row-major
+    order. With the coordinate ``frame`` that dimension is first. Coordinates and attributes are those of a result; the
+    coordinate ``time`` is ignored. Raises `UserError` if the energies have another shape.
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)

@@ -144,17 +144,11 @@ class LinesOfSight:
 def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
     """Read a lidar's geometry from a result's attributes.
 
+    They are ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally,
+    ``surface_time_ns``, the mean arrival over the pixels. This is the surface echo time if `surface` is ``measured``;
+    with ``level``, it is that of the mean sea level on the axis, and with ``any`` the first of these that is known.
     Raises `UserError` if an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under
     water.
-
-    Parameters
-    ----------
-    attributes
-        ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally, ``surface_time_ns``,
-        the mean arrival over the pixels.
-    surface
-        Surface echo time: ``measured`` is ``surface_time_ns``, ``level`` the time of the mean sea level on the axis,
-        ``any`` the first of these that is known.
     """
     if surface == "measured":
         required_number(attributes, "surface_time_ns")

@@ -51,15 +51,10 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
 
 
 def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:
-    """Find the highest point of each pixel's waveform in a gate [ns], by a parabola through three bins.
+    """Return the highest point of each pixel's waveform in a gate [ns], by a parabola through three bins.
 
-    Raises `UserError` if the gate is not within the record.
-
-    Returns
-    -------
-    height, time
-        Power [W] and time [ns], shape (waveforms,), for the pixels of one shot, or of several shots in a row; NaN where
-        the highest bin lies at a gate limit.
+    Power [W] and time [ns] have the shape (waveforms,), for the pixels of one shot, or of several shots in a row; NaN
+    where the highest bin lies at a gate limit. Raises `UserError` if the gate is not within the record.
     """
     time = shot["time"].values
     inside = np.flatnonzero((time >= start) & (time <= end))
@@ -99,14 +94,10 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return slopes [1] and their effects on the echoes in a receiver with 2x2 pixels, from `shot_statistics`.
 
-    Raises `UserError` if the pixels are different ones.
-
-    Returns
-    -------
-    dict
-        Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (surface echo
-        delay of the far pair after the near pair [ns]) and ``depth`` (bottom depth error [m]) for the slope along the
-        azimuth; ``sideways`` (delay of green, on the right, after red [ns]) for the rise to the left.
+    The effects, each over ``shot``, are ``strength`` (log10 of the surface echo [W]), ``separation`` (surface echo
+    delay of the far pair after the near pair [ns]) and ``depth`` (bottom depth error [m]) for the slope along the
+    azimuth, and ``sideways`` (delay of green, on the right, after red [ns]) for the rise to the left. Raises
+    `UserError` if the pixels are different ones.
     """
     if [str(name) for name in shots["pixel"].values] != ["red", "green", "blue", "black"]:
         raise UserError(f"pixels = {list(shots['pixel'].values)} must be the 2x2 of red, green, blue and black")

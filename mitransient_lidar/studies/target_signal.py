@@ -172,13 +172,9 @@ def target_gates(
 ) -> xr.Dataset:
     """Render a scene's gates with and without a target, on the same random numbers, for any number of pixels.
 
-    Raises `UserError` if the scene has no gates, or as for `target_signal`.
-
-    Returns
-    -------
-    xarray.Dataset
-        A gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
-        without), ``half`` (of the passes), and its dimensions.
+    Returns a gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
+    without), ``half`` (of the passes), and its dimensions. Raises `UserError` if the scene has no gates, or as for
+    `target_signal`.
     """
     chosen, *renderers = _pair(session, target_id, integrator, None)
     lidar = renderers[0].scene

@@ -57,14 +57,10 @@ class WaterEstimate:
 def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
     """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide field of view.
 
-    Parameters
-    ----------
-    decay, backscatter : array_like
-        Attenuation K along the path in the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi) including
-        multiple scattering [1/(m sr)]. The backscatter is the power at the surface, extrapolated with K, over
-        `LidarSystem.column_gain` and the fraction of the beam in view.
-    excess, level : float
-        K minus the absorption [1/m], and backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
+    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) includes
+    multiple scattering [1/(m sr)]: it is the power at the surface, extrapolated with K, over `LidarSystem.column_gain`
+    and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and `level` the backscatter over
+    bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Notes
     -----

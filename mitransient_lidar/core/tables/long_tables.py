@@ -62,19 +62,10 @@ def read_long_table(
     Cells are separated by semicolons, tabs, commas or blanks. Numbers have a decimal point or, unless commas separate,
     a decimal comma; they may stand in quotation marks. Comments follow a #; above the rows, they may begin with %, //
     or ! as well, and one of them may be the heading. Missing values are pandas' own, such as an empty cell or NA.
-    Raises `UserError` if the file is larger than 512 MiB or has more than 10^7 rows, no row, other columns, or entries
-    that are no numbers.
 
-    Parameters
-    ----------
-    path : Path
-        Text file in UTF-8.
-    columns, others : sequence of Column
-        The first columns in a table without a heading, and further ones that identify a line as a heading.
-    choose : callable
-        Column choice by the names in the heading.
-    names : list of str
-        Names that stand elsewhere; empty if they are in the heading.
+    Without a heading, the first columns are `columns`; these and `others` identify a line as a heading, unless `names`
+    stand elsewhere. `choose` chooses columns by the names. Raises `UserError` if the file is no text in UTF-8, is
+    larger than 512 MiB or has more than 10^7 rows, no row, other columns, or entries that are no numbers.
     """
     import pandas as pd
 
