@@ -34,22 +34,15 @@ _LARGEST_RELATIVE_ERROR = 0.3
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences between two results.
+    """Differences between two results."""
 
-    Attributes
-    ----------
-    z
-        Difference between the impulse responses in standard errors, second minus first, shape (pixel, time), converted
-        to the normal distribution for few passes; NaN in excluded bins.
-    limit
-        Critical ``abs(z)`` for the largest difference over all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
-    energy_ratio, energy_ratio_stderr
-        Energy in the included bins, second over first, and its standard error. Where the results state the correlation
-        between bin errors (`results.sum_errors`), it is the error of the power in these bins; pixels are independent.
-    """
-
+    #: Difference between the impulse responses in standard errors, second minus first, shape (pixel, time), converted
+    #: to the normal distribution for few passes; NaN in excluded bins.
     z: FloatArray
+    #: Critical ``abs(z)`` for the largest difference over all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
     limit: float
+    #: Energy in the included bins, second over first, and its standard error. Where the results state the correlation
+    #: between bin errors (`results.sum_errors`), it is the error of the power in these bins; pixels are independent.
     energy_ratio: float
     energy_ratio_stderr: float
 
@@ -77,12 +70,8 @@ class Comparison:
 def as_bins(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Return two results with time bins; where one has gates alone, both results' gates are bins at their middles.
 
-    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes.
-
-    Raises
-    ------
-    UserError
-        If one has gates or a record alone and the other has none, or a record has a single shot.
+    Records of shots become their mean signal, with the error by the spread of the shots, which count as passes. Raises
+    `UserError` if one has gates or a record alone and the other has none, or a record has a single shot.
     """
     results = first, second
     if all("impulse_response" in one for one in results):
@@ -117,12 +106,10 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     energy error as if they had one sign.
 
     Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
-
-    Raises
-    ------
-    UserError
-        If pixels or bins differ, or no bin is included.
+    Raises `UserError` if pixels or bins differ, or no bin is included.
     """
+    from scipy.special import ndtri, stdtr
+
     results = as_bins(first, second)
     times = [result["time"].values for result in results]
     shapes = [_by_pixel(result, "impulse_response").shape for result in results]
@@ -160,7 +147,9 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     parts = np.maximum(np.stack(relative) * common**2, variances)
     total = parts[0] + parts[1]
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
-    z = _as_normal(difference / np.sqrt(total), freedom)
+    t = difference / np.sqrt(total)
+    # Normal quantiles of Student's t (Welch 1947, doi:10.1093/biomet/34.1-2.28).
+    z = -np.sign(t) * ndtri(np.maximum(stdtr(freedom, -np.abs(t)), 1e-300))
     sums = [float(value[counted].sum()) for value in values]
     own = [_error_of_energy(result, counted) for result in results]
     spread = float(np.sqrt(np.nansum(total))) / sums[0]
@@ -206,11 +195,3 @@ def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> Float
 def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:
     values = result[name].values
     return np.asarray(values.reshape(-1, values.shape[-1]), dtype=np.float64)
-
-
-def _as_normal(t: FloatArray, freedom: FloatArray) -> FloatArray:
-    """Return the normal quantiles of Student's t (Welch 1947, doi:10.1093/biomet/34.1-2.28)."""
-    from scipy.special import ndtri, stdtr
-
-    tail: FloatArray = stdtr(freedom, -np.abs(t))
-    return np.asarray(-np.sign(t) * ndtri(np.maximum(tail, 1e-300)))

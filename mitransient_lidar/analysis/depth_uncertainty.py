@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.core.tables.written import write_csv
-from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative
+from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
 from mitransient_lidar.results.geometry import required_number
 from mitransient_lidar.results.variables import described
@@ -56,17 +56,10 @@ SURVEY_ORDERS = (
 
 
 def order_met(depth: npt.ArrayLike, tvu: npt.ArrayLike, thu: npt.ArrayLike) -> IntArray:
-    """Return the strictest order that both uncertainties meet.
+    """Return the strictest order that total vertical and horizontal uncertainties at 95 % [m] meet at depths [m].
 
-    Parameters
-    ----------
-    depth, tvu, thu : array_like
-        Depths, and total vertical and horizontal uncertainties at 95 % [m], of shapes that broadcast.
-
-    Returns
-    -------
-    ndarray
-        Places in `SURVEY_ORDERS`, their number where no order is met, and -1 where an uncertainty is NaN.
+    It is the place in `SURVEY_ORDERS`, their number where no order is met, and -1 where an uncertainty is NaN; shapes
+    broadcast.
     """
     d, vertical, horizontal = np.broadcast_arrays(*(np.asarray(one, dtype=np.float64) for one in (depth, tvu, thu)))
     met = [(vertical <= one.largest_tvu(d)) & (horizontal <= one.largest_thu(d)) for one in SURVEY_ORDERS]
@@ -74,58 +67,30 @@ def order_met(depth: npt.ArrayLike, tvu: npt.ArrayLike, thu: npt.ArrayLike) -> I
     return np.where(np.isfinite(vertical + horizontal), place, -1)
 
 
-@dataclass(frozen=True)
-class TrajectoryErrors:
+class TrajectoryErrors(NamedTuple):
     """Standard deviations of a survey trajectory's errors, by default a good inertial system's."""
 
     pointing_mrad: float = 0.1  #: Beam direction on either axis [mrad]: attitude, boresight and scanner.
     position_m: float = 0.05  #: Horizontal position on either axis [m].
     height_m: float = 0.05  #: Sea surface height [m]: position, range and datum.
 
-    def __post_init__(self) -> None:
-        for name in ("pointing_mrad", "position_m", "height_m"):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name)))
-
 
 def shift_by_slope(off_nadir: float, n: float) -> tuple[float, float]:
-    """Return the shift of a bottom point by a sea slope that is assumed to be level.
+    """Return the horizontal shifts of a bottom point by a sea slope that is assumed to be level.
 
-    Parameters
-    ----------
-    off_nadir : float
-        Beam angle from the vertical [rad].
-    n : float
-        Refractive index of the water.
-
-    Returns
-    -------
-    along, across : float
-        Horizontal shift per depth and slope [1], in the line of sight and across it, to first order.
+    They are per depth and slope [1], in the line of sight and across it, to first order, for a beam angle from the
+    vertical [rad] and a refractive index of the water.
     """
     turn, cos_water = float(turn_by_slope(off_nadir, n)), float(np.cos(snell(off_nadir, n)))
     return turn / cos_water**2, turn
 
 
 def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: float) -> tuple[FloatArray, ...]:
-    """Return the shift of a bottom point by an error in the beam's direction.
+    """Return the shifts of a bottom point at measured ranges by an error in the beam's direction.
 
-    Parameters
-    ----------
-    off_nadir : float
-        Beam angle from the vertical [rad].
-    height : float
-        Lidar height above the sea [m].
-    depth : ndarray
-        Bottom depths [m].
-    n : float
-        Refractive index of the water.
-
-    Returns
-    -------
-    along, across, up : ndarray
-        Shift [m/rad] in the line of sight, across it and vertically, in the shape of `depth`, to first order, for a
-        point at measured ranges. An error in the angle from nadir causes along and up, an error across it causes
-        across.
+    They are in the line of sight, across it and vertically [m/rad], in the shape of the bottom depths [m], to first
+    order. An error in the angle from nadir causes the first and the last, an error across it the second. The beam angle
+    is from the vertical [rad], and the lidar's height above the sea [m].
     """
     water = float(snell(off_nadir, n))
     cos_air, cos_water = float(np.cos(off_nadir)), float(np.cos(water))
@@ -196,10 +161,8 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
         "flag_values": np.arange(-1, len(SURVEY_ORDERS) + 1),
         "flag_meanings": " ".join(["unknown", *(one.name for one in SURVEY_ORDERS), "none"]),
     }
-    errors = {name: getattr(trajectory, name) for name in ("pointing_mrad", "position_m", "height_m")}
-    return found.assign_attrs(
-        {**table.attrs, **errors, "title": f"Uncertainties of the soundings of {table.attrs['instrument']}"}
-    )
+    title = f"Uncertainties of the soundings of {table.attrs['instrument']}"
+    return found.assign_attrs({**table.attrs, **trajectory._asdict(), "title": title})
 
 
 def non_negative_line(x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[float, float]:
@@ -225,17 +188,10 @@ def non_negative_line(x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[float, float]
 
 
 def write_fits(found: xr.Dataset, part: str, path: str | os.PathLike[str]) -> None:
-    """Write the fits of one altitude, angle and correction as uncertainty tools read them.
+    """Write the fits, ``vertical`` or ``horizontal``, of one altitude, angle and correction for uncertainty tools.
 
-    Parameters
-    ----------
-    found : xarray.Dataset
-        From `sounding_uncertainty`, without the dimensions ``altitude``, ``off_nadir_deg`` and ``correction``.
-    part : str
-        ``vertical`` or ``horizontal``.
-    path
-        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation. Rows
-        are by wind [m/s] and then by water, nan where there is no fit.
+    They are from `sounding_uncertainty`. The CSV file has the columns Wind, JerlovType, a and b, in m and per metre of
+    depth, one standard deviation. Rows are by wind [m/s] and then by water, nan where there is no fit.
     """
     fits = {f"{part}_{name}": name for name in "ab"}
     frame = found[[*fits]].to_dataframe(["wind_speed", "water"]).reset_index()

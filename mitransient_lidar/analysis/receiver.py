@@ -46,6 +46,18 @@ _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
+
+_GAIN = (
+    "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation; by default the receiver's, or "
+    "1"
+)
+Gain = Annotated[Setting | None, Option(_GAIN, 0, above=True, form="NUMBER|auto")]
+_DENSITY = (
+    "Optical density of a filter before the detector, also for daylight, or auto for the least multiple of 0.1 without "
+    "saturation; by default the receiver's, or 0"
+)
+OpticalDensity = Annotated[Setting | None, Option(_DENSITY, 0, DENSEST, form="NUMBER|auto")]
+
 _FAINT_W, _STEADY_BINS = 1e-9, 256  # light of which the sensitivity is measured [W], and its bins
 _BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when its record is written
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
@@ -65,23 +77,8 @@ def detect_waveforms(
         Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
     ] = 0.0,
     *,
-    gain: Annotated[
-        Setting | None,
-        Option(
-            "Factor of the amplifier's gain, or auto; by default the receiver's, or 1",
-            0,
-            above=True,
-            form="NUMBER|auto",
-        ),
-    ] = None,
-    optical_density: Annotated[
-        Setting | None,
-        Option(
-            "Optical density of a filter before the detector, or auto; by default the receiver's, or 0",
-            *(0, DENSEST),
-            form="NUMBER|auto",
-        ),
-    ] = None,
+    gain: Gain = None,
+    optical_density: OpticalDensity = None,
 ) -> xr.Dataset:
     """Record shots of a result, or of each shot in a series, with a receiver chain, or gates with a camera.
 
@@ -98,12 +95,6 @@ def detect_waveforms(
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
-    gain : float or 'auto', optional
-        Factor on the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation. By default
-        from the receiver's channels, 1 where they have none.
-    optical_density : float or 'auto', optional
-        Optical density of a filter before the detector, 0 to 12, which also attenuates the background; 'auto' for the
-        least multiple of 0.1 without saturation. By default from the channels, 0 where they have none.
 
     Returns
     -------
@@ -266,8 +257,8 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
     joined = joined.isel(pixel=order)
     attributes: dict[str, Any] = {}
     for name in dict.fromkeys(name for part in parts for name in part.attrs):
-        values = [part.attrs.get(name) for part in parts]
-        if all(_same(value, values[0]) for value in values):
+        values: list[Any] = [part.attrs.get(name) for part in parts]
+        if all(type(value) is type(values[0]) and np.array_equal(value, values[0]) for value in values):
             attributes[name] = values[0]
         elif name.startswith("receiver.") or None in values:
             for part in parts:
@@ -279,11 +270,6 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
             attributes[name] = [each[place] for place in order]
     joined.attrs = attributes
     return joined
-
-
-def _same(first: Any, second: Any) -> bool:
-    """Return whether two attributes are the same."""
-    return type(first) is type(second) and bool(np.array_equal(first, second))
 
 
 def _record_channel(

@@ -1,4 +1,4 @@
-"""Commands that compute from a result: signals, echoes, estimates and fits."""
+"""Commands that compute from a result: gates, signals, echoes, estimates and fits."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
+from mitransient_lidar.cli.files import GateFiles, announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
 from mitransient_lidar.cli.options import OUTPUT, Channel, Lidar, Quiet, Waveforms, waveform_selection
+from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.tables.written import write_csv
@@ -22,6 +23,64 @@ if TYPE_CHECKING:
     from mitransient_lidar.results.files import Given
 
 _REFUSED = 1  # exit code of a fit that is refused
+
+
+def _gates(
+    call: Call,
+    stack: Annotated[
+        Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result, a gate stack or frames of a camera.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the files, by default the folder of STACK.")
+    ] = None,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw all gates, and the depths seen in them.")] = True,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
+    ] = False,
+    tiff: Annotated[
+        bool, typer.Option("--tiff", help="Also write a 16-bit TIFF file, one page per frame and gate.")
+    ] = False,
+    images: Annotated[
+        bool, typer.Option("--images", help="Also write numbered 16-bit PNG files, one per frame and gate.")
+    ] = False,
+    gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie, by ffmpeg.")] = False,
+    html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Cut the gates of a train, or take those that are there, and write and draw them."""
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis.gates import cut as gating
+    from mitransient_lidar.results.gate_stack import has_frames
+
+    count = call.arguments["count"]
+    starts = [call.arguments[name] for name in ("start_ns", "start_depth_m", "start_range_m")]
+    given = {"--width-ns": call.arguments["width_ns"], "--step-ns": call.arguments["step_ns"]}
+    given["--count"] = None if count == 1 else count
+    with reporting(quiet):
+        result = results.dataset_of("FILE", stack, "result", "gates", "frames")
+        is_record = has_frames(result)
+        has_gates = is_record or "gate_energy" in result
+        is_cut = not has_gates or any(one is not None for one in starts)
+        stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")
+        wanted = {"drawings": plot, "sequence": sequence, "tiff": tiff, "images": images}
+        files = GateFiles.of(output or stack.parent, stem, **wanted, gif=gif, mp4=mp4, html=html)
+        if not is_cut:
+            draws_again(stack)
+        files.check()
+        if is_record and is_cut:
+            raise UserError(f"{stack} holds frames of a camera: cut the gates of the result, and record these")
+        named = [f"{option} {value:g}" for option, value in given.items() if value is not None]
+        if named and not is_cut:
+            raise UserError(f"{named[0]} needs --start-ns, --start-depth or --start-range, where the first gate begins")
+        cut = result
+        if is_cut:
+            with call.named():
+                train = call.function(result.attrs, **call.arguments)
+            cut = gating.cut_gates(result, train)
+    name_subject(stack, result.attrs, quiet)
+    with reporting(quiet):
+        files.write(cut, result, quiet)
 
 
 def _record(
@@ -114,8 +173,7 @@ def _echoes(
     if table:
         typer.echo("\n".join(csv_tables.describe_echoes(first)))
     if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output.parent):
             csv_tables.save_csv(itertools.chain([first], map(measured, parts)), output)
     elif selection and next(parts, None) is not None:
         typer.echo(f"these are the first {first.sizes['shot']} waveforms: write the echoes of all with --csv OUT")
@@ -150,8 +208,7 @@ def _retrieve(
     if figure is not None:
         from mitransient_lidar.plots.retrieval import plot_retrieval
 
-        figure.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(figure.parent):
             plot_retrieval(found, figure)
 
 
@@ -182,8 +239,7 @@ def _fit(
     source = results.open(file, **selection) if selection else file
     with DeferredInterrupt(at_once=False):
         fitted = call(source)
-        output.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output):
             write_netcdf(fitted, targets[0])
             write_csv(study.parameter_frame(fitted), targets[1], unknown="nan")
             plot_fit(fitted, targets[2])
@@ -194,6 +250,17 @@ def _fit(
 
 
 COMMANDS = {
+    "gates": Command(
+        "Analyse results",
+        "results.gate_stack:train_from_options",
+        _gates,
+        """Cut gates from a result.
+
+        Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. A STACK with gates gives
+        <stack>_cut_gates.exr and so on. Without a start, its own gates or camera frames are written and drawn. TIFF
+        and PNG images contain the digital numbers of frames, or energies from 0 to 65535.
+        """,
+    ),
     "record": Command(
         "Analyse results",
         "analysis.receiver:detect_waveforms",

@@ -21,7 +21,7 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import analysis, campaigns, gates, render, results, scenes, studies
+from mitransient_lidar.cli import analysis, campaigns, render, results, scenes, studies
 from mitransient_lidar.cli.generator import Command, LazyCommand
 from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.core.errors import UserError
@@ -34,7 +34,6 @@ COMMANDS: dict[str, Command] = {
     **studies.STUDIES,
     **campaigns.FIGURES,
     **results.COMMANDS,
-    **gates.COMMANDS,
     **analysis.COMMANDS,
     **scenes.COMMANDS,
 }

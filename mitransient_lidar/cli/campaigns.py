@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.generator import Call, Command
 from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
 from mitransient_lidar.cli.options import OUTPUT, Quiet
@@ -42,7 +42,13 @@ def _campaign(
     if len(used) > 1:
         raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them")
     if row is not None:
-        _render_row(call, campaign, row, output or campaign.with_name(f"{campaign.stem}_row{row}.nc"))
+        path = output or campaign.with_name(f"{campaign.stem}_row{row}.nc")
+        check_suffix("--output", path, ".nc")
+        from mitransient_lidar.campaigns.sweep import render_row
+
+        series = replace(call, function=render_row, arguments={}, flags={"row": "--row"})(campaign, row)
+        write_netcdf(series, path)
+        exit_if_interrupted(series)
         return
     if show:
         _show(campaign, output or campaign.with_suffix(".png"))
@@ -65,19 +71,6 @@ def _campaign(
     exit_if_failed(store)
 
 
-def _render_row(call: Call, campaign: Path, row: int, path: Path) -> None:
-    """Render one run to a NetCDF file."""
-    check_suffix("--output", path, ".nc")
-    from mitransient_lidar import results
-    from mitransient_lidar.campaigns.sweep import render_row
-
-    series = replace(call, function=render_row, arguments={}, flags={"row": "--row"})(campaign, row)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with announced():
-        results.save(series, path)
-    exit_if_interrupted(series)
-
-
 def _show(store: Path, path: Path) -> None:
     """Draw a store."""
     check_figure(path)
@@ -86,8 +79,7 @@ def _show(store: Path, path: Path) -> None:
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     dataset = open_campaign(store)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with announced(), reporting_damage(store):
+    with announced(path.parent), reporting_damage(store):
         plot_campaign(dataset, path)
     typer.echo("\n".join(describe_campaign(store)))
 

@@ -78,8 +78,10 @@ def check_suffix(option: str, path: Path, suffix: str) -> None:
 
 
 @contextlib.contextmanager
-def announced() -> Iterator[None]:
-    """Move all files of this context to their places at its end, and print their paths."""
+def announced(*folders: Path | None) -> Iterator[None]:
+    """Move all files of this context to their places at its end, in folders that it makes, and print their paths."""
+    for folder in filter(None, folders):
+        folder.mkdir(parents=True, exist_ok=True)
     with together() as written:
         yield
     for path in written:
@@ -90,16 +92,13 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     """Write a dataset to a NetCDF file, and print its path."""
     from mitransient_lidar.results import save
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with announced():
+    with announced(path.parent):
         save(dataset, path)
 
 
 def write_page(page: View, path: Path | None) -> Path:
     """Write a page, by default to a temporary file, print its path and return it."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with announced():
+    with announced(path and path.parent):
         return page.save(path)
 
 
@@ -156,8 +155,7 @@ class GateFiles:
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):
                 images.check_animation(drawn, path)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(self.folder):
             for path in self.names():
                 if path.suffix == ".tif" or (path.suffix == ".exr" and frames):
                     results.save(stack, path)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -52,10 +51,9 @@ def _render(
     check_targets(output, [*targets, *gates.names()], scene)
     with DeferredInterrupt(at_once=False):
         dataset = call()
-        output.mkdir(parents=True, exist_ok=True)
         if "waveform" not in dataset:
             targets = [output / f"{name}.nc"]
-        with announced():
+        with announced(output):
             for target in targets:
                 _write(dataset, target)
             if "gate_energy" in dataset:
@@ -110,8 +108,7 @@ def _frames(
     check_targets(output, [target, *gates.names()], scene)
     with DeferredInterrupt(at_once=False):
         frames = _again(call)()
-        output.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output):
             _write(frames, target)
             gates.write(frames, None, quiet)
     exit_if_interrupted(frames)
@@ -135,12 +132,8 @@ def _passive(
 
     with DeferredInterrupt(at_once=False):
         image = _again(call)()
-        output.mkdir(parents=True, exist_ok=True)
-        writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
-            ".gif": passive_plots.animate_passive,
-            ".png": passive_plots.plot_passive,
-        }
-        with announced():
+        writers: dict[str, Any] = {".gif": passive_plots.animate_passive, ".png": passive_plots.plot_passive}
+        with announced(output):
             for target in targets:
                 if target.suffix != ".gif" or "row" in image.dims:
                     writers.get(target.suffix, save)(image, target)
@@ -192,12 +185,10 @@ def _shots(
         given = {"count": 20, **{name: value for name, value in given.items() if value is not None}}
     with DeferredInterrupt(at_once=False):
         series = _again(replace(call, arguments=given))()
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output.parent, figure and figure.parent):
             results.save(series, output)
             if figure is not None:
                 measured = statistics.shot_statistics(series)
-                figure.parent.mkdir(parents=True, exist_ok=True)
                 plot_shot_statistics(measured, figure)
                 write_netcdf(measured, figure.with_suffix(".nc"))
     if not quiet:

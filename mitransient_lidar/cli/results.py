@@ -96,8 +96,7 @@ def _view(
     from mitransient_lidar.results.files import kinds_of
 
     of_gates = () if layout or components else ("gates", "frames")
-    source = results.open(file, **selection) if selection else file
-    dataset = results.dataset_of("FILE", source, "waveforms", "signals", *of_gates)
+    dataset = results.dataset_of("FILE", file, "waveforms", "signals", *of_gates, **selection)
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     with announced():
@@ -148,8 +147,7 @@ def _show(
         elif _is_points(file) and not selection:
             page = viewer.view_points(file)
         else:
-            source = results.open(file, **selection) if selection else file
-            dataset = results.dataset_of("FILE", source, "waveforms", "signals", "gates", "frames")
+            dataset = results.dataset_of("FILE", file, "waveforms", "signals", "gates", "frames", **selection)
             page = viewer.view(dataset if shot is None else _shot(dataset, shot, file), limit_mb=PAGE_MB)
     path = write_page(page, output)
     if browser and not webbrowser.open(path.resolve().as_uri()):
@@ -187,9 +185,7 @@ def _compare(
     recorded = [one for one in (first, second) if is_waveform_file(one)]
     selection = waveform_selection(recorded[0] if recorded else first, waveforms, channel, lidar)
     given = (
-        results.dataset_of(
-            name, results.open(one, **selection) if one in recorded else one, "result", "gates", "signals"
-        )
+        results.dataset_of(name, one, "result", "gates", "signals", **(selection if one in recorded else {}))
         for name, one in (("FILE", first), ("OTHER", second))
     )
     datasets = comparison.as_bins(*given)
@@ -212,13 +208,13 @@ COMMANDS = {
         _view,
         """Show a result, a scene or the points of a flight in the browser, or draw a result's waveforms or layout.
 
-        The page of a scene has sea, bottom, targets, beam and pixels in three dimensions, to scale; that of a flight or
-        LAS file its points by class, with errors of their heights. The page of a result is a map of the pixels at each
-        time, and the waveforms of those that are clicked. Pages need no network. Gates are shown where FILE has them,
-        of frames of a camera their mean. With --plot, --components, --layout or a drawing as --output, a PNG, PDF or
-        SVG file is written instead, by default in FILE's folder. Both print the path. With --layout, the command also
-        prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths and
-        the bottom: x, y, z.
+        The page of a scene has sea, bottom, targets, layers, beam and pixels in three dimensions, to scale; that of a
+        flight or LAS file its points by class, with errors of their heights. The page of a result is a map of the
+        pixels at each time, and the waveforms of those that are clicked. Pages need no network. Gates are shown where
+        FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a drawing as --output, a
+        PNG, PDF or SVG file is written instead, by default in FILE's folder. Both print the path. With --layout, the
+        command also prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets'
+        depths and the bottom: x, y, z.
         """,
     ),
     "compare": Command(

@@ -8,15 +8,11 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import check_suffix, write_page
 from mitransient_lidar.cli.generator import Call, Command
-from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.written import aligned_lines
 
 _HEADING = "Scenes and system"
-
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
 
 
 def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
@@ -31,30 +27,11 @@ def list_scenes() -> None:
     _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
-def _show(
-    name: Name,
-    html: Annotated[
-        bool, typer.Option("--html", help="Write a page that shows the scene in three dimensions instead.")
-    ] = False,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="HTML file of the page; NAME.html by default.")
-    ] = None,
-) -> None:
-    """Print the XML of a scene, self-contained, or write its page."""
-    if not html:
-        if output is not None:
-            raise UserError(f"--output {output} needs --html: the XML is printed")
-        from mitransient_lidar.loading.catalogue import scene_text
+def _show(name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]) -> None:
+    """Print the XML of a scene, self-contained."""
+    from mitransient_lidar.loading.catalogue import scene_text
 
-        typer.echo(scene_text(name), nl=False)
-        return
-    path = output or Path(f"{Path(name).stem}.html")
-    check_suffix("--output", path, ".html")
-    from mitransient_lidar.plots.viewer import view_scene
-
-    with reporting(quiet=False):
-        page = view_scene(name)
-    write_page(page, path)
+    typer.echo(scene_text(name), nl=False)
 
 
 def _copy(
@@ -82,9 +59,8 @@ def _instruments(
     if name is None:
         if xml:
             raise UserError("--xml needs the name of an instrument")
-        known = [shipped.read_instrument(each) for each in shipped.instrument_names()]
-        counts = [f"{len(one.channels)} channel{'s' * (len(one.channels) > 1)}" for one in known]
-        _print((one.name, f"{one.title}; {count}") for one, count in zip(known, counts, strict=True))
+        known = [(one := shipped.read_instrument(each), len(one.channels)) for each in shipped.instrument_names()]
+        _print((one.name, f"{one.title}; {count} channel{'s' * (count > 1)}") for one, count in known)
         return
     if xml:
         typer.echo(shipped.instrument_text(name), nl=False)
@@ -110,26 +86,10 @@ def _info(
     _print((name, str(value)) for name, value in facts.items())
 
 
-def _bench(
-    call: Call,
-    images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
-    beams: Annotated[
-        bool, typer.Option("--beams", help="Compare beams from 0.1 to 20 mrad in all views instead.")
-    ] = False,
-) -> None:
+def _bench(call: Call) -> None:
     """Run one benchmark."""
-    from mitransient_lidar.studies.bench import beams as narrow
-    from mitransient_lidar.studies.bench import images as imagers
-
-    if images and beams:
-        raise UserError("--images and --beams are alternatives: give one of them")
-    if images:
-        imagers.run(json=call.arguments["json"])
-    elif beams:
-        narrow.run(json=call.arguments["json"])
-    else:
-        with call.named():
-            call.function(**call.arguments)
+    with call.named():
+        call.function(**call.arguments)
 
 
 COMMANDS = {
@@ -143,21 +103,12 @@ COMMANDS = {
         marks parameters that are not given and have no default, or are not used.
         """,
     ),
-    "bench": Command(_HEADING, "studies.bench.integrators:run", _bench, "Measure the time to a given accuracy."),
+    "bench": Command(_HEADING, "studies.bench:run", _bench, "Measure the time to a given accuracy."),
 }
 
 SCENES = {
     "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
-    "show": Command(
-        "Commands",
-        "",
-        _show,
-        """Print the XML of a scene, self-contained, or write a page that shows it.
-
-        The page, of --html, has sea, bottom, targets, layers, beam and pixels in three dimensions, to scale, with names
-        and numbers; it needs no network. view NAME opens it in the browser.
-        """,
-    ),
+    "show": Command("Commands", "", _show, "Print the XML of a scene, self-contained; view NAME shows it as a page."),
     "copy": Command("Commands", "", _copy, "Copy a scene or an example file to edit."),
     "instruments": Command(
         "Commands",

@@ -29,8 +29,7 @@ def _study(
     def body(call: Call, output: Figure = OUTPUT / f"{name}.png", quiet: Quiet = False) -> None:
         check_figure(output, *suffixes)
         found = call()
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with announced():
+        with announced(output.parent):
             function_at(f"plots.{plot}")(found, output)
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
@@ -71,13 +70,10 @@ def _depth_bias(
     from mitransient_lidar.studies.depth_bias import describe_depth_bias
 
     found = call()
-    with announced():
+    with announced(figure and figure.parent):
         write_netcdf(found, target)
         if figure is not None:
-            from mitransient_lidar.plots.studies.depths import plot_depth_bias
-
-            figure.parent.mkdir(parents=True, exist_ok=True)
-            plot_depth_bias(found, figure)
+            function_at("plots.studies.depths:plot_depth_bias")(found, figure)
     typer.echo("\n".join(describe_depth_bias(found)))
 
 
@@ -98,8 +94,7 @@ def _tpu(
     former = sorted(output.glob(f"{glob.escape(instrument)}_*m_*deg_*"))
     check_targets(output, [target, *former], call.arguments["scene"])
     found = call()
-    output.mkdir(parents=True, exist_ok=True)
-    with announced():
+    with announced(output):
         write_netcdf(found, target)
         for height in found["altitude"].values:
             for angle in found["off_nadir_deg"].values:
@@ -150,9 +145,9 @@ STUDIES = {
         "estimate",
         "waveforms:plot_components",
         "describe_estimate",
-        """Estimate the waveforms in one second, over a level sea and without targets.
+        """Estimate the waveforms in about a second, over a level sea.
 
-        Lidar equation with sampled forward scattering: a first look, and a second opinion on a render.
+        Looks up the light in maps of the beam: a first look, and a second opinion on a render.
         """,
     ),
     "bounds": _study(

@@ -71,12 +71,8 @@ def open_file(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a regular file for reading; a link to one, too.
 
     Every reader of a file that a user or another file names opens it here, or gives a library that takes a path a
-    `check_regular` path: a named pipe or a device would wait for ever, or never end.
-
-    Raises
-    ------
-    UserError
-        If there is no such file, or it cannot be opened, or is a folder, a named pipe, a device or a socket.
+    `check_regular` path: a named pipe or a device would wait for ever, or never end. Raises `UserError` if there is no
+    such file, or it cannot be opened, or is a folder, a named pipe, a device or a socket.
     """
     # Before it is opened, which may act on a device; and again, since another file may have come in its place.
     check_regular(path)
@@ -161,10 +157,7 @@ def _check_mode(path: str | os.PathLike[str], mode: int) -> None:
 def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
     """Return the text of a file in UTF-8, without a byte order mark.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, is not such a text, or is larger than `most_bytes`.
+    Raises `UserError` if the file cannot be read, is not such a text, or is larger than `most_bytes`.
     """
     try:
         with open_file(path) as file:
@@ -184,14 +177,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Within `together`, it replaces `path` at the end of that context. On any failure the temporary file is removed and
     `path` is unchanged. An interruption waits until the file is in its place; a second one counts as a failure.
-    Leftovers of killed processes in the folder are removed first.
-
-    Raises
-    ------
-    UserError
-        If the name cannot be encoded.
-    WriteError
-        If the operating system reports an error.
+    Leftovers of killed processes in the folder are removed first. Raises `UserError` if the name cannot be encoded.
+    Raises `WriteError` if the operating system reports an error.
     """
     path, moves = Path(path), _moves.get()
     check_encodable(path)
@@ -222,12 +209,8 @@ def together() -> Iterator[list[Path]]:
 
     Yields a list that holds their paths, in order, after the context; a context within another one joins it, and its
     list stays empty. On any failure the former files stay; only a process that is killed during the moves, which take
-    less than a millisecond, leaves some of them. An interruption waits until all files are in their places.
-
-    Raises
-    ------
-    WriteError
-        If the operating system reports an error.
+    less than a millisecond, leaves some of them. An interruption waits until all files are in their places. Raises
+    `WriteError` if the operating system reports an error.
     """
     written: list[Path] = []
     if _moves.get() is not None:

@@ -57,12 +57,7 @@ class DeferredInterrupt:
     An interruption during a pass would become a ``RuntimeError`` in the loop that Dr.Jit is recording, and one while
     files are written would lose a render. The context applies to Ctrl-C, and to the signals of
     `TerminationAsInterrupt`. The outermost of nested contexts defers. Outside the main thread, and with other handlers
-    for the signals, nothing changes.
-
-    Parameters
-    ----------
-    at_once
-        Whether to defer from the beginning; else from the first context inside this one.
+    for the signals, nothing changes. Without `at_once` it defers from the first context inside this one on.
     """
 
     #: Contexts that are entered, from the outermost one on, the handlers that they replace, and the signal that waits.

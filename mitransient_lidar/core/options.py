@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import re
 import textwrap
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -15,15 +16,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.progress import progress_of
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    in_range,
-    integer,
-    non_negative,
-    number_list,
-    positive,
-    relative_error,
-)
+from mitransient_lidar.core.validation import FloatArray, integer, number_list, number_within, relative_error
 
 #: Annotations as texts that may have an `Option`.
 _MAY_HAVE = re.compile(r"\w+$|Annotated\[")
@@ -34,55 +27,33 @@ _R = TypeVar("_R")
 #: Numbers in a list or an array, shape (N,).
 Numbers = Sequence[float] | FloatArray
 
-#: A number, or the word for one that is chosen.
-NumberOrAuto = float | Literal["auto"] | None
-
 
 @dataclass(frozen=True)
 class Option:
-    """Meaning and range of a parameter, in the annotation of a public function.
+    """Meaning and range of a parameter, in the annotation of a public function."""
 
-    Attributes
-    ----------
-    meaning
-        Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
-    low, high
-        Limits of a number, or of each number in a list; None where there is none. `low` itself is excluded if `above`.
-    unit
-        Unit of numbers.
-    ascending
-        Whether the numbers in a list must increase.
-    form
-        Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
-        they are.
-    flag
-        Option name in commands, where it differs from the parameter's name.
-    is_argument
-        Whether commands take it by its place.
-    """
-
-    meaning: str
+    meaning: str  #: Verb or quantity, without unit and range; may have several sentences, the last one without a stop.
+    #: Limits of a number, or of each number in a list; None where there is none. `low` itself is excluded if `above`.
     low: float | None = None
     high: float | None = None
-    unit: str = ""
+    unit: str = ""  #: Unit of numbers.
     above: bool = False
-    ascending: bool = False
+    ascending: bool = False  #: Whether the numbers in a list must increase.
+    #: Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
+    #: they are.
     form: str = ""
-    flag: str = ""
-    is_argument: bool = False
+    flag: str = ""  #: Option name in commands, where it differs from the parameter's name.
+    is_argument: bool = False  #: Whether commands take it by its place.
 
     def range(self) -> str:
         """Return the allowed numbers as text, empty without limits."""
         if self.low is None:
             return ""
+        low, high = _number(self.low), "" if self.high is None else _number(self.high)
         if self.above:
-            text = f"greater than {_number(self.low)}" + (
-                "" if self.high is None else f", at most {_number(self.high)}"
-            )
+            text = f"greater than {low}" + (f", at most {high}" if high else "")
         else:
-            text = (
-                f"at least {_number(self.low)}" if self.high is None else f"{_number(self.low)} to {_number(self.high)}"
-            )
+            text = f"{low} to {high}" if high else f"at least {low}"
         return text + ", ascending" * self.ascending
 
     def help(self) -> str:
@@ -98,21 +69,19 @@ class Option:
             return value
         if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
             return self._check_list(name, value)
-        if int in kinds:
-            assert isinstance(self.low, int)
-            assert isinstance(self.high, int)
-            return integer(name, value, self.low, self.high)
-        # Errors for other limits would state the range that these functions allow.
-        assert self.low == 0 or not (self.above or self.high is None)
-        assert not self.above or self.high in (None, 1)
-        if self.above:
-            return positive(name, value) if self.high is None else relative_error(name, value)
-        if self.high is None:
-            return non_negative(name, value)
-        return in_range(name, value, self.low, self.high)
+        return self.number(name, value, int in kinds)
+
+    def number(self, name: str, value: Any, whole: bool = False) -> float | int:
+        """Return a number, or a whole one; raise `UserError` if it is out of range."""
+        low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        if whole:
+            return integer(name, value, int(low), int(high))
+        if self.above and high == 1 and name.endswith("error"):
+            return relative_error(name, value)
+        return number_within(name, value, low, high, above=self.above)
 
     def _check_list(self, name: str, values: Any) -> list[float]:
-        numbers, low = number_list(name, values), np.float64(-np.inf if self.low is None else self.low)
+        numbers, low = number_list(name, values), self.low or 0
         inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
         if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
             raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")
@@ -144,6 +113,13 @@ Infrared = Annotated[
     bool, Option("Also render the instrument's infrared channel, whose -D parameters begin with infrared.")
 ]
 Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
+
+#: Meanings of arguments that are no options of commands, for the documentation.
+_COMMON = {
+    "params": Option("Values of the scene's parameters by name, as for `rendering.render.render`"),
+    "integrator": Option("Integrator instead of the scene's, as for `rendering.render.render`"),
+    "progress": Option("Called with a `rendering.passes.Progress` after every pass, render or case"),
+}
 
 #: Beginning of a receiver's meaning.
 RECEIVERS = (
@@ -179,12 +155,7 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     A notebook shows the progress of a function that has the parameter ``progress``, unless one is given.
 
     Its signature shows their types alone, and its documentation the options that it does not describe, for the help of
-    Python.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range; the sentence names the parameter.
+    Python. Raises `UserError` if a number is out of range; the sentence names the parameter.
     """
     signature, options = inspect.signature(function), declared(function)
 
@@ -192,7 +163,9 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
-            if name in options and not is_unset(value, signature.parameters[name].default):
+            default = signature.parameters[name].default
+            is_unset = (value is None and default is None) or (default == () and len(value) == 0)
+            if name in options and not is_unset:
                 kind, option = options[name]
                 given.arguments[name] = option.check(name, value, kind)
         if "progress" not in signature.parameters:
@@ -205,16 +178,21 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
         for name, one in signature.parameters.items()
     ]
     run.__signature__ = signature.replace(parameters=shown)  # type: ignore[attr-defined]
-    run.__doc__ = _documented(function.__doc__ or "", {name: option for name, (_, option) in options.items()})
+    meanings = {name: option for name, (_, option) in options.items()}
+    run.__doc__ = _documented(function.__doc__ or "", meanings, signature.parameters)
     return run
 
 
-def _documented(text: str, options: Mapping[str, Option]) -> str:
-    """Return a documentation whose section of parameters has all options; those that it describes stay."""
+def _documented(text: str, options: Mapping[str, Option], names: Iterable[str]) -> str:
+    """Return a documentation whose section of parameters has all options, and others by their `names`.
+
+    Those that it describes stay.
+    """
     beginning, heading, rest = text.partition("Parameters\n    ----------\n")
     described, blank, end = rest.partition("\n\n")
     known = {name for line in described.splitlines() if line[4:5].strip() for name in re.findall(r"\w+", line)}
-    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in options.items() if name not in known]
+    listed = {**options, **{name: _COMMON[name] for name in names if name in _COMMON}}
+    added = [f"\n    {name}\n{_indented(option.help())}" for name, option in listed.items() if name not in known]
     return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
 
 
@@ -229,11 +207,6 @@ def documented_parameters(text: str, options: Mapping[str, Option]) -> str:
 
 def _indented(text: str) -> str:
     return textwrap.fill(text, 120, initial_indent=" " * 8, subsequent_indent=" " * 8)
-
-
-def is_unset(value: Any, default: Any) -> bool:
-    """Return whether a value is a default that needs no check: None, or an empty list."""
-    return (value is None and default is None) or (isinstance(default, tuple) and not default and len(value) == 0)
 
 
 def _is_list(kinds: tuple[Any, ...]) -> bool:

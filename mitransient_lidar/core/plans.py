@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, fields
-from math import inf
 from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 import numpy as np
@@ -12,12 +11,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.toml_files import check_keys, required, table
 from mitransient_lidar.core.options import Option, declared, documented_parameters, parts
-from mitransient_lidar.core.validation import (
-    finite_array,
-    integer,
-    number_within,
-    shown,
-)
+from mitransient_lidar.core.validation import finite_array, shown
 
 _P = TypeVar("_P", bound="Plan")
 
@@ -53,21 +47,9 @@ class Plan:
     def of(cls, given: object, where: str = "", prefix: str = "", **others: Any) -> Self:
         """Return the object for a table in a file.
 
-        Parameters
-        ----------
-        given
-            The table.
-        where
-            Name of the table in messages, such as ``[design]``.
-        prefix
-            Beginning of value names in messages, such as ``design.``.
-        others
-            Fields that are no keys.
-
-        Raises
-        ------
-        UserError
-            If it is no table, a key is unknown or missing, or a value is not allowed.
+        In messages the table is `where`, such as ``[design]``, and names of values begin with `prefix`, such as
+        ``design.``. `others` are fields that are no keys. Raises `UserError` if it is no table, a key is unknown or
+        missing, or a value is not allowed.
         """
         where = where or f"[{cls.__name__.lower()}]"
         values = table(where, given)
@@ -113,7 +95,7 @@ def _checked(field: Field[Any], value: Any, name: str, kind: Any, option: Option
     if int in kinds or float in kinds:
         if words and (isinstance(value, (bool, str)) or not isinstance(value, (int, float, np.number))):
             raise UserError(f"{name} = {shown(value)} must be a number or {' or '.join(words)}")
-        return _number(name, value, option, int in kinds)
+        return option.number(name, value, int in kinds)
     return one_of(name, value, words) if words else _composed(name, value, kinds[0], option)
 
 
@@ -140,14 +122,4 @@ def _list(name: str, value: Any, kinds: tuple[Any, ...], option: Option) -> tupl
     ends = finite_array(name, value)
     if ends.ndim != 1 or (Ellipsis not in kinds and ends.size != len(kinds)):
         raise UserError(f"{name} = {shown(value)} must be {option.form or 'a list of numbers'}")
-    return tuple(_number(name, end, option, False) for end in ends.tolist())
-
-
-def _number(name: str, value: Any, option: Option, whole: bool) -> float | int:
-    """Return a number within an `Option`'s limits."""
-    low, high = option.low, option.high
-    if whole:
-        assert isinstance(low, int)
-        assert isinstance(high, int)
-        return integer(name, value, low, high)
-    return number_within(name, value, -inf if low is None else low, inf if high is None else high, above=option.above)
+    return tuple(option.number(name, end) for end in ends.tolist())

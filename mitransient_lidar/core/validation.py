@@ -41,10 +41,7 @@ def finite(name: str, value: object) -> float:
 
 def positive(name: str, value: object) -> float:
     """Return `value` as a float above 0."""
-    number = finite(name, value)
-    if number <= 0:
-        raise UserError(f"{name} = {number:g} must be greater than 0")
-    return number
+    return number_within(name, value, 0, above=True)
 
 
 def non_negative(name: str, value: object) -> float:
@@ -130,10 +127,7 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
 def number_list(name: str, given: object) -> FloatArray:
     """Return one number, a sequence, or a text with numbers separated by commas or spaces, shape (N,), N > 0.
 
-    Raises
-    ------
-    UserError
-        If there is no number, an entry is empty or not a number, or a number is not finite.
+    Raises `UserError` if there is no number, an entry is empty or not a number, or a number is not finite.
     """
     values: Any = given
     if isinstance(given, str):

@@ -82,10 +82,7 @@ _FIRST = (
 def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result's attributes, checked, with ``title``, ``source`` and ``history`` added.
 
-    Raises
-    ------
-    ValueError
-        If an attribute is no int, float, str or list of one of those.
+    Raises `ValueError` if an attribute is no int, float, str or list of one of those.
     """
     return {
         "Conventions": "CF-1.11",
@@ -124,10 +121,7 @@ def shown(attributes: Mapping[str, Any]) -> dict[str, Any]:
 def attribute(name: str, value: Any) -> int | float | str | list[int] | list[float] | list[str]:
     """Convert an attribute to a Python type that both file formats return unchanged.
 
-    Raises
-    ------
-    ValueError
-        If it is no int, float, str or list of one of those.
+    Raises `ValueError` if it is no int, float, str or list of one of those.
     """
     if isinstance(value, (tuple, list, np.ndarray)):
         items = [attribute(name, item) for item in value]

@@ -37,11 +37,7 @@ _NAMED_PIXELS = 5  # largest number of pixels listed in a warning
 
 
 def build(
-    impulse_response: npt.ArrayLike,
-    impulse_response_stderr: npt.ArrayLike,
-    waveform: npt.ArrayLike,
-    waveform_stderr: npt.ArrayLike,
-    *,
+    *arrays: npt.ArrayLike,
     time: TimeAxis,
     pixel_names: Sequence[str],
     pixel_centres_mrad: npt.ArrayLike,
@@ -50,14 +46,14 @@ def build(
 ) -> xr.Dataset:
     """Label a render's arrays as a result.
 
-    Non-finite values are kept; a warning lists their pixels.
+    Non-finite values are kept; a warning lists their pixels. Raises `ValueError` if names repeat, a number is out of
+    range or an attribute has an unsupported type.
 
     Parameters
     ----------
-    impulse_response, impulse_response_stderr : array-like of shape (pixel, time)
-        Received energy and its standard error [J per bin].
-    waveform, waveform_stderr : array-like of shape (pixel, time)
-        Received power after the pulse and the receiver's response, and its standard error [W].
+    arrays : array-like of shape (pixel, time)
+        Received energy and its standard error [J per bin], and received power after the pulse and the receiver's
+        response and its standard error [W].
     time : TimeAxis
         The time bins.
     pixel_names : sequence of str
@@ -68,36 +64,22 @@ def build(
         Rows and columns of an imager, with pixels in row-major order.
     attributes : mapping of str to int, float, str or a list of those
         Parameters and outcome of the render; they override the attributes set here (``title``, ``history``, ...).
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, names repeat, a number is out of range or an attribute has an unsupported type.
     """
-    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
-    values = {name: np.array(array, dtype=np.float64) for name, array in zip(LIGHT, arrays, strict=True)}
-    shape = values["impulse_response"].shape
-    if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"impulse_response has shape {shape}; it must be (pixel, time) with at least one of each.")
-    for name, array in values.items():
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}; it must be that of impulse_response, {shape}.")
-    if time.bin_count != shape[1]:
-        raise ValueError(f"time has {time.bin_count} bins; it must have those of impulse_response, {shape[1]}.")
-    centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
-    if centres.shape != (shape[0], 2) or not np.isfinite(centres).all():
-        raise ValueError(
-            f"pixel_centres_mrad must be {shape[0]} finite pairs (angle_x, angle_y), but has shape {centres.shape}."
-        )
     bins = {"time_start_ns": finite("time_start_ns", time.start_ns)}
     bins["bin_width_ns"] = positive("bin_width_ns", time.bin_width_ns)
-
-    coords = pixel_coordinates(pixel_names, centres, grid)
+    coords = pixel_coordinates(pixel_names, pixel_centres_mrad, grid)
     dims, layout = coords["angle_x"][0], coords["angle_x"][1].shape
     coords["time"] = ("time", time.centres_ns)
-    names = coords["pixel"][1].tolist() if grid is None else [str(divmod(i, grid[1])) for i in range(shape[0])]
-    _warn_of_non_finite(values, names)
-    data = {name: ((*dims, "time"), array.reshape(*layout, -1)) for name, array in values.items()}
+    data = {}
+    for name, array in zip(LIGHT, arrays, strict=True):
+        values = np.array(array, dtype=np.float64)
+        counts = np.count_nonzero(~np.isfinite(values), axis=1)
+        if affected := np.flatnonzero(counts).tolist():
+            names = coords["pixel"][1] if grid is None else list(np.ndindex(grid))
+            pixels = ", ".join(f"{names[index]}: {counts[index]}" for index in affected[:_NAMED_PIXELS])
+            more = f" and {len(affected) - _NAMED_PIXELS} more pixels" if len(affected) > _NAMED_PIXELS else ""
+            _LOG.warning("%s has non-finite values in pixel %s%s", name, pixels, more)
+        data[name] = ((*dims, "time"), values.reshape(*layout, -1))
     return label(xr.Dataset(data, coords, provenance({**bins, **attributes})))
 
 
@@ -116,14 +98,8 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
 def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.ArrayLike) -> xr.Dataset:
     """Return a result from `build` or `build_series` with its light by origin.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    origins : sequence of str
-        Unique origin names.
-    arrays : array-like of shape (pixel, origin, time)
-        The four arrays of `build` for each origin; in a series with the shots first.
+    Arrays are the four of `build`, shape (pixel, origin, time), in a series with the shots first; names of origins are
+    unique.
     """
     values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
     added = _add(dataset, "by_origin", "{}, by origin", {"origin": np.array(origins, dtype=str)}, values)
@@ -163,14 +139,7 @@ def add_derivatives(
 def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
     """Return a result from `build` with each pass batch's mean power, ``waveform_batch`` [W].
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    passes : sequence of int
-        Passes per batch.
-    waveforms : array-like of shape (batch, pixel, time)
-        Mean power in these passes [W].
+    `waveforms` have the shape (batch, pixel, time), and `passes` are the numbers of passes per batch.
     """
     waveform = dataset["waveform"]
     values = np.asarray(waveforms, dtype=np.float64).reshape(len(passes), *waveform.shape)
@@ -208,10 +177,8 @@ def _add(
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
     """Return the dimensions of a variable, (pixel, time) or (row, column, time), with `shots` also after ``shot``.
 
-    Raises
-    ------
-    UserError
-        If the variable or a coordinate is missing, the dimensions are others or empty, or the times are invalid.
+    Raises `UserError` if the variable or a coordinate is missing, the dimensions are others or empty, or the times are
+    invalid.
     """
     if name not in dataset:
         raise UserError(f"the dataset has no variable {name}: it must be a result with a record in time")
@@ -229,13 +196,9 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
 def time_axis(dataset: xr.Dataset) -> TimeAxis:
     """Return a dataset's time bins.
 
-    They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with
-    them, else from the coordinate, as after a selection of bins.
-
-    Raises
-    ------
-    UserError
-        If the dataset has no coordinate ``time``, or a single bin of unknown width.
+    They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with them,
+    else from the coordinate, as after a selection of bins. Raises `UserError` if the dataset has no coordinate
+    ``time``, or a single bin of unknown width.
     """
     if "time" not in dataset.coords:
         raise UserError("the dataset has no coordinate time")
@@ -257,12 +220,7 @@ def pixel_coordinates(
 ) -> dict[str, Any]:
     """Return pixel coordinates: their names, or rows and columns, and their centres angle_x and angle_y.
 
-    Arguments as for `build`.
-
-    Raises
-    ------
-    ValueError
-        If names repeat, or the number of names or grid cells differs from the number of centres.
+    Arguments as for `build`. Raises `ValueError` if names repeat, or their number differs from that of the centres.
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)
@@ -273,9 +231,6 @@ def pixel_coordinates(
             raise ValueError(f"pixel_names = {names} must be {count} different names, one a pixel.")
         coords = {"pixel": ("pixel", np.array(names, dtype=str), described("pixel"))}
     else:
-        rows, columns = grid
-        if rows < 1 or columns < 1 or rows * columns != count:
-            raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
         coords = {
             dim: (dim, np.arange(size), described(dim)) for dim, size in zip(("row", "column"), grid, strict=True)
         }
@@ -306,12 +261,3 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
             f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly"
         )
     check_coordinates(place, dataset, name)
-
-
-def _warn_of_non_finite(values: Mapping[str, npt.NDArray[np.float64]], names: Sequence[str]) -> None:
-    for variable, array in values.items():
-        counts = np.count_nonzero(~np.isfinite(array), axis=1)
-        if affected := np.flatnonzero(counts).tolist():
-            pixels = ", ".join(f"{names[index]}: {counts[index]}" for index in affected[:_NAMED_PIXELS])
-            more = f" and {len(affected) - _NAMED_PIXELS} more pixels" if len(affected) > _NAMED_PIXELS else ""
-            _LOG.warning("%s has non-finite values in pixel %s%s", variable, pixels, more)

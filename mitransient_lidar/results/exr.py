@@ -70,16 +70,10 @@ class _Images(NamedTuple):
     header: dict[str, str]  #: Header attribute for each coordinate over the dimension.
 
 
+_OF_GATES = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IMAGES = {
-    "gates": _Images(
-        "gate",
-        3,
-        {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"},
-        {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"},
-    ),
-    "frames": _Images(
-        "gate", 3, {}, {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
-    ),
+    "gates": _Images("gate", 3, {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}, _OF_GATES),
+    "frames": _Images("gate", 3, {}, _OF_GATES),
     "radiance": _Images("frame", 4, {"radiance": "Y", "radiance_stderr": "Y.stderr"}, {"time_s": "timeS"}),
 }
 
@@ -100,10 +94,8 @@ class Part(NamedTuple):
 def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
     """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts for a file, or for a sequence of files.
 
-    Raises
-    ------
-    UserError
-        If the dataset has variables that the file cannot store, or so many channels do not fit into the memory.
+    Raises `UserError` if the dataset has variables that the file cannot store, or so many channels do not fit into the
+    memory.
     """
     types = {name: dataset[name].dtype.name for name in _OF_FRAMES if name in dataset}
     if content == "frames":
@@ -196,16 +188,11 @@ def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
     names = sorted(channels)
     advice = "take fewer or wider bins, or a .nc file"
     require_memory(f"{len(names)} channels of an EXR file", _BYTES_PER_CHANNEL * len(names), advice)
-    several = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
+    chosen = [names[first : first + _MOST_CHANNELS] for first in range(0, len(names), _MOST_CHANNELS)]
+    several = [{name: channels[name] for name in part} for part in chosen]
     shared = {**_header(readable), _EXACT: json.dumps(exact)}
-    return [
-        Part(
-            chosen[0] if len(several) > 1 else "",
-            {} if number else shared,
-            {name: channels[name] for name in chosen},
-        )
-        for number, chosen in enumerate(several)
-    ]
+    one = len(several) == 1
+    return [Part("" if one else next(iter(own)), {} if i else shared, own) for i, own in enumerate(several)]
 
 
 def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any], kind: _Images) -> list[Part]:
@@ -244,12 +231,8 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
     """Write a gate stack as numbered files in a folder, one per gate: ``<stem>_gate000.exr`` and so on.
 
     The folder is created if it is missing, and existing files of the same names are replaced. The first file is written
-    last, so that `read` rejects an interrupted sequence.
-
-    Raises
-    ------
-    UserError
-        If `stem` is no file name, or a file cannot be written.
+    last, so that `read` rejects an interrupted sequence. Raises `UserError` if `stem` is no file name, or a file cannot
+    be written.
     """
     if not stem or Path(stem).name != stem:
         raise UserError(f"stem = {stem!r} must be the start of a file name, without folders")
@@ -271,19 +254,15 @@ def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
 def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
     """Write one or more images into one file, which is overwritten if it exists.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises `OSError` if the file cannot be written.
     """
     kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
-        with OpenEXR.File(
-            [
-                OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
-                for part in parts
-            ]
-        ) as file:
+        stored = [
+            OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
+            for part in parts
+        ]
+        with OpenEXR.File(stored) as file:
             file.write(os.fspath(path))
     except RuntimeError as error:
         raise OSError(str(error)) from error
@@ -292,10 +271,7 @@ def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
 def read(path: Path) -> xr.Dataset:
     """Read a dataset from a file, the first file of a sequence, or a folder with one sequence.
 
-    Raises
-    ------
-    UserError
-        If a file is missing, damaged or truncated, or was not written by this package.
+    Raises `UserError` if a file is missing, damaged or truncated, or was not written by this package.
     """
     if path.is_dir():
         path = _first_of_folder(path)
@@ -304,7 +280,10 @@ def read(path: Path) -> xr.Dataset:
     if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
         first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
         raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}")
-    exact = exact_metadata(path, parts[0].attributes)
+    text = parts[0].attributes.get(_EXACT, "null")
+    exact = parse_json(text, f"the header attribute {_EXACT} of {path}")
+    if not isinstance(exact, dict):
+        raise UserError(f"{path} is an OpenEXR file, but not a result of mitransient-lidar.")
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
         images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)
@@ -397,11 +376,8 @@ def _first_of_folder(folder: Path) -> Path:
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
     """Read all images in a file.
 
-    Raises
-    ------
-    UserError
-        If the file is damaged, truncated, or larger than half of the memory, or a part has another checksum than its
-        own. Files by other programs have none.
+    Raises `UserError` if the file is damaged, truncated, or larger than half of the memory, or a part has another
+    checksum than its own. Files by other programs have none.
     """
     check_exr(path, _damaged(path), largest_result())
     with damaged_file(_damaged(path)), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
@@ -424,23 +400,6 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
         if part.attributes.get(_CHECKSUM, checksum) != checksum:
             raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written")
     return parts
-
-
-def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a part's exact metadata.
-
-    Raises
-    ------
-    UserError
-        If they are missing or damaged.
-    """
-    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
-    if _EXACT not in attributes:
-        raise UserError(foreign)
-    exact = parse_json(attributes[_EXACT], f"the header attribute {_EXACT} of {path}")
-    if not isinstance(exact, dict):
-        raise UserError(foreign)
-    return exact
 
 
 def _header(readable: Mapping[str, Any]) -> dict[str, Any]:

@@ -152,27 +152,16 @@ def kinds_of(dataset: xr.Dataset) -> set[str]:
     return found - {"signals" if has_frames(dataset) else "frames"}
 
 
-def dataset_of(name: str, given: Given, *kinds: str) -> xr.Dataset:
-    """Return a dataset that is given itself, or by its file's path.
+def dataset_of(name: str, given: Given, *kinds: str, **selection: Any) -> xr.Dataset:
+    """Return a dataset of one of the kinds from `kinds_of`, given itself, or by its path for `open` with `selection`.
 
-    Parameters
-    ----------
-    name
-        Parameter name, for messages.
-    given
-        The dataset, or a path for `open`.
-    kinds
-        Kinds from `kinds_of`, of which it must be one.
-
-    Raises
-    ------
-    UserError
-        If it is neither, or of none of these kinds, or the file cannot be read.
+    Raises `UserError`, with the parameter's name, if it is neither, or of none of these kinds, or the file cannot be
+    read.
     """
     if isinstance(given, xr.Dataset):
         dataset, place = given, name
     elif isinstance(given, (str, os.PathLike)) and str(given):
-        dataset, place = open(given), str(given)
+        dataset, place = open(given, **selection), str(given)
     else:
         raise UserError(f"{name} = {shown(given)} must be a dataset with {_listed(kinds)}, or the path of its file")
     found = kinds_of(dataset)

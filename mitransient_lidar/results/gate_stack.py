@@ -88,21 +88,16 @@ def train_from_options(
     start = start_ns
     if start_depth_m is not None:
         start = float(lidar_geometry(attributes, surface="level").time_of_depth(start_depth_m))
+    elif start_range_m is not None and (optional_number(attributes, "altitude") or 0.0) < 0:  # under water
+        start = range_time_ns(start_range_m, 0.0, required_number(attributes, "group_index"))
     elif start_range_m is not None:
-        start = _time_of_range(attributes, start_range_m)
+        geometry = lidar_geometry(attributes, surface="level")
+        start = range_time_ns(start_range_m, geometry.slant_range, geometry.group_index)
     assert start is not None
     shape = GateShape.edges(width_ns, rise_ns, fall_ns) if width_ns else GateShape.from_file(str(profile_file))
     return GateTrain.measured(
         shape.jittered(jitter_ns), start, shape.width_ns if step_ns is None else step_ns, count, pulses
     )
-
-
-def _time_of_range(attributes: Mapping[str, Any], slant_range: float) -> float:
-    """Return when echoes arrive from a range on the axis of a lidar, over water or under it [ns]."""
-    if (optional_number(attributes, "altitude") or 0.0) < 0:
-        return range_time_ns(slant_range, 0.0, required_number(attributes, "group_index"))
-    geometry = lidar_geometry(attributes, surface="level")
-    return range_time_ns(slant_range, geometry.slant_range, geometry.group_index)
 
 
 def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
@@ -121,22 +116,11 @@ def build_gates(
     coords: Mapping[Any, Any],
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Label the energies in gates as a gate stack.
+    """Label the energies in gates, summed over their pulses, and their standard errors [J] as a gate stack.
 
-    Parameters
-    ----------
-    energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
-        Energy in each gate, summed over its pulses, and its standard error [J]. The pixels of an imager may be in one
-        axis, in row-major order. With the coordinate ``frame`` that dimension is first.
-    train : GateTrain
-        The gates.
-    coords, attributes : mapping
-        Coordinates and attributes of a result; the coordinate ``time`` is ignored.
-
-    Raises
-    ------
-    UserError
-        If the energies have another shape.
+    They have the shape (row, column, gate) or (pixel, gate). The pixels of an imager may be in one axis, in row-major
+    order. With the coordinate ``frame`` that dimension is first. Coordinates and attributes are those of a result; the
+    coordinate ``time`` is ignored. Raises `UserError` if the energies have another shape.
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
@@ -174,12 +158,7 @@ def build_gates(
 def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.ArrayLike) -> xr.Dataset:
     """Return a gate stack from `build_gates` with the derivatives of its energies by parameters.
 
-    Parameters
-    ----------
-    stack : xarray.Dataset
-        The gate stack.
-    slopes, stderr : array-like of shape (parameter, pixel, gate)
-        Derivative of each gate's energy, in J per unit of the parameter, and its standard error.
+    The derivatives and their standard errors are in J per unit of the parameter, shape (parameter, pixel, gate).
     """
     energy = stack["gate_energy"]
     arrays = {
@@ -235,12 +214,8 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
     """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
-    Several frames give their mean, `average_frames`.
-
-    Raises
-    ------
-    UserError
-        If it has no gates, or dimensions other than (row, column, gate) or (pixel, gate); `place` names it.
+    Several frames give their mean, `average_frames`. Raises `UserError` if it has no gates, or dimensions other than
+    (row, column, gate) or (pixel, gate); `place` names it.
     """
     if missing := [name for name in ("gate_energy", "gate_energy_stderr") if name not in dataset]:
         raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}")
@@ -264,27 +239,23 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
     return stack.transpose(..., *pixels, "gate")
 
 
-def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
+def as_stack(dataset: xr.Dataset) -> xr.Dataset:
     """Return gates to draw and to analyse as a gate stack, with a name and unit for ``gate_energy`` in its attributes.
 
     Camera frames become their mean above the dark level [DN], with this mean's standard error; a stack with a sea for
-    each frame becomes the mean over the frames.
-
-    Raises
-    ------
-    UserError
-        As for `check_stack`.
+    each frame becomes the mean over the frames. Raises `UserError` as for `check_stack`.
     """
     if not has_frames(dataset):
-        stack = check_stack(dataset, place)
+        stack = check_stack(dataset)
         stack["gate_energy"].attrs |= {"long_name": "energy in the gate", "units": "J"}
         return stack
     mean = dataset["signal"].mean("frame")
     deviation = np.sqrt((dataset["signal_deviation"] ** 2).mean("frame" if "frame" in dataset["snr"].dims else ()))
-    stack = _without_frames(dataset).assign(
-        gate_energy=mean - dataset["dark_level"], gate_energy_stderr=deviation / math.sqrt(dataset.sizes["frame"])
-    )
-    stack = check_stack(stack.assign_attrs(dataset.attrs), place)
+    coords = {name: one for name, one in dataset.coords.items() if name != "frame"}
+    coords = {name: one.mean("frame") if "frame" in one.dims else one for name, one in coords.items()}
+    energy: dict[str, Any] = {"gate_energy": mean - dataset["dark_level"]}
+    energy["gate_energy_stderr"] = deviation / math.sqrt(dataset.sizes["frame"])
+    stack = check_stack(xr.Dataset(coords=coords).assign(energy).assign_attrs(dataset.attrs))
     stack["gate_energy"].attrs |= {"long_name": "signal above the dark level", "units": "DN"}
     return stack
 
@@ -292,10 +263,3 @@ def as_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Datase
 def has_frames(dataset: xr.Dataset) -> bool:
     """Return whether a dataset has frames of a camera: a signal over gates. A record in time may have gates beside."""
     return "signal" in dataset and "gate" in dataset["signal"].dims
-
-
-def _without_frames(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the coordinates and attributes of a dataset over frames, with means for those over the gates."""
-    coords = {name: one for name, one in dataset.coords.items() if name != "frame"}
-    means = {name: one.mean("frame") if "frame" in one.dims else one for name, one in coords.items()}
-    return xr.Dataset(coords=means, attrs=dataset.attrs)

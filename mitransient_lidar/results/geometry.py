@@ -26,7 +26,6 @@ from mitransient_lidar.results.variables import described
 
 Attributes = Mapping[str, Any]
 
-
 #: Decimals kept in the coordinates of `LinesOfSight`.
 _SIGHT = {
     **{"sight_x": 6, "sight_y": 6, "off_nadir": 7, "surface_time": 6, "surface_spread": 6},
@@ -36,49 +35,28 @@ _SIGHT = {
 
 @dataclass(frozen=True)
 class LinesOfSight:
-    """Pixel lines of sight over a level sea: arrays with one shape, such as (pixels,).
+    """Pixel lines of sight over a level sea: arrays with one shape, such as (pixels,)."""
 
-    Attributes
-    ----------
-    sight_x, sight_y
-        Tangent-plane angles about the receiver's axis [rad].
-    off_nadir
-        Angle from the vertical in air [rad].
-    surface_time, surface_spread
-        Echo arrival from the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's direct
-        light.
-    depth_per_ns
-        Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one location.
-    beam_share
-        Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
-    """
-
+    #: Tangent-plane angles about the receiver's axis [rad].
     sight_x: FloatArray
     sight_y: FloatArray
-    off_nadir: FloatArray
+    off_nadir: FloatArray  #: Angle from the vertical in air [rad].
+    #: Echo arrival from the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's direct
+    #: light.
     surface_time: FloatArray
     surface_spread: FloatArray
+    #: Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one location.
     depth_per_ns: FloatArray
-    beam_share: FloatArray
+    beam_share: FloatArray  #: Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset, dims: tuple[str, ...] | None = None) -> LinesOfSight:
         """Read the lines of sight in a result or gate stack.
 
         Without their coordinates, they go to the pixel centres, with the mean arrival in the attribute
-        ``surface_time_ns`` if it is known.
-
-        Parameters
-        ----------
-        dataset
-            A dataset over ``pixel``, or ``row`` and ``column``.
-        dims
-            Dimensions of the arrays, flattened to one; by default the pixels' own.
-
-        Raises
-        ------
-        UserError
-            If coordinates and attributes do not determine the geometry.
+        ``surface_time_ns`` if it is known. Arrays have the dimensions `dims`, flattened to one, by default those of the
+        pixels: ``pixel``, or ``row`` and ``column``. Raises `UserError` if coordinates and attributes do not determine
+        the geometry.
         """
         if dims is None:
             dims = ("row", "column") if "row" in dataset.dims else ("pixel",)
@@ -127,7 +105,7 @@ class LinesOfSight:
         """Return the line of sight for the pixel sum, weighted with the beam, shape (1,)."""
         known = np.isfinite(self.beam_share).all() and self.beam_share.sum() > 0
         weight = (
-            self.beam_share / self.beam_share.sum() if known else np.full(self.off_nadir.shape, 1 / self.off_nadir.size)
+            self.beam_share / self.beam_share.sum() if known else np.ones(self.off_nadir.shape) / self.off_nadir.size
         )
         mean = {name: np.array([np.sum(weight * values)]) for name, values in vars(self).items()}
         apart = np.sum(weight * (self.surface_time - mean["surface_time"]) ** 2)
@@ -166,19 +144,11 @@ class LinesOfSight:
 def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
     """Read a lidar's geometry from a result's attributes.
 
-    Parameters
-    ----------
-    attributes
-        ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally, ``surface_time_ns``,
-        the mean arrival over the pixels.
-    surface
-        Surface echo time: ``measured`` is ``surface_time_ns``, ``level`` the time of the mean sea level on the axis,
-        ``any`` the first of these that is known.
-
-    Raises
-    ------
-    UserError
-        If an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under water.
+    They are ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally,
+    ``surface_time_ns``, the mean arrival over the pixels. This is the surface echo time if `surface` is ``measured``;
+    with ``level``, it is that of the mean sea level on the axis, and with ``any`` the first of these that is known.
+    Raises `UserError` if an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under
+    water.
     """
     if surface == "measured":
         required_number(attributes, "surface_time_ns")
@@ -195,16 +165,14 @@ def lidar_system(attributes: Attributes, efficiency: float | None = None) -> Lid
     """Return the lidar equation's system, with the whole beam's energy and the open aperture area.
 
     The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default it is
-    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
-
-    Raises
-    ------
-    UserError
-        If the efficiency is out of range or unknown, or another attribute is missing.
+    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see. Raises
+    `UserError` if the efficiency is out of range or unknown, or another attribute is missing.
     """
     energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
     geometry = lidar_geometry(attributes)
-    return LidarSystem(**vars(geometry), energy=energy, aperture_area=open_aperture(attributes))
+    blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
+    area = required_number(attributes, "aperture_area") * (1 - blocked)
+    return LidarSystem(**vars(geometry), energy=energy, aperture_area=area)
 
 
 def spot_diameter(attributes: Attributes) -> float:
@@ -223,12 +191,6 @@ def _columns(values: FloatArray, dimensions: int) -> FloatArray:
     return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
-def open_aperture(attributes: Attributes) -> float:
-    """Return the area of the aperture [m^2] that is not obscured: ``aperture_area`` times 1 - ``obscuration``."""
-    blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
-    return required_number(attributes, "aperture_area") * (1 - blocked)
-
-
 def share_in_view(dataset: xr.Dataset) -> FloatArray:
     """Return the share of the beam's energy in all pixels of a result over ``pixel``, shape () or (shots,).
 
@@ -240,15 +202,10 @@ def share_in_view(dataset: xr.Dataset) -> FloatArray:
         share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
         if np.isfinite(share).all():
             return share
-    return np.asarray(_gaussian_share(dataset.attrs))
-
-
-def _gaussian_share(attributes: Attributes) -> float:
-    """Return the share of a Gaussian beam inside a field of view about its axis, without gaps between pixels."""
-    half = required_number(attributes, "field_of_view_mrad") / required_number(attributes, "divergence_mrad")
-    if attributes.get("field_of_view_shape", "circle") == "circle":
-        return 1 - math.exp(-0.5 * half**2)
-    return math.erf(half / math.sqrt(2)) ** 2
+    half = required_number(dataset.attrs, "field_of_view_mrad") / required_number(dataset.attrs, "divergence_mrad")
+    if dataset.attrs.get("field_of_view_shape", "circle") == "circle":
+        return np.asarray(1 - math.exp(-0.5 * half**2))
+    return np.asarray(math.erf(half / math.sqrt(2)) ** 2)
 
 
 def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:

@@ -31,10 +31,8 @@ _LARGEST_TIFF = 4e9  # bytes, with 32-bit offsets
 def write(dataset: xr.Dataset, path: Path) -> list[Path]:
     """Write gates or frames as one TIFF file or as numbered PNG files, and return their paths.
 
-    Raises
-    ------
-    UserError
-        If the dataset has neither, a number of a frame exceeds 16 bits, or a TIFF file would exceed 4 GB.
+    Raises `UserError` if the dataset has neither, a number of a frame exceeds 16 bits, or a TIFF file would exceed 4
+    GB.
     """
     from PIL import Image, PngImagePlugin
 

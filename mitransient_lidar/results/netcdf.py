@@ -40,14 +40,8 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
     It goes by way of memory, because HDF5 ends the process where the disk is full. Signals behind a converter are
-    written as its codes.
-
-    Raises
-    ------
-    ValueError
-        If an attribute is no number, text or list of one of these.
-    OSError
-        If the file cannot be written.
+    written as its codes. Raises `ValueError` if an attribute is no number, text or list of one of these. Raises
+    `OSError` if the file cannot be written.
     """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
@@ -125,27 +119,20 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
 def read(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
     """Read a NetCDF-4 file into memory, and return whether another program than `write` has written it.
 
-    Raises
-    ------
-    UserError
-        If the file is damaged, truncated, or larger than half of the memory.
+    Raises `UserError` if the file is damaged, truncated, or larger than half of the memory.
     """
+    import h5py
+
     damaged = f"{path} is damaged or truncated: its NetCDF data cannot be read."
     check_sum(path)
     with damaged_file(damaged):
         check_hdf5(path)
     dataset, foreign = _group(path, None, damaged)
-    if not foreign and _has_infrared(path):
+    with h5py.File(path, "r") as file:
+        has_infrared = isinstance(file.get(INFRARED), h5py.Group)
+    if not foreign and has_infrared:
         dataset = join(dataset, _group(path, INFRARED, damaged)[0])
     return dataset, foreign
-
-
-def _has_infrared(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file has a group of the infrared channel."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return isinstance(file.get(INFRARED), h5py.Group)
 
 
 def _group(path: str | os.PathLike[str], group: str | None, damaged: str) -> tuple[xr.Dataset, bool]:

@@ -28,32 +28,20 @@ _CURVE = ("error_inflation_bins", "error_inflation")
 
 @dataclass(frozen=True)
 class BlockCorrelation:
-    """Correlation between bin errors, the same for all bins in two blocks.
+    """Correlation between bin errors, the same for all bins in two blocks."""
 
-    Attributes
-    ----------
-    correlation
-        Mean correlation between a bin in one block and a bin in another, shape (blocks, blocks); on the diagonal,
-        between different bins in a block.
-    block
-        Block of each bin, ascending, shape (time,).
-    inflation
-        Ratio of given errors to bin errors, shape () or (time,).
-    """
-
+    #: Mean correlation between a bin in one block and a bin in another, shape (blocks, blocks); on the diagonal,
+    #: between different bins in a block.
     correlation: FloatArray
-    block: np.ndarray[Any, np.dtype[np.intp]]
+    block: np.ndarray[Any, np.dtype[np.intp]]  #: Block of each bin, ascending, shape (time,).
+    #: Ratio of given errors to bin errors, shape () or (time,).
     inflation: FloatArray = field(default_factory=lambda: np.ones(()))
 
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
         """Return the covariances between k sums over the same bins, shape (..., k, k).
 
-        Parameters
-        ----------
-        scaled
-            Errors of neighbouring bins times their weights, shape (..., k, bins).
-        first
-            Number of their first bin in the record.
+        `scaled` are errors of neighbouring bins times their weights, shape (..., k, bins), from the bin `first` of the
+        record on.
         """
         part = slice(first, first + scaled.shape[-1])
         own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
@@ -87,28 +75,18 @@ class BlockCorrelation:
 
 @dataclass(frozen=True)
 class SumErrors:
-    """Correlation between bin errors, from a render's passes.
+    """Correlation between bin errors, from a render's passes."""
 
-    Attributes
-    ----------
-    shared
-        The correlation; None where only the curve is known, as from an EXR file.
-    curve
-        Numbers of bins, and the median ratios between their sums' errors and independent bins', shape (2, n); empty
-        where nothing is known.
-    """
-
-    shared: BlockCorrelation | None
+    shared: BlockCorrelation | None  #: The correlation; None where only the curve is known, as from an EXR file.
+    #: Numbers of bins, and the median ratios between their sums' errors and independent bins', shape (2, n); empty
+    #: where nothing is known.
     curve: FloatArray
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
         """Return a result's statement, None without one.
 
-        Raises
-        ------
-        UserError
-            If the result states another kind of correlation.
+        Raises `UserError` if the result states another kind of correlation.
         """
         curve = _curve(dataset.attrs)
         if VARIABLE not in dataset:
@@ -123,16 +101,9 @@ class SumErrors:
         return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:
-        """Return the standard error of a sum over weighted bins.
+        """Return the standard error of a weighted sum over neighbouring bins, from the bin `first` of the record on.
 
-        Parameters
-        ----------
-        deviation
-            Standard errors of neighbouring bins, shape (..., bins).
-        weights
-            Their weights, shape (bins,) or the shape of `deviation`.
-        first
-            Number of the first of them in the record.
+        Standard errors have the shape (..., bins), weights this one or (bins,).
         """
         scaled = deviation * weights
         if self.shared is None:

@@ -46,15 +46,8 @@ class PointClass(IntEnum):
 def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, Any]:
     """Return a variable's attributes ``units`` and ``long_name``, empty if it is not in the registry.
 
-    Parameters
-    ----------
-    name
-        Variable name; with ``_stderr``, ``_low`` or ``_high`` after another one's name, its standard error or a limit
-        of its interval.
-    kind
-        Dataset kind, whose entry ``kind.name`` goes first.
-    unit
-        Unit instead of the registry's, such as counts for signals.
+    ``_stderr``, ``_low`` or ``_high`` after another one's name is its standard error or a limit of its interval. For a
+    dataset kind, the entry ``kind.name`` goes first. `unit`, such as counts for signals, replaces the registry's.
     """
     for key in (f"{kind}.{name}", name):
         if key in VARIABLES:

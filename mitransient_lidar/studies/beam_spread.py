@@ -70,12 +70,8 @@ def beam_spread(
 
     Parameters
     ----------
-    scene, params, instrument
-        As for `rendering.render.render`.
     depths
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import os
@@ -14,20 +13,19 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
 from mitransient_lidar.analysis.jackknife import jackknife_error
-from mitransient_lidar.analysis.receiver import DENSEST, chain_of
+from mitransient_lidar.analysis.receiver import Gain, OpticalDensity, chain_of
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.options import (
     RECEIVERS,
     BackgroundPower,
     Instrument,
-    NumberOrAuto,
     Option,
     Scene,
     Seed,
     checked,
     positive_option,
 )
+from mitransient_lidar.core.tables.written import table_lines, write_csv
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
@@ -68,19 +66,8 @@ def bounds(
             form="NAME,NAME,...",
         ),
     ] = None,
-    gain: Annotated[
-        NumberOrAuto,
-        Option(
-            "Factor of the receiver's gain, or auto for the largest without saturation",
-            0,
-            above=True,
-            form="NUMBER|auto",
-        ),
-    ] = None,
-    optical_density: Annotated[
-        NumberOrAuto,
-        Option("Optical density of a filter, or auto for the least without saturation", 0, DENSEST, form="NUMBER|auto"),
-    ] = None,
+    gain: Gain = None,
+    optical_density: OpticalDensity = None,
     background_power_w: BackgroundPower = 0.0,
     nuisances: Annotated[
         Mapping[str, float] | None,
@@ -102,8 +89,6 @@ def bounds(
 
     Parameters
     ----------
-    scene, params, instrument
-        As for `rendering.render.render`.
     free
         Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
     over
@@ -122,8 +107,6 @@ def bounds(
         has the number of omitted designs, with a warning.
     seed
         Random seed, at least 0; all designs use the same random numbers.
-    progress
-        Called with a `passes.Progress` after every render.
 
     Returns
     -------
@@ -243,16 +226,12 @@ def write_table(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Columns are the design parameters, the free parameter with its value and unit, and bound, bound_stderr, bound_known,
     ratio and ratio_stderr; a bound that does not exist is inf, an unknown error nan.
     """
-    varied = [str(name) for name in found.coords if str(name).startswith("design_")]
+    names = {str(name): str(name).removeprefix("design_") for name in found.coords if str(name).startswith("design_")}
+    names |= {"parameter": "parameter", "parameter_value": "value", "parameter_units": "units"}
     numbers = ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")
-    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow((*(name.removeprefix("design_") for name in varied), "parameter", "value", "units", *numbers))
-        for place in itertools.product(range(found.sizes["design"]), range(found.sizes["parameter"])):
-            cell = found.isel(design=place[0], parameter=place[1])
-            own = [cell[name].item() for name in (*varied, "parameter")]
-            value, units = float(cell["parameter_value"]), cell["parameter_units"].item()
-            rows.writerow((*own, f"{value:.9g}", units, *(f"{float(cell[name]):.6g}" for name in numbers)))
+    frame = found.reset_coords()[[*numbers, *(set(names) - {"parameter"})]].to_dataframe(["design", "parameter"])
+    frame = frame.reset_index()[[*names, *numbers]].rename(columns=names)
+    write_csv(frame.assign(value=frame["value"].map("{:.9g}".format)), path, digits=6, unknown="nan")
 
 
 def describe_bounds(found: xr.Dataset) -> list[str]:
@@ -263,6 +242,8 @@ def describe_bounds(found: xr.Dataset) -> list[str]:
     """
     lines = []
     width = max(12, *(len(str(name)) for name in found["design"].values))
+    columns = [("  design", f"<{width + 2}"), ("bound", ">11.4g"), ("+-", ">10.2g"), ("others known", ">14.4g")]
+    columns += [("ratio", ">9.4g"), ("+-", ">8.2g")]
     for name in found["parameter"].values:
         one = found.sel(parameter=name)
         first = one.isel(design=0)
@@ -270,15 +251,12 @@ def describe_bounds(found: xr.Dataset) -> list[str]:
         known = f", known to {prior:g}" if math.isfinite(prior) else ""
         unit = first["parameter_units"].item()
         lines.append(f"{name} = {float(first['parameter_value']):g} {unit}{known}")
-        lines.append(f"  {'design':<{width}}{'bound':>11}{'+-':>10}{'others known':>14}{'ratio':>9}{'+-':>8}")
-        for place in np.argsort(one["bound"].values, kind="stable"):
-            row = one.isel(design=int(place))
-            cells = [float(row[key]) for key in ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")]
-            text = [
-                f"{value:>{size}.{digits}g}" if math.isfinite(value) else f"{'-':>{size}}"
-                for value, size, digits in zip(cells, (11, 10, 14, 9, 8), (4, 2, 4, 4, 2), strict=True)
-            ]
-            lines.append(f"  {row['design'].item():<{width}}{''.join(text)}")
+        order = np.argsort(one["bound"].values, kind="stable")
+        names = ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")
+        numbers = np.stack([one[key].values[order] for key in names], axis=1)
+        texts = [[value if math.isfinite(value) else "-" for value in row] for row in numbers]
+        designs = [f"  {design}" for design in one["design"].values[order]]
+        lines += table_lines(columns, ((design, *row) for design, row in zip(designs, texts, strict=True)))
     for design in found["design"].values:
         one = found.sel(design=design)
         said = one["remarks"].item().splitlines()

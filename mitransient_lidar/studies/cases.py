@@ -19,23 +19,8 @@ _Case = TypeVar("_Case")
 class Cases(Generic[_Case]):
     """Cases in a study, such as designs, depths or locations, one after the other.
 
-    Parameters
-    ----------
-    cases
-        The cases, and with their name in the plural in warnings, such as ``designs``.
-    unit, steps
-        Progress unit, and number of units per case.
-    max_time
-        Time after which no case begins [s], None for no limit. Those before the first kept result always do.
-    progress
-        Called after every step.
-
-    Attributes
-    ----------
-    begun, kept
-        Number of cases that have begun, and of kept results.
-    left
-        Time that was left when the case began [s], None without a limit.
+    Warnings have their name in the plural, such as ``designs``. A case has `steps` units of progress. None begins after
+    `max_time` [s], None for no limit; those before the first kept result always do.
     """
 
     def __init__(
@@ -48,11 +33,12 @@ class Cases(Generic[_Case]):
         max_time: float | None = None,
         progress: ProgressCallback | None = None,
     ) -> None:
-        self.cases, self.begun, self.kept = cases, 0, 0
+        self.cases = cases
+        self.begun, self.kept = 0, 0  #: Numbers of cases that have begun, and of kept results.
         self._name, self._unit, self._steps = name, unit, steps
         self._max_time, self._progress = max_time, progress
         self._start, self._done = time.perf_counter(), 0
-        self.left = max_time
+        self.left = max_time  #: Time that was left when the case began [s], None without a limit.
 
     def __iter__(self) -> Iterator[_Case]:
         """Return the cases that begin in time, and warn of the others."""

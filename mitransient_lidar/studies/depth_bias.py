@@ -27,6 +27,7 @@ from mitransient_lidar.analysis.waveforms.surface_times import check_surface
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS, Infrared, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -144,8 +145,6 @@ def depth_bias(
     max_time
         Time after which no sea is rendered [s], above 0; the first one always is. All numbers for omitted seas are NaN,
         and the attribute ``seas_left_out`` has their number.
-    progress
-        Called with a `passes.Progress` after every sea.
 
     Returns
     -------
@@ -196,7 +195,8 @@ def depth_bias(
     for place in seas:
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
         shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
-        if not _is_lost(shallower):
+        seen = [bool(np.any(cell["found"] > 0)) for cell in shallower]
+        if not any(seen) or seen[-1]:
             given = {
                 "wavelength_nm": _WAVELENGTH,
                 **(params or {}),
@@ -208,18 +208,9 @@ def depth_bias(
                 **({} if wind else {"spectrum": "flat"}),
             }
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
+            options |= {"instrument": instrument, "infrared": infrared, "seed": seed, "first_seed": seed}
             error = target_error * (1 if wind else _LEVEL)
-            rendered = render_shots(
-                scene,
-                given,
-                instrument=instrument,
-                infrared=infrared,
-                target_error=error,
-                seed=seed,
-                first_seed=seed,
-                **options,
-            )
-            seas.keep(rendered)
+            rendered = seas.keep(render_shots(scene, given, target_error=error, **options))
             # Troughs may leave a shallow bottom dry.
             wet = np.isfinite(rendered["true_bottom_depth_below_surface"].values)
             if not wet.all():
@@ -253,44 +244,29 @@ def depth_bias(
     return label(found.assign_coords(ripples=("wind_speed", waves)))
 
 
-def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
-    """Return table lines for one estimator in a result of `depth_bias`, in centimetres."""
-    corrected = "corrected_bias" in found
-    head = f"{'angle':>6}{'wind':>6}{'ripples':>9} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
-    head += f"{'>10':>7}{'hidden':>8}{'flagged':>9}{'bias':>8}{'spread':>8}"
-    lines = [head + f"{'error':>8}{'z':>6}{'wrong':>7}" + (f"{'bias':>10}{'spread':>8}{'z':>6}" if corrected else "")]
-    one = found.sel(estimator=estimator)
+def describe_depth_bias(found: xr.Dataset) -> list[str]:
+    """Return table lines for the estimator ``gaussian`` in a result of `depth_bias`, in centimetres."""
+    columns = [("angle", ">6.1f"), ("wind", ">6g"), ("ripples", ">9g"), (" water", "<7"), ("depth", ">6g")]
+    columns += [(" channel", "<11"), ("SNR", ">7.1f"), ("found", ">7"), (">10", ">7"), ("hidden", ">8")]
+    columns += [("flagged", ">9"), ("bias", ">8.1f"), ("spread", ">8.1f"), ("error", ">8.1f"), ("z", ">6.2f")]
+    columns += [("wrong", ">7"), ("bias", ">10.1f"), ("spread", ">8.1f"), ("z", ">6.2f")]
+    rows = []
     for place in np.ndindex(*(found.sizes[axis] for axis in AXES)):
-        at = one.isel(dict(zip(AXES, place, strict=True)))
-        label = f"{float(at['off_nadir_deg']):>6.1f}{float(at['wind_speed']):>6g}"
-        label += f"{float(at['ripples']):>9g} {at['water'].item():<6}"
+        at = found.sel(estimator="gaussian").isel(dict(zip(AXES, place, strict=True)))
         if np.isnan(at["found"].values).all():  # left out
             continue
         for pixel in found["pixel"].values:
             cell = at.sel(pixel=pixel)
-            number = {name: float(cell[name]) for name in cell.data_vars if cell[name].ndim == 0}
-            text = f"{label}{float(at['depth']):>6g} {pixel!s:<10}{number['snr']:>7.1f}{100 * number['found']:>5.0f} %"
-            text += (
-                f"{_percent(number['bright_found']):>7}{_percent(number['hidden']):>8}{_percent(number['flagged']):>9}"
-            )
-            text += "".join(f"{100 * number[name]:>8.1f}" for name in ("bias", "spread", "error"))
-            text += f"{number['z']:>6.2f}{100 * number['wrong']:>5.1f} %"
-            if corrected:
-                text += f"{100 * number['corrected_bias']:>10.1f}{100 * number['corrected_spread']:>8.1f}"
-                text += f"{number['corrected_z']:>6.2f}"
-            lines.append(text)
-    return lines
-
-
-def _percent(share: float) -> str:
-    """Return a share as text, `-` without one."""
-    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
-
-
-def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether a bottom was found at one of the smaller depths, and none at the last of them."""
-    found = [bool(np.any(cell["found"] > 0)) for cell in shallower]
-    return any(found) and not found[-1]
+            own = {name: float(cell[name]) for name in cell.data_vars if cell[name].ndim == 0}
+            share = {name: f"{100 * value:.0f} %" if math.isfinite(value) else "-" for name, value in own.items()}
+            row = [*(float(at[name]) for name in ("off_nadir_deg", "wind_speed", "ripples")), f" {at['water'].item()}"]
+            row += [float(at["depth"]), f" {pixel}", own["snr"], f"{100 * own['found']:.0f} %", share["bright_found"]]
+            row += [share["hidden"], share["flagged"], *(100 * own[name] for name in ("bias", "spread", "error"))]
+            row += [own["z"], f"{100 * own['wrong']:.1f} %"]
+            if "corrected_bias" in own:
+                row += [100 * own["corrected_bias"], 100 * own["corrected_spread"], own["corrected_z"]]
+            rows.append(row)
+    return table_lines(columns if "corrected_bias" in found else columns[:-3], rows)
 
 
 def _check_counts(recorded: xr.Dataset) -> None:

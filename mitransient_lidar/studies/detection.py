@@ -68,18 +68,18 @@ def detect(
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
     ] = 0.9,
     depths: Annotated[
-        Numbers, Option("Further target depths", 0, unit="m", above=True, ascending=True, form="N,N,...")
+        Numbers, Option("Further values of target_depth", 0, unit="m", above=True, ascending=True, form="N,N,...")
     ] = (),
     shots: Annotated[
         int, Option("Number of simulated shots with and without the target, none for a camera", 100, 100_000)
     ] = 10_000,
     clutter: Annotated[
-        int, Option("Number of seas whose differences count as noise, at least 4, or 0 for one known sea", 0, 1000)
+        int, Option("Seas, by surface_seed, whose differences count as noise, at least 4, or 0 for one known", 0, 1000)
     ] = 0,
     renders: Annotated[int, Option("Renders of one sea, whose spread gives the intervals", 3, 1000)] = 4,
     target_id: TargetId = "target",
     background_power_w: BackgroundPower = 0.0,
-    frames: Annotated[int, Option("Averaged camera frames per gate", 1, 1_000_000)] = 1,
+    frames: Annotated[int, Option("Averaged camera frames per gate, of one sea", 1, 1_000_000)] = 1,
     passes: Annotated[int, Option("Number of independent passes per render", 16, 100_000)] = 16,
     max_time: Annotated[
         float | None,
@@ -103,21 +103,9 @@ def detect(
         As for `target_signal.target_signal`, with at most 16 pixels, or gates for a camera.
     receiver
         Detector and electronics of every pixel, or a camera, or the name of one in `physics.receiver.receiver_files`.
-    depths
-        Further target depths to render [m], increasing: values of the scene parameter ``target_depth``.
     shots
         Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it. A camera
         needs none.
-    frames
-        Averaged camera frames per gate, with the same sea in all.
-    clutter
-        Number of seas, by the parameter ``surface_seed``, whose differences are noise to the detector: 0 for none, or 4
-        to 1000.
-    max_time
-        Time after which no further depth is begun [s], above 0; all renders of the unchanged target are made. The
-        attribute ``depths_left_out`` lists the omitted depths as text, and a warning names them.
-    progress
-        Called with a `passes.Progress` after every render.
 
     Returns
     -------
@@ -133,8 +121,7 @@ def detect(
         where it is 1. Without intervals: ``expected_detection`` and ``expected_area`` in closed form, ``deflection`` by
         the full signal, ``depth_bound`` [m] (Cramer-Rao, without clutter), and over ``pixel`` and ``time`` [ns] the
         means of ``background`` and ``difference`` [W] over the renders. Attributes ``gain_pixels`` and ``gain_single``:
-        transimpedance factors that keep the echo in range.
-
+        transimpedance factors that keep the echo in range, and ``depths_left_out``: as text the depths without time.
 
         With a camera: over (row, column, gate) or (pixel, gate) the maps in `images.ImageTrial.maps`; ``detection``
         over ``frames`` (averaged numbers) and ``frames_needed``, and with `depths` ``detection_at_depth`` and

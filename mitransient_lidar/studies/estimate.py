@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.options import Instrument, Option, Scene, Seed, checked
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.accumulators import PassAccumulator
@@ -79,14 +80,10 @@ def describe_estimate(found: xr.Dataset) -> list[str]:
     """Return the lines of a table of a result of `estimate`: energy, and peak power with its time, by origin."""
     energy, power = found["impulse_response_by_origin"], found["waveform_by_origin"]
     over = [dim for dim in power.dims if dim not in ("origin", "time")]
-    lines = [f"{'all pixels':<12}{'energy (J)':>12}{'peak (W)':>12}{'at (ns)':>10}"]
+    columns = (("all pixels", "<12"), ("energy (J)", ">12.3e"), ("peak (W)", ">12.3e"), ("at (ns)", ">10.1f"))
+    rows = []
     for name in found["origin"].values:
-        received = float(energy.sel(origin=name).sum())
-        curve = power.sel(origin=name).sum(over)
-        peak = (
-            f"{float(curve.max()):>12.3e}{float(curve['time'][int(np.argmax(curve.values))]):>10.1f}"
-            if received > 0
-            else ""
-        )
-        lines.append(f"{name!s:<12}{received:>12.3e}{peak}")
-    return lines
+        received, curve = float(energy.sel(origin=name).sum()), power.sel(origin=name).sum(over)
+        peak = (float(curve.max()), float(curve["time"][int(np.argmax(curve.values))]))
+        rows.append((str(name), received, *(peak if received > 0 else ())))
+    return table_lines(columns, rows)

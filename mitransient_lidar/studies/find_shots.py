@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.options import Option, Scene, checked, positive_option
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
@@ -33,23 +33,17 @@ _PASSES = 12
 
 @dataclass(frozen=True)
 class RenderedShots:
-    """Shots in a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level.
-
-    Attributes
-    ----------
-    azimuth, beam_spread
-        Beam azimuth [rad], and standard deviations of its footprint along and across it [m].
-    pixel_lines, pixel_map, pixel_count
-        Grid lines of a map about a shot [m], shape (n,), the pixel index at each node, shape (n, n), rows along y, and
-        the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
-    """
+    """Shots in a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level."""
 
     scene: str
     shots: tuple[Shot, ...]
     results: list[xr.Dataset]
     sea: SeaMap
+    #: Beam azimuth [rad], and standard deviations of its footprint along and across it [m].
     azimuth: float
     beam_spread: tuple[float, float]
+    #: Grid lines of a map about a shot [m], shape (n,), the pixel index at each node, shape (n, n), rows along y, and
+    #: the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
     pixel_lines: FloatArray
     pixel_map: npt.NDArray[np.int64]
     pixel_count: int
@@ -101,11 +95,10 @@ def find_shots(
 
 def describe_found_shots(rendered: RenderedShots) -> list[str]:
     """Return table lines for locations and slopes."""
-    lines = [f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}"]
-    for shot in rendered.shots:
-        along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
-        lines.append(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
-    return lines
+    columns = (("kind", "<10"), ("aim_x", ">10.2f"), ("aim_y", ">10.2f"), ("along (deg)", ">13.2f"))
+    angles = [np.degrees(np.arctan([shot.along, shot.across])) for shot in rendered.shots]
+    rows = [(shot.kind, shot.x, shot.y, *pair) for shot, pair in zip(rendered.shots, angles, strict=True)]
+    return table_lines((*columns, ("across (deg)", ">14.2f")), rows)
 
 
 @alone

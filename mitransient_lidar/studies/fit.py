@@ -15,18 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.bandwidth import (
-    BANDWIDTH,
-    BANDWIDTH_BOUNDS,
-    BANDWIDTH_START,
-    BehindBandwidth,
-)
+from mitransient_lidar.analysis.information import bandwidth
+from mitransient_lidar.analysis.information.bandwidth import BANDWIDTH
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured, with_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, checked, positive_option
 from mitransient_lidar.core.parameters.water import LAYERED_WATER
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
@@ -131,8 +128,6 @@ def fit(
     max_time
         Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
         warning. The start is always rendered.
-    progress
-        Called with a `rendering.passes.Progress` after every render.
 
     Returns
     -------
@@ -155,8 +150,8 @@ def fit(
     if BANDWIDTH in names:
         if found.receiver is not None:
             raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
-        start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
-        bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
+        start = {BANDWIDTH: bandwidth.BANDWIDTH_START, **(start or {})}
+        bounds = {BANDWIDTH: bandwidth.BANDWIDTH_BOUNDS, **(bounds or {})}
     model = None
     if callable(scene):
         if missing := [name for name in names if name not in (start or {})]:
@@ -179,7 +174,7 @@ def fit(
         bounds = {**model.bounds(), **(bounds or {})}
 
     def light() -> Model:
-        return BehindBandwidth(render_at) if BANDWIDTH in names else render_at
+        return bandwidth.behind_bandwidth(render_at) if BANDWIDTH in names else render_at
 
     problem = WaveformFit(found, light(), starts, bounds, free_scale=free_scale, free_time=free_time)
     problem.approach(most_renders=most_renders, until=began + limit)
@@ -330,13 +325,12 @@ def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:
 
 def describe_fit(fitted: xr.Dataset) -> list[str]:
     """Return table lines for a fit: each parameter's value, standard error and start, and the fit's quality."""
-    lines = [f"{'parameter':<24}{'value':>13}{'error':>11}{'start':>13}  unit"]
-    for name in fitted["parameter"].values:
-        one = fitted.sel(parameter=name)
-        error = f"{float(one['stderr']):>11.3g}" if np.isfinite(one["stderr"]) else f"{'unknown':>11}"
-        text = f"{name:<24}{float(one['value']):>13.6g}{error}{float(one['start']):>13.6g}  "
-        text += one["parameter_units"].item()
-        lines.append(text + (" (at its bound)" if int(one["at_bound"]) else ""))
+    columns = (("parameter", "<24"), ("value", ">13.6g"), ("error", ">11.3g"), ("start", ">13.6g"), ("  unit", ""))
+    ends = np.where(fitted["at_bound"].values, " (at its bound)", "")
+    units = [f"  {unit}{end}" for unit, end in zip(fitted["parameter_units"].values, ends, strict=True)]
+    error = [value if np.isfinite(value) else "unknown" for value in fitted["stderr"].values]
+    cells = (fitted["parameter"].values, fitted["value"].values, error, fitted["start"].values, units)
+    lines = table_lines(columns, zip(*cells, strict=True))
     chi = fitted.attrs
     text = f"chi-squared {chi['chi_squared']:.4g}, expected {chi['expected']:.4g}"
     if np.isfinite(chi["probability"]):

@@ -16,6 +16,7 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Numbers, Option, Scene, Seed, checked, positive_option
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
@@ -68,11 +69,6 @@ def fov_sweep(
         XML scene's parameter ``field_of_view_mrad``, which determines the size of the surface.
     min_depth, max_depth
         Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
-    max_time
-        Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
-        out, with a warning; the narrowest one is always rendered.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------
@@ -161,13 +157,17 @@ def fov_sweep(
 
 def describe_fov_sweep(found: xr.Dataset) -> list[str]:
     """Return table lines for a result of `fov_sweep`."""
-    columns = ("effective_attenuation", "effective_attenuation_stderr", "system_attenuation")
-    lines = [f"{'field of view':>13}{'R_s':>9}{'c R_s':>8}{'K':>9}{'+-':>9}{'fit':>9}"]
-    lines.append(f"{'(mrad)':>13}{'(m)':>9}{'':>8}{'(1/m)':>9}{'(1/m)':>9}{'(1/m)':>9}")
-    for row in (found.isel(field_of_view=number) for number in range(found.sizes["field_of_view"])):
-        view, radius, scaled = (float(row[name]) for name in ("field_of_view", "spot_radius", "scaled_radius"))
-        values = "".join(f"{float(row[name]):>9.4f}" for name in columns)
-        lines.append(f"{view:>13g}{radius:>9.3g}{scaled:>8.3f}{values}")
+    columns = {
+        "field_of_view": ("field of view", ">13g"),
+        "spot_radius": ("R_s", ">9.3g"),
+        "scaled_radius": ("c R_s", ">8.3f"),
+        "effective_attenuation": ("K", ">9.4f"),
+        "effective_attenuation_stderr": ("+-", ">9.4f"),
+        "system_attenuation": ("fit", ">9.4f"),
+    }
+    units = ("(mrad)", "(m)", "", "(1/m)", "(1/m)", "(1/m)")
+    rows = zip(*(found[name].values for name in columns), strict=True)
+    lines = table_lines([*columns.values()], [units, *rows])
     names = {"c": "attenuation", "Kd": "kd", "a + bb": "a_plus_bb", "a": "absorption"}
     limits = ", ".join(f"{symbol} = {found.attrs[name]:.4f}" for symbol, name in names.items())
     lines.append(f"{limits} 1/m; radius of the beam {found.attrs['beam_radius']:.3g} m")

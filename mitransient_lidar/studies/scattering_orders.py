@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.options import FewerPasses, Instrument, Option, Scene, Seed, checked
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
@@ -42,12 +43,8 @@ def scattering_orders(
 
     Parameters
     ----------
-    scene, params, instrument, integrator
-        As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum over all higher ones.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------
@@ -102,32 +99,20 @@ def scattering_orders(
     return label(xr.Dataset(data, coords=coords, attrs=attributes), "orders")
 
 
-def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
-    """Return order, energy and its standard error [J], share of all light, and share with several reversals.
+def describe_orders(result: xr.Dataset) -> list[str]:
+    """Return table lines for a result of `scattering_orders`: one for each order, and one for all.
 
-    One row for each order in a result of `scattering_orders`, and a last one for all; shares are NaN without light. The
+    Energy and its standard error [J], share of all light, and share with several reversals, NaN without light. The
     error of a sum is the sum of the errors, its upper bound.
     """
     energy, stderr = result["energy"].values, result["energy_stderr"].values
-    total = energy.sum()
     last = int(result["order"][-1])
     names = [*(str(order) for order in range(last)), f">={last}", "all"]
-    columns = np.column_stack([energy, energy.sum(axis=1)])
+    one, several = np.column_stack([energy, energy.sum(axis=1)])
     errors = np.append(stderr.sum(axis=0), stderr.sum())
-    return [
-        (name, float(one + several), float(error), _share(one + several, total), _share(several, one + several))
-        for name, (one, several), error in zip(names, columns.T, errors, strict=True)
-    ]
-
-
-def describe_orders(result: xr.Dataset) -> list[str]:
-    """Return table lines for a result of `scattering_orders`: one for each order, and one for all."""
-    lines = [f"{'order':<8}{'energy (J)':>22}{'share (%)':>12}{'several reversals (%)':>24}"]
-    for name, energy, error, share, several in shares(result):
-        known = f"{energy:.3e} +- {error:.0e}"
-        lines.append(f"{name:<8}{known:>22}{100 * share:>12.3f}{100 * several:>24.3f}")
-    return lines
-
-
-def _share(part: float, total: float) -> float:
-    return float(part / total) if total > 0 else float("nan")
+    both = one + several
+    with np.errstate(invalid="ignore"):
+        shares = 100 * both / both[-1], 100 * several / both
+    known = [f"{value:.3e} +- {error:.0e}" for value, error in zip(both, errors, strict=True)]
+    columns = (("order", "<8"), ("energy (J)", ">22"), ("share (%)", ">12.3f"), ("several reversals (%)", ">24.3f"))
+    return table_lines(columns, zip(names, known, *shares, strict=True))

@@ -19,6 +19,8 @@ _HALF_GATE_NS = 10.0
 def shot_statistics(series: xr.Dataset) -> xr.Dataset:
     """Measure the echoes of shots at locations on one sea, for their dependence on its slopes.
 
+    Raises `UserError` if the scene has no bottom, or the record lacks an echo.
+
     Parameters
     ----------
     series
@@ -31,16 +33,16 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
         positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
         ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate
         about the echo from a level sea; NaN where it lies at a gate limit.
-
-    Raises
-    ------
-    UserError
-        If the scene has no bottom, or the record lacks an echo.
     """
     columns: dict[str, FloatArray] = {name: series[name].values for name in ("aim_x", "aim_y")}
     columns |= {f"slope_{name}": series[f"true_slope_{name}"].values for name in ("along", "across")}
     shape = series.sizes["shot"], -1
-    for name, time in _echo_times(series).items():
+    depth = series.attrs.get("scene.bottom_depth")
+    if depth is None or "surface_time_ns" not in series.attrs:
+        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
+    geometry = lidar_geometry(series.attrs)
+    echoes = {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
+    for name, time in echoes.items():
         heights, times = highest_points(series, time - _HALF_GATE_NS, time + _HALF_GATE_NS)
         columns |= {f"{name}_peak": heights.reshape(shape), f"{name}_time": times.reshape(shape)}
     data = {name: (("shot", "pixel")[: values.ndim], values) for name, values in columns.items()}
@@ -48,28 +50,11 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
     return label(xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs), "highest")
 
 
-def _echo_times(shot: xr.Dataset) -> dict[str, float]:
-    """Return the times of surface and bottom echo from a level sea [ns]."""
-    depth = shot.attrs.get("scene.bottom_depth")
-    if depth is None or "surface_time_ns" not in shot.attrs:
-        raise UserError("statistics of shots need a scene with a sea and the parameter bottom_depth")
-    geometry = lidar_geometry(shot.attrs)
-    return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
-
-
 def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:
-    """Find the highest point of each pixel's waveform in a gate [ns], by a parabola through three bins.
+    """Return the highest point of each pixel's waveform in a gate [ns], by a parabola through three bins.
 
-    Returns
-    -------
-    height, time
-        Power [W] and time [ns], shape (waveforms,), for the pixels of one shot, or of several shots in a row; NaN where
-        the highest bin lies at a gate limit.
-
-    Raises
-    ------
-    UserError
-        If the gate is not within the record.
+    Power [W] and time [ns] have the shape (waveforms,), for the pixels of one shot, or of several shots in a row; NaN
+    where the highest bin lies at a gate limit. Raises `UserError` if the gate is not within the record.
     """
     time = shot["time"].values
     inside = np.flatnonzero((time >= start) & (time <= end))
@@ -109,17 +94,10 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return slopes [1] and their effects on the echoes in a receiver with 2x2 pixels, from `shot_statistics`.
 
-    Returns
-    -------
-    dict
-        Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (surface echo
-        delay of the far pair after the near pair [ns]) and ``depth`` (bottom depth error [m]) for the slope along the
-        azimuth; ``sideways`` (delay of green, on the right, after red [ns]) for the rise to the left.
-
-    Raises
-    ------
-    UserError
-        If the pixels are different ones.
+    The effects, each over ``shot``, are ``strength`` (log10 of the surface echo [W]), ``separation`` (surface echo
+    delay of the far pair after the near pair [ns]) and ``depth`` (bottom depth error [m]) for the slope along the
+    azimuth, and ``sideways`` (delay of green, on the right, after red [ns]) for the rise to the left. Raises
+    `UserError` if the pixels are different ones.
     """
     if [str(name) for name in shots["pixel"].values] != ["red", "green", "blue", "black"]:
         raise UserError(f"pixels = {list(shots['pixel'].values)} must be the 2x2 of red, green, blue and black")

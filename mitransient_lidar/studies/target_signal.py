@@ -13,6 +13,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
+from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
@@ -65,15 +66,11 @@ def target_signal(
 
     Parameters
     ----------
-    scene, params, instrument, integrator
-        As for `rendering.render.render`.
     grid, max_offset
         Target positions along each axis, and their largest offset from the position in the scene: the result is
         `target_map` on a square.
     axis
         Time bins instead of automatic ones.
-    progress
-        Called with a `passes.Progress` after every pass.
 
     Returns
     -------
@@ -175,16 +172,9 @@ def target_gates(
 ) -> xr.Dataset:
     """Render a scene's gates with and without a target, on the same random numbers, for any number of pixels.
 
-    Returns
-    -------
-    xarray.Dataset
-        A gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
-        without), ``half`` (of the passes), and its dimensions.
-
-    Raises
-    ------
-    UserError
-        If the scene has no gates, or as for `target_signal`.
+    Returns a gate stack from the first half of the passes, with the target, and ``gate_light`` [J] over ``kind`` (with,
+    without), ``half`` (of the passes), and its dimensions. Raises `UserError` if the scene has no gates, or as for
+    `target_signal`.
     """
     chosen, *renderers = _pair(session, target_id, integrator, None)
     lidar = renderers[0].scene
@@ -225,10 +215,7 @@ def _pair(
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
     """Return the target's shape.
 
-    Raises
-    ------
-    UserError
-        If there is no such shape, or it is the sea, or completely above the sea or below the bottom.
+    Raises `UserError` if there is no such shape, or it is the sea, or completely above the sea or below the bottom.
     """
     shapes = list(scene.shapes())
     names = [shape.id() for shape in shapes]
@@ -332,25 +319,22 @@ def describe_target(result: xr.Dataset) -> list[str]:
         return _describe_map(result)
     attributes = result.attrs
     sum_echo, sum_snr = (float(result[f"combined_{name}"][0]) for name in ("echo", "detectability"))
-    lines = [
+    columns = (("pixel", "<12"), ("echo (J)", ">22"), ("of all (%)", ">12.1f"), ("contrast", ">18"))
+    rows = []
+    parts = [(str(name), result.isel(pixel=i), "") for i, name in enumerate(result["pixel"].values)]
+    parts += [(name, result.isel(combination=i), "combined_") for i, name in enumerate(("sum", "best"))]
+    for name, one, kind in parts:
+        names = [f"{kind}{quantity}" for quantity in ("echo", "contrast", "detectability")]
+        echo, contrast, snr = ((float(one[each]), float(one[f"{each}_stderr"])) for each in names)
+        share = "" if name == "best" else 100 * echo[0] / sum_echo
+        row = (name, f"{echo[0]:.3e} +- {echo[1]:.0e}", share, f"{contrast[0]:.3f} +- {contrast[1]:.3f}")
+        weight = "" if kind else float(one["weight"])
+        rows.append((*row, weight, f"{snr[0] / sum_snr:.3f} +- {snr[1] / sum_snr:.3f}"))
+    return [
         f"target's echo at {attributes['peak_ns']:.1f} ns, gate {attributes['gate_start_ns']:.1f} to "
         f"{attributes['gate_end_ns']:.1f} ns",
-        f"{'pixel':<12}{'echo (J)':>22}{'of all (%)':>12}{'contrast':>18}{'weight':>8}{'relative SNR':>18}",
+        *table_lines((*columns, ("weight", ">8.2f"), ("relative SNR", ">18")), rows),
     ]
-    rows = [(str(name), result.isel(pixel=i), "", "weight") for i, name in enumerate(result["pixel"].values)]
-    rows += [(name, result.isel(combination=i), "combined_", "") for i, name in enumerate(("sum", "best"))]
-    for name, one, kind, weight in rows:
-        echo, contrast, snr = (one[kind + quantity] for quantity in ("echo", "contrast", "detectability"))
-        errors = [float(one[f"{kind}{quantity}_stderr"]) for quantity in ("echo", "contrast", "detectability")]
-        share = "" if name == "best" else f"{100 * float(echo) / sum_echo:.1f}"
-        cells = (
-            f"{float(echo):.3e} +- {errors[0]:.0e}",
-            f"{float(contrast):.3f} +- {errors[1]:.3f}",
-            f"{float(one[weight]):.2f}" if weight else "",
-            f"{float(snr) / sum_snr:.3f} +- {errors[2] / sum_snr:.3f}",
-        )
-        lines.append(f"{name:<12}{cells[0]:>22}{share:>12}{cells[1]:>18}{cells[2]:>8}{cells[3]:>18}")
-    return lines
 
 
 def _describe_map(maps: xr.Dataset) -> list[str]:
@@ -358,12 +342,10 @@ def _describe_map(maps: xr.Dataset) -> list[str]:
     share = 100 * maps["echo"] / maps["combined_echo"].sel(combination="sum")
     snr = maps["combined_detectability"]
     gain = snr.sel(combination="best") / snr.sel(combination="sum")
-    columns = "".join(f"{name + ' (%)':>12}" for name in names) + "".join(f"{name + ' contrast':>16}" for name in names)
-    lines = [f"{'target_x':>9}{'target_y':>10}{columns}{'best SNR/sum':>16}"]
-    for x in maps["target_x"].values:
-        for y in maps["target_y"].values:
-            place = {"target_x": x, "target_y": y}
-            shares = "".join(f"{float(value):>12.1f}" for value in share.sel(place).values)
-            contrasts = "".join(f"{float(value):>16.3f}" for value in maps["contrast"].sel(place).values)
-            lines.append(f"{x:>9.2f}{y:>10.2f}{shares}{contrasts}{float(gain.sel(place)):>16.3f}")
-    return lines
+    columns = [("target_x", ">9.2f"), ("target_y", ">10.2f"), *((f"{name} (%)", ">12.1f") for name in names)]
+    columns += [*((f"{name} contrast", ">16.3f") for name in names), ("best SNR/sum", ">16.3f")]
+    rows = []
+    for x, y in itertools.product(maps["target_x"].values, maps["target_y"].values):
+        place = {"target_x": x, "target_y": y}
+        rows.append((x, y, *share.sel(place).values, *maps["contrast"].sel(place).values, float(gain.sel(place))))
+    return table_lines(columns, rows)

@@ -79,17 +79,11 @@ def tpu(
     ----------
     params, scene
         As for `depth_bias.depth_bias`.
-    winds
-        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
     infrared
         As of `depth_bias.depth_bias`; ``auto`` corrections then are none.
-    pointing_mrad, position_m, height_m
-        Trajectory errors of the survey; see `analysis.depth_uncertainty.TrajectoryErrors`.
     max_time
         Time after which no sea is rendered [s], above 0. Uncertainties for omitted seas are NaN; altitudes without any
         rendered sea are left out. The attribute ``seas_left_out`` has the number of both.
-    progress
-        Called with a `passes.Progress` after every table cell.
 
     Returns
     -------
@@ -116,25 +110,11 @@ def tpu(
     found: list[xr.Dataset] = []
     cases = Cases(heights.tolist(), "altitudes", unit="cell", max_time=max_time, progress=progress)
     for height in cases:
-        table = depth_bias(
-            instrument,
-            {**given, "altitude": height},
-            scene=scene,
-            receiver=receiver,
-            infrared=infrared,
-            angles_deg=angles,
-            winds=winds,
-            ripples=[RIPPLES],
-            waters=waters,
-            depths=depths,
-            estimators=[estimator],
-            shots=shots,
-            records=records,
-            seed=seed,
-            corrections=corrections,
-            max_time=cases.left,
-            progress=cases.step,
-        )
+        options: dict[str, Any] = {"scene": scene, "receiver": receiver, "infrared": infrared, "seed": seed}
+        options |= {"angles_deg": angles, "winds": winds, "ripples": [RIPPLES], "waters": waters, "depths": depths}
+        options |= {"estimators": [estimator], "shots": shots, "records": records, "corrections": corrections}
+        at_height = {**given, "altitude": height}
+        table = depth_bias(instrument, at_height, max_time=cases.left, progress=cases.step, **options)
         found.append(sounding_uncertainty(cases.keep(table), trajectory))
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
     seas = math.prod(found[0].sizes[axis] for axis in AXES)

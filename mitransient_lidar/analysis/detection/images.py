@@ -127,37 +127,23 @@ def _template(count: int, renders: Sequence[int]) -> FloatArray:
 class ImageTrial:
     """A scene's light in a camera's gates.
 
-    Parameters
-    ----------
-    light : ndarray
-        Energies [J] with and without the target in two halves of each render's passes, shape (with or without, render,
-        half, *pixels, gate).
-    seas : bool
-        Whether renders belong to different seas.
-    open_ns : float
-        Integrated gate transmission [ns].
-    pulses : int
-        Pulses per frame.
-    sky : float
-        Daylight power on each pixel [W].
-    slope : ndarray, optional
-        Derivative of the light with respect to the gate time [J/ns], for the camera's jitter, which all pixels in a
-        gate's frame share; without it, the jitter has no effect.
-    target_share : float
-        Share of the noise with the target in the covariance D that the filters are for, 0 to 1.
-
     Notes
     -----
     The filters use the camera's fixed pattern, as for a calibrated camera.
     """
 
+    #: Energies [J] with and without the target in two halves of each render's passes, shape (with or without, render,
+    #: half, *pixels, gate).
     light: FloatArray
-    seas: bool
+    seas: bool  #: Whether renders belong to different seas.
     camera: Camera
-    open_ns: float
-    pulses: int
-    sky: float
+    open_ns: float  #: Integrated gate transmission [ns].
+    pulses: int  #: Pulses per frame.
+    sky: float  #: Daylight power on each pixel [W].
+    #: Derivative of the light with respect to the gate time [J/ns], for the camera's jitter, which all pixels in a
+    #: gate's frame share; without it, the jitter has no effect.
     slope: FloatArray | None = None
+    #: Share of the noise with the target in the covariance D that the filters are for, 0 to 1.
     target_share: float = 0.5
 
     def tuned(self, frames: int, pfa: float) -> ImageTrial:

@@ -219,12 +219,7 @@ class Cases:
         One case is weighted for its noise alone; at least three for noise and clutter, with each case's weights
         estimated from the others. Few seas do not determine a weight for every sample. Each detector's samples are
         therefore weighted for its noise and the strongest component of its clutter, and then the detectors for noise
-        and their common clutter.
-
-        Raises
-        ------
-        UserError
-            If the target changes no sample.
+        and their common clutter. Raises `UserError` if the target changes no sample.
 
         Notes
         -----

@@ -35,17 +35,8 @@ def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     second half, as sorting would bias the first. The relation is a line where each pixel has its own light: with an
     intensifier, for light that changes little over its blur; in a photon counter, for few counts.
 
-    Parameters
-    ----------
-    recorded : xarray.Dataset
-        Frames, at least 4, with ``signal``, ``saturation`` and ``dark_level``.
-    levels : int
-        Number of levels, 2 to 1000, each with as many pixels and gates.
-
-    Raises
-    ------
-    UserError
-        If there are fewer frames, or fewer than 2 pixels and gates a level that are not saturated.
+    Frames have ``signal``, ``saturation`` and ``dark_level``; there are 2 to 1000 levels, each with as many pixels and
+    gates. Raises `UserError` for fewer than 4 frames, or 2 pixels and gates a level that are not saturated.
     """
     number, frames = integer("levels", levels, 2, 1000), recorded.sizes.get("frame", 0)
     if frames < 4:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.core.validation import FloatArray, increasing_array, integer
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.gate_stack import as_stack, average_frames, has_frames
@@ -55,6 +55,8 @@ def range_from_gates(
 ) -> RangeImage:
     """Find every pixel's echo above the water column's backscatter.
 
+    Raises `UserError` if shapes disagree or a value is out of range.
+
     Parameters
     ----------
     energy, stderr : array_like, shape (..., gate)
@@ -69,11 +71,6 @@ def range_from_gates(
     -------
     RangeImage
         Arrays of shape (...); pixels with non-finite energies have NaN depth and confidence 0.
-
-    Raises
-    ------
-    UserError
-        If shapes disagree or a value is out of range.
 
     Notes
     -----
@@ -92,7 +89,7 @@ def range_from_gates(
     train between surface and target, since a surface echo would be found instead of the target.
     """
     e, s = np.asarray(energy, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
-    mid = finite_array("gate_mid", gate_mid)
+    mid = increasing_array("gate_mid", gate_mid)
     if e.ndim == 0 or e.shape != s.shape or mid.shape != e.shape[-1:]:
         raise UserError(
             f"energy of shape {e.shape} and stderr of shape {s.shape} must be equal, with the {mid.size} gates of "
@@ -100,8 +97,6 @@ def range_from_gates(
         )
     if mid.size < 3:
         raise UserError(f"energy has {mid.size} gates and must have at least 3: two define the column")
-    if np.any(np.diff(mid) <= 0):
-        raise UserError("gate_mid must increase strictly")
     if np.any(s < 0):
         raise UserError(f"stderr = {s[s < 0][0]:g} must not be negative")
     largest = (mid.size - 3) // 2

@@ -162,21 +162,17 @@ def jittered_beside(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return the mean gate energy over a jitter, and its derivative by gate time, from the neighbouring gates.
 
-    Without gates that follow within the longer of pulse and edges, it is left out with a warning.
+    Without gates that follow within the longer of pulse and edges, it is left out with a warning. The derivative is
+    None without jitter, or where it is left out.
 
     Parameters
     ----------
     energy : ndarray
-        Energy in the gates, shape (..., gate) [J].
+        Energy in the gates, shape (..., gate) [J], as of the mean; the derivative is in J/ns.
     jitter, included : float
         Standard deviation of the gate time, and the part of it that the energy has already [ns].
     step, longest : float
         Time from gate to gate, and the longest one that shows the energy between them [ns].
-
-    Returns
-    -------
-    mean, slope : ndarray
-        In the shape of the energy, [J] and [J/ns]; no slope without jitter, or where it is left out.
     """
     if jitter == 0:
         return energy, None

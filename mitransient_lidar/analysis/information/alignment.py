@@ -54,14 +54,8 @@ def best_offset(times: FloatArray, values: FloatArray, model_times: FloatArray, 
 
     At this time the squared difference between compressed samples, asinh(value / 2 % of the largest), is least over the
     record. The samples have a scale of their own, and the model is dark outside its own record. The column and faint
-    echoes count beside the surface echo.
-
-    Parameters
-    ----------
-    times, values
-        Times of the samples [ns], shape (time,), and waveforms, shape (pixel, time).
-    model_times, mean
-        Evenly spaced times of the model [ns], and its samples, shape (pixel, time).
+    echoes count beside the surface echo. Waveforms and model have times [ns], shape (time,), those of the model evenly
+    spaced, and samples, shape (pixel, time).
     """
     step = float(np.median(np.diff(model_times)))
     grid = np.arange(times[0], times[-1] + 0.5 * step, step)

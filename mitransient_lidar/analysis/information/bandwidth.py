@@ -16,22 +16,18 @@ BANDWIDTH_START, BANDWIDTH_BOUNDS = 100.0, (1.0, 1e4)  # [MHz]
 _STEP = 0.01  # relative one of the differences that give the derivative by the bandwidth
 
 
-class BehindBandwidth:
-    """Model of `fits.WaveformFit` whose light passes a single pole with the half-power frequency ``bandwidth_mhz``.
+def behind_bandwidth(model: Callable[[Mapping[str, float]], xr.Dataset]) -> Callable[[Mapping[str, float]], xr.Dataset]:
+    """Return a model of `fits.WaveformFit` whose light passes a single pole with the frequency ``bandwidth_mhz``.
 
-    Another bandwidth does not call the model again.
+    The half-power frequency is in MHz. The model has the derivative by it, and another one does not call `model` again.
     """
+    last: list[tuple[dict[str, float], xr.Dataset]] = []
 
-    def __init__(self, model: Callable[[Mapping[str, float]], xr.Dataset]) -> None:
-        self.model = model
-        self._last: tuple[dict[str, float], xr.Dataset] | None = None
-
-    def __call__(self, values: Mapping[str, float]) -> xr.Dataset:
-        """Return the model behind the bandwidth [MHz] of values, with the derivative by it."""
+    def behind(values: Mapping[str, float]) -> xr.Dataset:
         others = {name: value for name, value in values.items() if name != BANDWIDTH}
-        if self._last is None or self._last[0] != others:
-            self._last = others, self.model(others)
-        light, bandwidth = self._last[1], values[BANDWIDTH]
+        if not last or last[0][0] != others:
+            last[:] = [(others, model(others))]
+        light, bandwidth = last[0][1], values[BANDWIDTH]
         width = results.time_axis(light).bin_width_ns
         names = [name for name in light.data_vars if str(name).startswith("waveform") and "time" in light[name].dims]
         smoothed = light.assign({name: _behind(light[name], bandwidth, width) for name in names})
@@ -44,6 +40,8 @@ class BehindBandwidth:
         both = [slope] if slopes is None else [slopes, slope]
         joined = xr.concat(both, "parameter", coords="minimal", compat="override", join="override")
         return smoothed.drop_dims("parameter", errors="ignore").assign(waveform_derivative=joined)
+
+    return behind
 
 
 def _behind(array: xr.DataArray, bandwidth_mhz: float, width_ns: float) -> xr.DataArray:

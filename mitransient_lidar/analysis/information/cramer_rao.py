@@ -28,14 +28,9 @@ class Bounds(NamedTuple):
 
 
 def bounds(information: FloatArray, names: Sequence[str]) -> Bounds:
-    """Return the Cramer-Rao bounds from a Fisher information matrix.
+    """Return the Cramer-Rao bounds from a Fisher information matrix, and remarks with the parameters' names.
 
-    Parameters
-    ----------
-    information : ndarray, shape (parameter, parameter)
-        Symmetric; an estimate may have negative eigenvalues.
-    names : sequence of str
-        Parameter names, for the remarks.
+    The matrix is symmetric; an estimate may have negative eigenvalues.
 
     Notes
     -----

@@ -27,34 +27,20 @@ _SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combi
 
 @dataclass(frozen=True)
 class Errors:
-    """Parameter errors.
+    """Parameter errors."""
 
-    Attributes
-    ----------
-    covariance
-        Shape (parameter, parameter); NaN for parameters that are at a bound or without influence, and for the others
-        with these fixed.
-    by_model
-        Standard errors by the Monte Carlo of the model alone, shape (parameter,).
-    influence
-        Waveform change per unit of each parameter in standard deviations, shape (parameter,).
-    held
-        Whether a parameter is at a bound.
-    chi_squared, expected, freedom
-        Sum of the squared residuals, its mean, and the degrees of freedom of the chi-squared distribution, scaled to
-        this mean, that has its variance.
-    grown
-        Whether the covariance is multiplied by the reduced chi-squared.
-    """
-
+    #: Shape (parameter, parameter); NaN for parameters that are at a bound or without influence, and for the others
+    #: with these fixed.
     covariance: FloatArray
-    by_model: FloatArray
-    influence: FloatArray
-    held: BoolArray
+    by_model: FloatArray  #: Standard errors by the Monte Carlo of the model alone, shape (parameter,).
+    influence: FloatArray  #: Waveform change per unit of each parameter in standard deviations, shape (parameter,).
+    held: BoolArray  #: Whether a parameter is at a bound.
+    #: Sum of the squared residuals, its mean, and the degrees of freedom of the chi-squared distribution, scaled to
+    #: this mean, that has its variance.
     chi_squared: float
     expected: float
     freedom: float
-    grown: bool = False
+    grown: bool = False  #: Whether the covariance is multiplied by the reduced chi-squared.
 
     @property
     def stderr(self) -> FloatArray:

@@ -67,6 +67,9 @@ def fisher_information(
 ) -> xr.Dataset:
     """Return the Fisher information in one shot's record about scene parameters, and Cramer-Rao bounds.
 
+    Raises `UserError` if a dataset has no derivatives, renders differ, no sample has both signal and noise, a nuisance
+    is unknown, or as for `detect_waveforms`.
+
     Parameters
     ----------
     dataset : xarray.Dataset or sequence of xarray.Dataset
@@ -92,12 +95,6 @@ def fisher_information(
         the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method``
         and ``prior`` (a nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on
         parameters that the record does not determine, one per line.
-
-    Raises
-    ------
-    UserError
-        If a dataset has no derivatives, renders differ, no sample has both signal and noise, a nuisance is unknown, or
-        as for `detect_waveforms`.
 
     Notes
     -----
@@ -143,7 +140,12 @@ def fisher_information(
     if every.size > 2:
         left = [bounds(gram.information(np.delete(every, one)) + np.diag(known), names) for one in every]
         without = np.array([one.bound for one in left])
-        found = found._replace(remarks=[*found.remarks, *_unresolved(found, left)])
+        error = jackknife_error(np.array([one.smallest for one in left]))
+        if 0 <= found.smallest <= 2 * error:  # a negative eigenvalue has been named already
+            found.remarks.append(
+                f"the smallest eigenvalue of the scaled information, {found.smallest:.2g}, is within twice its error "
+                f"by the render, {error:.2g}: render more passes"
+            )
     with np.errstate(divide="ignore", invalid="ignore"):
         diagonal = np.diagonal(information) - known
         if every.size > 1:
@@ -153,7 +155,13 @@ def fisher_information(
             "variance_share": np.diagonal(gram.information(every, "covariance")) / diagonal,
             "monte_carlo_share": added / diagonal,
         }
-    remarks = [*found.remarks, *_remarks_of_noise(names, shares["monte_carlo_share"], every.size)]
+    verb, after = ("adds", ": its bound is too low") if every.size == 1 else ("would add", ", which is removed")
+    of_noise = [
+        f"the noise of the render {verb} {100 * share:.3g} % to the information about {name}{after}"
+        for name, share in zip(names, shares["monte_carlo_share"], strict=True)
+        if math.isfinite(share) and share > _NOTED
+    ]
+    remarks = [*found.remarks, *of_noise]
     for remark in found.remarks:
         _LOG.warning("%s", remark)
     return _labelled(renders[0], names, prior, found, information, without, shares, lost, remarks, dims)
@@ -184,10 +192,7 @@ def _check(renders: Sequence[xr.Dataset]) -> tuple[str, ...]:
 def priors(nuisances: Mapping[str, float]) -> dict[str, float]:
     """Return the standard deviations to which nuisances are known, as numbers.
 
-    Raises
-    ------
-    UserError
-        If a name is not in `NUISANCES`, or a number not above 0.
+    Raises `UserError` if a name is not in `NUISANCES`, or a number not above 0.
     """
     for name, known in nuisances.items():
         if name not in NUISANCES:
@@ -266,29 +271,6 @@ def _whitened(root: FloatArray, change: FloatArray) -> FloatArray:
     """Return a covariance change between the covariance's inverse roots, as a vector."""
     half = solve_triangular(root, change, lower=True)
     return np.asarray(solve_triangular(root, half.T, lower=True).ravel())
-
-
-def _unresolved(found: Bounds, left: Sequence[Bounds]) -> list[str]:
-    """Return a sentence if the noise of the render could make the matrix singular."""
-    error = jackknife_error(np.array([one.smallest for one in left]))
-    # A negative eigenvalue has been named already.
-    if not 0 <= found.smallest <= 2 * error:
-        return []
-    return [
-        f"the smallest eigenvalue of the scaled information, {found.smallest:.2g}, is within twice its error by the "
-        f"render, {error:.2g}: render more passes"
-    ]
-
-
-def _remarks_of_noise(names: Sequence[str], shares: FloatArray, renders: int) -> list[str]:
-    """Return sentences on the information that the noise of the render would add, or adds to a single one."""
-    verb = "adds" if renders == 1 else "would add"
-    after = ": its bound is too low" if renders == 1 else ", which is removed"
-    return [
-        f"the noise of the render {verb} {100 * share:.3g} % to the information about {name}{after}"
-        for name, share in zip(names, shares, strict=True)
-        if math.isfinite(share) and share > _NOTED
-    ]
 
 
 def _labelled(

@@ -59,6 +59,9 @@ class _Rendered(NamedTuple):
 class WaveformFit:
     """Fit of a model's parameters to waveforms.
 
+    Raises `UserError` if a start or bounds are invalid, there is nothing to fit, no sample lies within the model's
+    time, or the waveforms have no light where the model has.
+
     Parameters
     ----------
     found
@@ -72,12 +75,6 @@ class WaveformFit:
         Lowest and highest values by name; see `free_parameters`.
     free_scale, free_time
         Whether scale and time offset of the waveforms are unknown, by default only for uncalibrated waveforms.
-
-    Raises
-    ------
-    UserError
-        If a start or bounds are invalid, there is nothing to fit, no sample lies within the model's time, or the
-        waveforms have no light where the model has.
     """
 
     def __init__(
@@ -127,12 +124,8 @@ class WaveformFit:
 
         Light falls exponentially with water coefficients, so that logarithms of samples are nearly linear in them where
         values are not. Least squares of logarithms, for samples with a relative error of a tenth besides their own,
-        come close to the solution. From some starts, least squares of values need many steps, or end elsewhere.
-
-        Parameters
-        ----------
-        most_renders, until
-            As for `run`, which has one render left at least.
+        come close to the solution. From some starts, least squares of values need many steps, or end elsewhere. Limits
+        are as for `run`, which has one render left at least.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000) - 1, until
         blurs: tuple[float, ...] = (0.0,)

@@ -50,10 +50,7 @@ class Free:
 def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[float, float]] | None = None) -> list[Free]:
     """Return free parameters with their bounds, by default the ranges of their names.
 
-    Raises
-    ------
-    UserError
-        If bounds belong to no free parameter or do not increase, or a start is not between them.
+    Raises `UserError` if bounds belong to no free parameter or do not increase, or a start is not between them.
     """
     given = dict(bounds or {})
     found = []

@@ -43,46 +43,27 @@ class ReceiverSettings:
 
 @dataclass(frozen=True)
 class Measured:
-    """Waveforms to fit.
+    """Waveforms to fit."""
 
-    Attributes
-    ----------
-    values
-        Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
-    stderr
-        Their standard errors in the same unit and shape; None where they are unknown or the model's.
-    time_ns
-        Sample times [ns], shape (time,), increasing strictly.
-    correlation
-        Correlation between errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
-    template
-        Array with dimensions, coordinates and attributes of the waveforms.
-    calibrated
-        Whether values and times are a model's, so that neither scale nor offset are unknown.
-    receiver, shots
-        Receiver of a signal, None for waveforms, and number of averaged records.
-    render_variance
-        Variance of the render whose record a signal is, which `stderr` and the receiver's noise leave out, shape
-        (pixel, time); None without one.
-    rounding
-        Sample variance by the converter in a table with a receiver, shape (pixel, time); None without one.
-    estimated
-        Whether `stderr` is from the spread of a few passes.
-    batches
-        Deviations of the waveforms in pass batches, shape (batch, pixel, time); see `batch_deviations`.
-    """
-
+    #: Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
     values: FloatArray
+    #: Their standard errors in the same unit and shape; None where they are unknown or the model's.
     stderr: FloatArray | None
-    time_ns: FloatArray
+    time_ns: FloatArray  #: Sample times [ns], shape (time,), increasing strictly.
+    #: Correlation between errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
     correlation: FloatArray
-    template: xr.DataArray
-    calibrated: bool = True
+    template: xr.DataArray  #: Array with dimensions, coordinates and attributes of the waveforms.
+    calibrated: bool = True  #: Whether values and times are a model's, so that neither scale nor offset are unknown.
+    #: Receiver of a signal, None for waveforms, and number of averaged records.
     receiver: ReceiverSettings | None = None
     shots: int = 1
-    estimated: bool = False
+    estimated: bool = False  #: Whether `stderr` is from the spread of a few passes.
+    #: Deviations of the waveforms in pass batches, shape (batch, pixel, time); see `batch_deviations`.
     batches: FloatArray | None = None
+    #: Variance of the render whose record a signal is, which `stderr` and the receiver's noise leave out, shape (pixel,
+    #: time); None without one.
     render_variance: FloatArray | None = None
+    #: Sample variance by the converter in a table with a receiver, shape (pixel, time); None without one.
     rounding: FloatArray | None = None
 
     @property
@@ -98,10 +79,7 @@ class Measured:
     def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
         """Return the scale of a model's samples, in the same shape, by least squares with variances `noise`.
 
-        Raises
-        ------
-        UserError
-            If the waveforms have no light where the model has.
+        Raises `UserError` if the waveforms have no light where the model has.
         """
         weight = np.where(np.isfinite(self.values), 1.0, 0.0)
         if noise is not None:
@@ -135,10 +113,7 @@ class Prediction(NamedTuple):
 def with_waveforms(source: Given) -> Given:
     """Return the dataset of a result or of signals, given itself or by its file; a table's path unchanged.
 
-    Raises
-    ------
-    UserError
-        If it is another dataset, or its file cannot be read.
+    Raises `UserError` if it is another dataset, or its file cannot be read.
     """
     is_path = isinstance(source, (str, os.PathLike)) and not waveform_files.is_waveform_file(source)
     if is_path and Path(source).suffix.lower() not in (".nc", ".exr", ""):
@@ -154,6 +129,9 @@ def measured(
 ) -> Measured:
     """Return the waveforms in a result, a recorded signal, or a table.
 
+    Raises `UserError` if the file cannot be read, a series has more than one shot, the receiver is unknown, or a value
+    is out of range.
+
     Parameters
     ----------
     source
@@ -167,12 +145,6 @@ def measured(
         Receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
         receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
         samples are volts, which are expanded; limits and rounding are found from the samples.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read, a series has more than one shot, the receiver is unknown, or a value is out of
-        range.
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)
@@ -204,12 +176,8 @@ def measured(
 def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Prediction:
     """Return a render's prediction, with derivatives, for the pixels of waveforms, after their receiver if any.
 
-    Derivatives after a receiver are central differences of its closed form in the direction of the derivative.
-
-    Raises
-    ------
-    UserError
-        If the render has other pixels, lacks a derivative, or holds values that are not finite.
+    Derivatives after a receiver are central differences of its closed form in the direction of the derivative. Raises
+    `UserError` if the render has other pixels, lacks a derivative, or holds values that are not finite.
     """
     dataset = _same_pixels(found, dataset)
     dims = (*found.pixel_dims, "time")

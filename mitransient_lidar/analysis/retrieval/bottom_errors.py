@@ -81,18 +81,9 @@ def loss_error(
     exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over the
     column's. From each its value for homogeneous water is subtracted. Both are means over the shots, in the same water.
 
-    Parameters
-    ----------
-    waveforms
-        Waveforms of one pixel.
-    echoes
-        Table from `echo_table.extract` for these waveforms with `layers`, without the dimension pixel.
-    depth, path
-        Bottom depths and one-way paths to them in the water [m], per shot.
-    attenuation
-        Mean column attenuation along the path [1/m].
-    light
-        Scattered light in homogeneous water.
+    Waveforms are of one pixel, as is their table from `echo_table.extract` with `layers`. Bottom depths and one-way
+    paths to them in the water [m] are per shot, the column attenuation along the path [1/m] is a mean, and the
+    scattered light is that in homogeneous water.
     """
     depths = 2 * attenuation * path
     if light is None or not np.isfinite(depths).any():
@@ -270,18 +261,8 @@ def target_flags(
     """Return flags for bottom echoes that targets disturb, and the share of the beam that targets hide from the bottom.
 
     The attribute ``target_outlines`` gives the targets, for shots at `one_place`. Otherwise the share is 0, and every
-    echo before the bottom's has a flag.
-
-    Parameters
-    ----------
-    echoes
-        Table from `echo_table.extract` with depths below the mean sea level.
-    attributes
-        The result's attributes.
-    margin
-        Distance between a target and its echo depth [m].
-    one_place
-        Whether all shots are at one location.
+    echo before the bottom's has a flag. The echoes are from `echo_table.extract`, with depths below the mean sea level,
+    at most `margin` [m] from the targets'.
     """
     bottom, before = (echoes["depth_m"].sel(echo=name).values for name in ("bottom", "target"))
     targets = json.loads(attributes.get("target_outlines", "[]"))

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.seawater import water_scattering
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 
@@ -58,14 +57,10 @@ class WaterEstimate:
 def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
     """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide field of view.
 
-    Parameters
-    ----------
-    decay, backscatter : array_like
-        Attenuation K along the path in the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi) including
-        multiple scattering [1/(m sr)]. The backscatter is the power at the surface, extrapolated with K, over
-        `LidarSystem.column_gain` and the fraction of the beam in view.
-    excess, level : float
-        K minus the absorption [1/m], and backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
+    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) includes
+    multiple scattering [1/(m sr)]: it is the power at the surface, extrapolated with K, over `LidarSystem.column_gain`
+    and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and `level` the backscatter over
+    bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Notes
     -----
@@ -117,41 +112,25 @@ def bottom_reflectance(
     return np.asarray(np.where(known, scale * np.asarray(energy) / np.where(known, power, 1.0), np.nan))
 
 
-#: Bottom classes and their lower edges of reflectance at 532 nm.
+#: Bottom classes and their lower edges of reflectance at 532 nm: mud and vegetation are dark; gravel, rock and mixed
+#: bottoms medium; sand and shell bright. These edges are a convention: bottoms of one kind vary by a factor of 2, and a
+#: single wavelength does not resolve more classes.
 BOTTOM_CLASSES = {"dark": 0.0, "medium": 0.1, "bright": 0.2}
 
 
-def bottom_class(
-    reflectance: npt.ArrayLike, stderr: npt.ArrayLike, classes: dict[str, float] | None = None
-) -> tuple[list[str], FloatArray]:
-    """Return the names of bottom classes, and their probabilities, shape (..., classes).
+def bottom_class(reflectance: npt.ArrayLike, stderr: npt.ArrayLike) -> FloatArray:
+    """Return the probabilities of `BOTTOM_CLASSES`, shape (..., classes).
 
     A probability is the fraction of a Gaussian about the reflectance in the class; values below 0 count as the first.
-
-    Parameters
-    ----------
-    reflectance, stderr : array_like
-        Reflectance and its standard error [1]; they broadcast. NaN where unknown.
-    classes : dict of str to float, optional
-        Names and lower edges, increasing from 0. By default: dark (mud, vegetation), medium from 0.1 (gravel, rock,
-        mixed bottoms), bright from 0.2 (sand, shell). These edges are a convention: bottoms of one kind vary by a
-        factor of 2, and a single wavelength does not resolve more classes.
-
-    Raises
-    ------
-    UserError
-        If classes are out of order.
+    Reflectance and standard error [1] broadcast, and are NaN where unknown.
     """
     from scipy.special import ndtr
 
-    edges = BOTTOM_CLASSES if classes is None else classes
-    lower = finite_array("classes", list(edges.values()))
-    if lower.size == 0 or lower[0] != 0 or np.any(np.diff(lower) <= 0):
-        raise UserError(f"classes = {edges} must have lower edges that increase from 0")
+    lower = np.array(list(BOTTOM_CLASSES.values()))
     value, error = np.broadcast_arrays(np.asarray(reflectance, dtype=np.float64), np.asarray(stderr, dtype=np.float64))
     distance = lower[1:] - value[..., np.newaxis]
     sharp = np.where(distance > 0, np.inf, -np.inf)
     wide = np.where(error > 0, error, 1.0)[..., np.newaxis]
     below = np.where(np.isnan(distance), np.nan, ndtr(np.where(error[..., np.newaxis] > 0, distance / wide, sharp)))
     ends = np.concatenate([np.zeros_like(value)[..., np.newaxis], below, np.ones_like(value)[..., np.newaxis]], axis=-1)
-    return list(edges), np.where(np.isnan(value)[..., np.newaxis], np.nan, np.diff(ends, axis=-1))
+    return np.where(np.isnan(value)[..., np.newaxis], np.nan, np.diff(ends, axis=-1))

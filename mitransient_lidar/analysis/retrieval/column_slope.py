@@ -47,13 +47,9 @@ class ColumnBins:
     ) -> ColumnBins:
         """Return the record bins between two depths [m], 0 <= `min_depth` < `max_depth`.
 
-        `edge` is the largest angle from the axis of light that the receiver detects [rad].
-
-        Raises
-        ------
-        UserError
-            If the depths are out of order, the surface echo at the beam's edge reaches below the first, or the record
-            does not include them and at least 3 bins between them.
+        `edge` is the largest angle from the axis of light that the receiver detects [rad]. Raises `UserError` if the
+        depths are out of order, the surface echo at the beam's edge reaches below the first, or the record does not
+        include them and at least 3 bins between them.
         """
         top, bottom = non_negative("min_depth", min_depth), positive("max_depth", max_depth)
         if bottom <= top:
@@ -85,12 +81,8 @@ class ColumnBins:
 
         Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential in s. A bin without rare
         paths has too low a signal and too small an error. The standard error assumes independent bins. Bins in one pass
-        share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
-
-        Raises
-        ------
-        UserError
-            If a bin has no signal, or a relative standard error above 0.5.
+        share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes. Raises
+        `UserError` if a bin has no signal, or a relative standard error above 0.5.
         """
         if np.any(energy <= 0):
             raise UserError(f"the column has no signal in {np.count_nonzero(energy <= 0)} of {energy.size} bins")

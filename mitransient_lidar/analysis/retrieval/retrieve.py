@@ -44,6 +44,8 @@ from mitransient_lidar.results.variables import flagged, label
 
 _LOG = logging.getLogger(__name__)
 
+_DEEPEST_PATH = 8.0  # in the water, at which a column shows the water's properties [m]
+
 
 def surface_slopes(
     dataset: xr.Dataset,
@@ -51,10 +53,11 @@ def surface_slopes(
     wind_speed: float | None = None,
     wind_direction_deg: float | None = None,
     slope_deviation: tuple[float, float] | None = None,
-    facets: float = 1.0,
     efficiency: float | None = None,
 ) -> xr.Dataset:
     """Estimate slope, direction and height of the surface from times and strengths of the pixels' surface echoes.
+
+    Raises `UserError` if the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
     Parameters
     ----------
@@ -68,8 +71,6 @@ def surface_slopes(
     slope_deviation : (float, float), optional
         Prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and across,
         averaged over a footprint [1], above 0.
-    facets : float
-        As for `surface_slope.fit_plane`.
     efficiency : float, optional
         As for `bottom`.
 
@@ -84,11 +85,6 @@ def surface_slopes(
         ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
         Without a sea model, a slope beyond 5 standard deviations of the sea's slopes (attribute
         ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
-
-    Raises
-    ------
-    UserError
-        If the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
     Notes
     -----
@@ -110,7 +106,7 @@ def surface_slopes(
     shape = surface["time_ns"].shape[:-1]
     time, error = (surface[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
     light = surface_inputs.pixel_light(dataset)
-    plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error, facets=facets)
+    plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error)
     refused, limit = np.zeros(len(time), dtype=bool), surface_inputs.steepest_sea(dataset)
     wind = None if slope_deviation is not None else surface_inputs.wind(dataset, wind_speed, wind_direction_deg)
     if wind is not None:
@@ -170,14 +166,10 @@ def surface_slopes(
     return found.assign_attrs({"steepest_slope": limit}) if math.isfinite(limit) else found
 
 
-def bottom(
-    dataset: xr.Dataset,
-    slopes: xr.Dataset,
-    *,
-    efficiency: float | None = None,
-    classes: dict[str, float] | None = None,
-) -> xr.Dataset:
+def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None = None) -> xr.Dataset:
     """Estimate depth and reflectance of the bottom, without and with the surface's slope and height.
+
+    Raises `UserError` if the dataset lacks an attribute or a number is out of range.
 
     Parameters
     ----------
@@ -188,8 +180,6 @@ def bottom(
     efficiency : float, optional
         Transmitter and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the
         attribute ``two_way_efficiency``.
-    classes : dict of str to float, optional
-        As for `column_retrieval.bottom_class`.
 
     Returns
     -------
@@ -202,11 +192,6 @@ def bottom(
         ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance
         ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where a flag is
         set, without a column with a warning. Depth and energy are NaN if the echo comes from a target.
-
-    Raises
-    ------
-    UserError
-        If the dataset lacks an attribute or a number is out of range.
 
     Notes
     -----
@@ -253,7 +238,7 @@ def bottom(
     depth = [bottom_depth(distance, path, lidar.height, lidar.off_nadir, one) for distance, path, one in surfaces]
 
     power, attenuation = column["amplitude"].values, echoes["attenuation"].values
-    mean_attenuation = _mean(attenuation)
+    mean_attenuation = scattered_light.mean_of_known(attenuation)
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
     helpful, by_sea = bottom_errors.sea_variances(lidar, time, mean_attenuation, slopes)
@@ -274,7 +259,7 @@ def bottom(
         reflectance.append(np.pi * light * np.exp(2 * mean_attenuation * path) / (received * gain))
     slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
-    backscatter = _mean(scattered_light.backscatter_of(echoes, system, share))
+    backscatter = scattered_light.mean_of_known(scattered_light.backscatter_of(echoes, system, share))
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
@@ -288,7 +273,7 @@ def bottom(
     reflectance.append(np.where(column_corrected, ratio, np.where(np.isfinite(ratio), reflectance[1], np.nan)))
 
     loss = bottom_errors.loss_error(waveforms, echoes, depth[0], surfaces[0][1], mean_attenuation, scattered)
-    common = of_echo**2 + loss**2 + hidden**2 + _mean(of_decay**2) / _count(of_decay)
+    common = of_echo**2 + loss**2 + hidden**2 + scattered_light.mean_of_known(of_decay**2) / _count(of_decay)
     wavy = bottom_errors.focusing(dataset.attrs, lidar.slant_range) ** 2
     without, corrected = by_sea["reflectance"]
     of_sea = [wavy + without, wavy + np.where(slope_corrected, corrected, without)]
@@ -302,7 +287,7 @@ def bottom(
     unsure = (deviation > bottom_errors.LARGEST_ERROR) | (flags != 0)[..., np.newaxis]
     known = np.where(unsure, np.nan, np.stack(reflectance, axis=-1))
     errors = np.abs(known) * deviation
-    names, probability = column_retrieval.bottom_class(known[..., 2], errors[..., 2], classes)
+    probability = column_retrieval.bottom_class(known[..., 2], errors[..., 2])
     found = _labelled(dataset, {"bottom_energy": energy}, echoes["attenuation"].shape)
     dims = tuple(found["bottom_energy"].dims)
     unknown = np.full(np.shape(time), np.nan)
@@ -320,17 +305,14 @@ def bottom(
         found[name] = ((*dims, "correction"), values)
     found["class_probability"] = ((*dims, "bottom_class"), probability)
     found["reflectance_flags"] = (dims, np.broadcast_to(flags, np.shape(time)), flagged(ReflectanceFlag))
-    return label(found.assign_coords(correction=["level", "slope", "column"], bottom_class=names), "bottom")
+    names = {"correction": ["level", "slope", "column"], "bottom_class": list(column_retrieval.BOTTOM_CLASSES)}
+    return label(found.assign_coords(names), "bottom")
 
 
-def water(
-    dataset: xr.Dataset,
-    *,
-    efficiency: float | None = None,
-    phase_factor: float | None = None,
-    deepest_path: float = 8.0,
-) -> xr.Dataset:
+def water(dataset: xr.Dataset, *, efficiency: float | None = None) -> xr.Dataset:
     """Estimate absorption, backscattering, Kd and bounds of c from the column.
+
+    Raises `UserError` if the view is too narrow, the dataset lacks an attribute or a number is out of range.
 
     Parameters
     ----------
@@ -338,11 +320,6 @@ def water(
         Waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the beam.
     efficiency : float, optional
         As for `bottom`.
-    phase_factor : float, optional
-        2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for Fournier-Forand functions. By default, for
-        sea water with typical particles.
-    deepest_path : float
-        Largest path in the water at which the column is used [m], above 0.
 
     Returns
     -------
@@ -351,40 +328,24 @@ def water(
         ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
         `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the
         beam.
-
-    Raises
-    ------
-    UserError
-        If the view is too narrow, the dataset lacks an attribute or a number is out of range.
     """
     lidar = lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
-    end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
-    factor = None if phase_factor is None else positive("phase_factor", phase_factor)
+    end = lidar.surface_time_ns + _DEEPEST_PATH / lidar.metres_per_ns
     in_range("spot_diameter", spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
     shallow = summed.isel(time=summed["time"].values < end)
     echoes = echo_table.extract(shallow).isel(pixel=0)
     column, system = echoes.sel(echo="column"), lidar_system(dataset.attrs, efficiency)
     share = np.where((seen := share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
     waveforms = Waveforms.from_dataset(shallow, None, None, None, None)
-    light = scattered_light.of_columns(waveforms, echoes, system, share, dataset, factor)
+    light = scattered_light.of_columns(waveforms, echoes, system, share, dataset)
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
     backscatter = scattered_light.backscatter_of(echoes, system, share)
     excess, gain = (np.nan, np.nan) if light is None else (light.excess, light.level)
     found = column_retrieval.water_of_column(decay, backscatter, excess, gain)
-    table = {
-        "column_attenuation": decay,
-        "column_attenuation_stderr": decay_error,
-        "absorption": found.absorption,
-        "backscattering": found.backscattering,
-        "kd": found.kd,
-        "attenuation": found.attenuation,
-        "attenuation_low": found.attenuation_low,
-        "attenuation_high": found.attenuation_high,
-    }
+    table = {"column_attenuation": decay, "column_attenuation_stderr": decay_error, **vars(found)}
     level_error = (column["amplitude_stderr"] / column["amplitude"]).values
-    for name, error in found.errors(decay_error, level_error).items():
-        table[f"{name}_stderr"] = error
+    table |= {f"{name}_stderr": error for name, error in found.errors(decay_error, level_error).items()}
     return _labelled(dataset, table, np.shape(decay), "water")
 
 
@@ -486,7 +447,3 @@ def _labelled(
 def _count(values: FloatArray) -> int:
     """Return the number of known values, at least 1."""
     return max(int(np.isfinite(values).sum()), 1)
-
-
-def _mean(values: FloatArray) -> float:
-    return float(values[known].mean()) if (known := np.isfinite(values)).any() else math.nan

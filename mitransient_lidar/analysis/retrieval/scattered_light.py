@@ -19,9 +19,8 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RA
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
+from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, water_and_bottoms
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
-from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function, water_scattering
@@ -79,30 +78,20 @@ class View:
 
 @dataclass(frozen=True)
 class ScatteredLight:
-    """Column and bottom in a water, over singly scattered light that absorption alone attenuates.
+    """Column and bottom in a water, over singly scattered light that absorption alone attenuates."""
 
-    Attributes
-    ----------
-    absorption, backscattering
-        Water coefficients [1/m].
-    path, column
-        Paths [m], and the column's signal there over b p(pi) exp(-2 a s), with a bottom at the last depth.
-    bottom_path, bottom
-        Bottom echo paths [m], and logarithm of their energy over exp(-2 a s).
-    fitted
-        Paths of the bins in the column's exponential [m].
-    start, excess, level
-        The column's exponential: its level at the surface over b p(pi), its attenuation minus the absorption [1/m], and
-        its level as a backscatter over bb/(2 pi).
-    """
-
+    #: Water coefficients [1/m].
     absorption: float
     backscattering: float
+    #: Paths [m], and the column's signal there over b p(pi) exp(-2 a s), with a bottom at the last depth.
     path: FloatArray
     column: FloatArray
+    #: Bottom echo paths [m], and logarithm of their energy over exp(-2 a s).
     bottom_path: FloatArray
     bottom: FloatArray
-    fitted: FloatArray
+    fitted: FloatArray  #: Paths of the bins in the column's exponential [m].
+    #: The column's exponential: its level at the surface over b p(pi), its attenuation minus the absorption [1/m], and
+    #: its level as a backscatter over bb/(2 pi).
     start: float
     excess: float
     level: float
@@ -138,37 +127,29 @@ def of_columns(
     system: LidarSystem,
     share: FloatArray,
     dataset: xr.Dataset,
-    phase_factor: float | None = None,
 ) -> ScatteredLight | None:
     """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
-    Parameters
-    ----------
-    waveforms, echoes
-        Waveforms of one pixel, and their table from `echo_table.extract` without the dimension pixel.
-    system, share
-        The lidar, and the share of the beam in view, shape () or (shots,).
-    dataset
-        Result with the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if they are known, the slope
-        variance and the pixel outlines.
-    phase_factor
-        As for `retrieve.water`.
+    Waveforms are of one pixel, as is their table from `echo_table.extract`. The share of the beam in view has the shape
+    () or (shots,). The result has the attributes ``field_of_view_mrad``, ``divergence_mrad`` and, if known, the slope
+    variance and the pixel outlines.
     """
-    decay, backscatter = (_mean(one) for one in (echoes["attenuation"].values, backscatter_of(echoes, system, share)))
+    levels = backscatter_of(echoes, system, share)
+    decay, backscatter = (mean_of_known(one) for one in (echoes["attenuation"].values, levels))
     if not (decay > 0 and backscatter > 0):
         return None
     records, width = waveforms.records(slice(0, waveforms.count)), waveforms.echo_fwhm_ns
-    start, end = (_mean(echoes[f"column_{edge}_ns"].values) for edge in ("start", "end"))
+    start, end = (mean_of_known(echoes[f"column_{edge}_ns"].values) for edge in ("start", "end"))
     inside = (records.time_ns >= start) & (records.time_ns <= end)
     path = waveforms.geometry.path_of_time(records.time_ns[inside])
     gain = waveforms.gain(slice(0, waveforms.count)).mean(axis=0)[inside]
     noise = np.broadcast_to(records.noise, records.power.shape).mean(axis=0)[inside]
     view = View.of(dataset, system, width * waveforms.geometry.metres_per_ns)
-    bottom = _mean(echoes["time_ns"].sel(echo="bottom").values)
+    bottom = mean_of_known(echoes["time_ns"].sel(echo="bottom").values)
     # Without a bottom, the water goes on below the last bin.
     deepest = float(waveforms.geometry.path_of_time(end + _BELOW * width if math.isnan(bottom) else bottom))
     weights = gain * np.exp(-2 * decay * path) / noise
-    return light_of(view, decay, backscatter, path, weights, deepest, BACKSCATTER_RATIO, phase_factor)
+    return light_of(view, decay, backscatter, path, weights, deepest, BACKSCATTER_RATIO)
 
 
 def backscatter_of(echoes: xr.Dataset, system: LidarSystem, share: FloatArray) -> FloatArray:
@@ -179,7 +160,8 @@ def backscatter_of(echoes: xr.Dataset, system: LidarSystem, share: FloatArray) -
     return np.asarray(level / (share * system.column_gain))
 
 
-def _mean(values: FloatArray) -> float:
+def mean_of_known(values: FloatArray) -> float:
+    """Return the mean of finite values, NaN without any."""
     return float(values[known].mean()) if (known := np.isfinite(values)).any() else math.nan
 
 
@@ -191,7 +173,6 @@ def light_of(
     weights: FloatArray,
     deepest: float,
     ratio: float,
-    phase_factor: float | None,
 ) -> ScatteredLight:
     """Return the light in the water whose column has an exponential.
 
@@ -207,8 +188,6 @@ def light_of(
         Path of the bottom echo, or of the deepest light [m].
     ratio
         Particle bb/b.
-    phase_factor
-        As for `retrieve.water`.
     """
     bb, a, depth = 2 * np.pi * backscatter / _FIRST_LEVEL, decay, deepest * view.system.cos_water
     for paths in _PATHS:
@@ -216,7 +195,7 @@ def light_of(
         a = max(a, _LEAST_ABSORPTION * decay)
         b, phase = _scattering(bb, ratio)
         at, column, bottom_path, bottom = _curves(view, a, bb, b, phase, depth, paths)
-        factor = phase_factor or 2 * np.pi * float(phase.eval_s(1.0)) * b / bb
+        factor = 2 * np.pi * float(phase.eval_s(1.0)) * b / bb
         seen = np.interp(path, at, np.log(np.maximum(column, 1e-9)))
         slope, start = np.polyfit(path, seen, 1, w=weights)
         start, excess = math.exp(start), -0.5 * float(slope)
@@ -232,15 +211,13 @@ def _curves(
     """Return path and signal of the column, and path and logarithm of bottoms, for `ScatteredLight`."""
     from scipy.ndimage import gaussian_filter1d
 
-    column = WaterColumn(*(np.array([one]) for one in (0.0, a + b, b, bb)))
-    model = EchoEstimate(view.system, column, [phase], np.eye(2) * 0.5 * view.slope_variance, depth, np.pi)
-    rng = np.random.default_rng(0)
-    water, bottoms = model.water_and_bottom(np.zeros((paths, 2)), _STEPS, rng, every_depth=True)
-    geometry = view.system
+    geometry, rng = view.system, np.random.default_rng(0)
+    shape, absorption = (paths, _STEPS), a + b - b
+    water, bottoms = water_and_bottoms(geometry, (absorption, b), phase, view.slope_variance, depth, shape, rng)
 
     def seen(light: Arrivals) -> tuple[FloatArray, FloatArray]:
-        shift = np.hypot(light.angle_x, light.angle_y)
-        return geometry.path_of_time(light.time_ns), light.energy * view.share(shift)
+        share = view.share(np.hypot(light.shift.real, light.shift.imag))
+        return geometry.path_of_time(light.time_ns), light.energy * share
 
     path, energy = seen(water)
     step = depth / _STEPS / geometry.cos_water

@@ -17,32 +17,19 @@ from mitransient_lidar.physics.lidar.level_sea import cos_in_water, fresnel
 
 @dataclass(frozen=True)
 class SlopeRefraction:
-    """Ray refracted into the water by a sloping surface; arrays of one shape.
+    """Ray refracted into the water by a sloping surface; arrays of one shape."""
 
-    Attributes
-    ----------
-    cos_air, cos_water
-        Cosines of the ray's angles from the facet's normal in air and water.
-    cos_vertical
-        Cosine of the ray's angle from the vertical in the water.
-    """
-
+    #: Cosines of the ray's angles from the facet's normal in air and water.
     cos_air: FloatArray
     cos_water: FloatArray
-    cos_vertical: FloatArray
+    cos_vertical: FloatArray  #: Cosine of the ray's angle from the vertical in the water.
 
     @classmethod
     def of(cls, along: npt.ArrayLike, across: npt.ArrayLike, off_nadir: float, n: float) -> SlopeRefraction:
         """Refract a ray at a facet, by Snell's law w = d/n + (cos_air/n - cos_water) m with the normal m.
 
-        Parameters
-        ----------
-        along, across : array_like
-            Facet slopes [1]; they broadcast. NaN, and a ray that meets the facet from below, give NaN.
-        off_nadir : float
-            Angle of the ray in air from the vertical [rad], 0 to below pi/2.
-        n : float
-            Refractive index of the water, at least 1.
+        The facet's slopes [1] broadcast; NaN, and a ray that meets the facet from below, give NaN. The ray's angle in
+        air from the vertical [rad] is 0 to below pi/2, and the water's refractive index at least 1.
         """
         a, b = np.broadcast_arrays(np.asarray(along, dtype=np.float64), np.asarray(across, dtype=np.float64))
         length = np.sqrt(1 + a**2 + b**2)
@@ -101,6 +88,10 @@ def variances(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a quantity's variances without and with the correction for slope and range.
 
+    Without the correction the variance is the true correction's variance over the sea, with it the variance of its
+    error. Both are to first order about the level sea, for independent slopes and range. NaN quantities are not
+    corrected.
+
     Parameters
     ----------
     quantity : callable
@@ -110,12 +101,6 @@ def variances(
     before, after : sequence of 3 array_like
         Standard deviations of slopes and range on the sea, infinite where unknown, and standard errors of their
         estimates; they broadcast. A NaN error, for a slope that is not estimated, counts in neither.
-
-    Notes
-    -----
-    Without the correction the variance is the true correction's variance over the sea, with it the variance of its
-    error. Both are to first order about the level sea, for independent slopes and range. NaN quantities are not
-    corrected.
     """
     level = np.array([0.0, 0.0, surface_range])
     without, corrected = np.zeros(1), np.zeros(1)

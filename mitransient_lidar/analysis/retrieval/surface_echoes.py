@@ -38,17 +38,10 @@ _PIXEL_CELLS = 128  # per side of the pixel map
 
 @dataclass(frozen=True)
 class PixelMap:
-    """Pixels of a receiver in tangent-plane angles (angle_x, angle_y) about its axis.
+    """Pixels of a receiver in tangent-plane angles (angle_x, angle_y) about its axis."""
 
-    Attributes
-    ----------
-    reach
-        Half side of the square about the axis that contains all pixels [rad].
-    inside
-        Whether each pixel contains the centres of the square's cells, shape (pixels, n, n) with rows along angle_y.
-    """
-
-    reach: float
+    reach: float  #: Half side of the square about the axis that contains all pixels [rad].
+    #: Whether each pixel contains the centres of the square's cells, shape (pixels, n, n) with rows along angle_y.
     inside: BoolArray
 
     @classmethod
@@ -139,21 +132,13 @@ class SeaLidar(LidarGeometry):
 
 @dataclass(frozen=True)
 class SeaShots:
-    """Surface echoes of shots at random sea locations, without noise.
+    """Surface echoes of shots at random sea locations, without noise."""
 
-    Attributes
-    ----------
-    energy
-        Received energy over pulse energy, efficiencies and aperture area [1/m^2], shape (shots, pixels).
-    time_ns
-        Mean two-way time of the echo's energy [ns], NaN without energy, shape (shots, pixels).
-    along, across, height
-        Mean sea slopes over the beam's footprint [1] and mean height above the mean sea level [m], shape (shots,).
-        Slopes are positive along for a face towards the lidar and across for a rise to its left.
-    """
-
+    #: Received energy over pulse energy, efficiencies and aperture area [1/m^2], shape (shots, pixels).
     energy: FloatArray
-    time_ns: FloatArray
+    time_ns: FloatArray  #: Mean two-way time of the echo's energy [ns], NaN without energy, shape (shots, pixels).
+    #: Mean sea slopes over the beam's footprint [1] and mean height above the mean sea level [m], shape (shots,).
+    #: Slopes are positive along for a face towards the lidar and across for a rise to its left.
     along: FloatArray
     across: FloatArray
     height: FloatArray
@@ -162,21 +147,8 @@ class SeaShots:
 def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed: int = 2**40) -> SeaShots:
     """Return the surface echoes of 600 shots at random locations on four seas.
 
-    Parameters
-    ----------
-    lidar : SeaLidar
-        Lidar.
-    wind_speed : float
-        Wind speed [m/s], 1 to 30.
-    wind_direction : float
-        Direction that the wind blows towards, counter-clockwise from the lidar's azimuth [rad].
-    seed : int
-        Seed of seas and locations, at least 0.
-
-    Raises
-    ------
-    UserError
-        If the wind speed is out of range, or waves move the light by too many beam widths.
+    The wind, 1 to 30 m/s, blows towards a direction that is counter-clockwise from the lidar's azimuth [rad]. Raises
+    `UserError` if its speed is out of range, or waves move the light by too many beam widths.
 
     Notes
     -----

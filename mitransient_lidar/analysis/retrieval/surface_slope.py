@@ -46,12 +46,8 @@ class PixelLight:
     def of_outlines(cls, outlines: Sequence[Sequence[npt.ArrayLike]], sigma: float) -> PixelLight:
         """Integrate a Gaussian beam with a standard deviation [rad] over the area inside the outlines of each pixel.
 
-        Outlines are closed lines of points (angle_x, angle_y) [rad]; a line inside another one is a hole.
-
-        Raises
-        ------
-        UserError
-            If `sigma` is not positive, a line has fewer than three points, or the beam misses a pixel.
+        Outlines are closed lines of points (angle_x, angle_y) [rad]; a line inside another one is a hole. Raises
+        `UserError` if `sigma` is not positive, a line has fewer than three points, or the beam misses a pixel.
         """
         width = positive("sigma", sigma)
         found = []
@@ -77,29 +73,22 @@ def _midpoints(low: float, high: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class SurfacePlane:
-    """Planes through the surface echoes of shots; shape (n,) each, NaN where the pixels do not determine them.
+    """Planes through the surface echoes of shots; shape (n,) each, NaN where the pixels do not determine them."""
 
-    Attributes
-    ----------
-    along, across, along_stderr, across_stderr
-        Slopes along the lidar's azimuth and to its left, and their standard errors [1].
-    range_m, range_stderr
-        Distance to the plane along the receiver's axis and its standard error [m].
-    misfit_ns
-        Root mean square deviation of the echoes from the plane over the degrees of freedom [ns]; NaN without any.
-    """
-
+    #: Slopes along the lidar's azimuth and to its left, and their standard errors [1].
     along: FloatArray
     across: FloatArray
     along_stderr: FloatArray
     across_stderr: FloatArray
+    #: Distance to the plane along the receiver's axis and its standard error [m].
     range_m: FloatArray
     range_stderr: FloatArray
+    #: Root mean square deviation of the echoes from the plane over the degrees of freedom [ns]; NaN without any.
     misfit_ns: FloatArray
 
 
 def fit_plane(
-    time_ns: npt.ArrayLike, light: PixelLight, off_nadir: float, *, stderr_ns: npt.ArrayLike = 0.0, facets: float = 1.0
+    time_ns: npt.ArrayLike, light: PixelLight, off_nadir: float, *, stderr_ns: npt.ArrayLike = 0.0
 ) -> SurfacePlane:
     """Fit a plane to the surface echoes in each shot's pixels.
 
@@ -113,19 +102,12 @@ def fit_plane(
         Angle of the receiver's axis from the vertical [rad], 0 to below pi/2.
     stderr_ns : array_like, shape () or (n, pixels)
         Standard errors of the times from noise [ns], at least 0.
-    facets : float
-        Number of facets that cause most of a pixel's echo, above 0: the error of its centre is spread/sqrt(facets).
 
     Returns
     -------
     SurfacePlane
         Both slopes with three echoes that are not collinear; with two at different angle_x, the slope along, assuming
         that across is 0; otherwise neither.
-
-    Raises
-    ------
-    UserError
-        If `facets` is not positive.
 
     Notes
     -----
@@ -153,14 +135,13 @@ def fit_plane(
     noise = np.broadcast_to(np.asarray(stderr_ns, dtype=np.float64), time.shape)
     safe = np.where(known, time, 1.0)
     inverse = np.sqrt(1 + x**2 + y**2) / (_NS * safe)
-    relative = spread / np.sqrt(positive("facets", facets))
     to_inverse = inverse / safe
     alone = to_inverse * np.hypot(np.nan_to_num(noise), _LEAST_ERROR_NS)
     correlation = _correlation(x, spread)
-    level = _planes(inverse, alone, inverse * np.tan(off_nadir) * relative, known, light, correlation, off_nadir)
+    level = _planes(inverse, alone, inverse * np.tan(off_nadir) * spread, known, light, correlation, off_nadir)
     tilt, unsure = (np.nan_to_num(one)[:, np.newaxis] for one in (level.along, level.along_stderr))
     steepness = np.hypot(np.tan(off_nadir - np.arctan(_LIKELY * tilt)), np.sqrt(_LIKELY) * unsure)
-    return _planes(inverse, alone, inverse * steepness * relative, known, light, correlation, off_nadir)
+    return _planes(inverse, alone, inverse * steepness * spread, known, light, correlation, off_nadir)
 
 
 def _correlation(x: FloatArray, spread: FloatArray) -> FloatArray:
@@ -230,59 +211,36 @@ def _planes(
 
 @dataclass(frozen=True)
 class PixelEchoes:
-    """Surface echoes in the pixels of shots; shape (n, pixels) each.
+    """Surface echoes in the pixels of shots; shape (n, pixels) each."""
 
-    Attributes
-    ----------
-    time_ns, time_stderr_ns
-        Two-way times and their standard errors from noise [ns]; NaN for a pixel without an echo.
-    energy, energy_stderr
-        Echo energy and its standard error from noise [J], or [V s] for a signal; NaN for a pixel without an echo.
-    column_energy
-        Water column energy during an echo, which hides fainter ones, in the same unit, shape (pixels,).
-    time_spread_ns
-        Standard deviation of the light's arrival over the pixel from a level sea [ns], shape (pixels,).
-    echo_fwhm_ns
-        Full echo width at half maximum [ns].
-    """
-
+    #: Two-way times and their standard errors from noise [ns]; NaN for a pixel without an echo.
     time_ns: FloatArray
     time_stderr_ns: FloatArray
+    #: Echo energy and its standard error from noise [J], or [V s] for a signal; NaN for a pixel without an echo.
     energy: FloatArray
     energy_stderr: FloatArray
+    #: Water column energy during an echo, which hides fainter ones, in the same unit, shape (pixels,).
     column_energy: FloatArray
+    #: Standard deviation of the light's arrival over the pixel from a level sea [ns], shape (pixels,).
     time_spread_ns: FloatArray
-    echo_fwhm_ns: float
+    echo_fwhm_ns: float  #: Full echo width at half maximum [ns].
 
 
 @dataclass(frozen=True)
 class SeaEstimate:
-    """Sea slopes along and across [1] and height [m] under shots, averaged over the beam's footprint.
+    """Sea slopes along and across [1] and height [m] under shots, averaged over the beam's footprint."""
 
-    Attributes
-    ----------
-    mean, covariance
-        Estimates in this order, shape (n, 3), and the covariance of their errors, shape (n, 3, 3).
-    prior
-        Covariance of the three on the sea, shape (3, 3).
-    """
-
+    #: Estimates in this order, shape (n, 3), and the covariance of their errors, shape (n, 3, 3).
     mean: FloatArray
     covariance: FloatArray
-    prior: FloatArray
+    prior: FloatArray  #: Covariance of the three on the sea, shape (3, 3).
 
 
 def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> SeaEstimate:
     """Estimate slopes and height of the sea from echo times and strengths, given the sea's statistics.
 
-    Parameters
-    ----------
-    echoes : PixelEchoes
-        Measured echoes.
-    shots : SeaShots
-        Echoes of the same lidar at random locations on a sea with the same statistics.
-    scale : float or None
-        Pulse energy times efficiencies and aperture area [J m^2], positive. If None, strengths are not used.
+    `shots` are echoes of the same lidar at random locations on a sea with the same statistics. `scale` is pulse energy
+    times efficiencies and aperture area [J m^2], positive; if None, strengths are not used.
 
     Notes
     -----

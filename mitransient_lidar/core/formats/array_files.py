@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, open_file
-from mitransient_lidar.core.formats.exr_chunks import check_chunks, read_headers
+from mitransient_lidar.core.formats.exr_chunks import check_parts
 from mitransient_lidar.core.validation import usable_memory
 
 if TYPE_CHECKING:
@@ -32,10 +32,7 @@ Array = npt.NDArray[Any]
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
     """Return a file's suffix in lower case; `kind` is the file kind, for the message.
 
-    Raises
-    ------
-    UserError
-        If the suffix is not one of `suffixes`, or the file cannot be opened, or is no regular one.
+    Raises `UserError` if the suffix is not one of `suffixes`, or the file cannot be opened, or is no regular one.
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:
@@ -120,9 +117,7 @@ def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
     """Raise `UserError` if an OpenEXR file is damaged, or has more bytes of pixels than allowed by its headers."""
     check_regular(path)
     with damaged_file(damaged):
-        for part in read_headers(path):
-            check_size(path, 4.0 * part.shape[0] * part.shape[1] * max(part.channels, 1), most)
-        check_chunks(path)
+        check_parts(path, lambda size: check_size(path, size, most))
 
 
 def check_hdf5(path: str | os.PathLike[str]) -> None:
@@ -161,10 +156,7 @@ def read_netcdf(path: Path) -> xr.Dataset:
     damaged = f"{path} is damaged, or is not a NetCDF-4 file."
     with damaged_file(damaged):
         check_hdf5(path)
-    with (
-        damaged_file(damaged),
-        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
-    ):
+    with damaged_file(damaged), xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file:
         check_size(path, file.nbytes)
         dataset = file.load()
     for variable in dataset.variables.values():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import IO
 
@@ -59,30 +60,21 @@ class Part:
             raise ValueError(f"chunk {number} is damaged")
 
 
-def read_headers(path: str | os.PathLike[str]) -> list[Part]:
-    """Return the parts of an OpenEXR file.
-
-    Raises
-    ------
-    ValueError, KeyError, IndexError, struct.error
-        If a header is damaged.
-    """
-    with open_file(path) as file:
-        return _headers(file)[0]
-
-
-def check_chunks(path: str | os.PathLike[str]) -> None:
+def check_parts(path: str | os.PathLike[str], check_size: Callable[[float], None]) -> None:
     """Raise an error if scan line chunks are not where the file states, or do not decompress.
 
-    Tiles are not checked, nor the data of other compressions than ZIP, ZIPS and PXR24.
-
-    Raises
-    ------
-    ValueError, KeyError, IndexError, struct.error, zlib.error
-        If the file is damaged.
+    Tiles are not checked, nor the data of other compressions than ZIP, ZIPS and PXR24. The bytes of the pixels of each
+    part are checked before. Raises `ValueError`, `KeyError`, `IndexError`, `struct.error` or `zlib.error` if the file
+    is damaged.
     """
     with open_file(path) as file:
-        parts, several = _headers(file)
+        (version,) = struct.unpack("<4xI", file.read(8))
+        several = bool(version & _SEVERAL)
+        parts = [_part(_attributes(file), version)]
+        while several and (attributes := _attributes(file)):
+            parts.append(_part(attributes, version))
+        for part in parts:
+            check_size(4.0 * part.shape[0] * part.shape[1] * max(part.channels, 1))
         if not several and not parts[0].is_plain:
             return
         tables = [struct.unpack(f"<{part.chunks}Q", file.read(8 * part.chunks)) for part in parts]
@@ -92,16 +84,6 @@ def check_chunks(path: str | os.PathLike[str]) -> None:
                 if several and struct.unpack("<i", file.read(4))[0] != index:
                     raise ValueError(f"chunk {number} is damaged")
                 part.check_chunk(file, number)
-
-
-def _headers(file: IO[bytes]) -> tuple[list[Part], bool]:
-    """Return a file's parts, with the file at its tables, and whether the file has several."""
-    (version,) = struct.unpack("<4xI", file.read(8))
-    several = bool(version & _SEVERAL)
-    parts = [_part(_attributes(file), version)]
-    while several and (attributes := _attributes(file)):
-        parts.append(_part(attributes, version))
-    return parts, several
 
 
 def _attributes(file: IO[bytes]) -> dict[str, bytes]:

@@ -38,13 +38,8 @@ def las_blocks(path: Path, first: int, end: int | None, field: str | None, size:
     """Yield the waveforms from `first` to before `end` of a file, each once, in the order of its points.
 
     At most `size` points are in memory. The channel is a `field` of the points; ``descriptor`` is the index of the wave
-    packet descriptor.
-
-    Raises
-    ------
-    UserError
-        If the file is damaged or has no waveforms, its packets are missing, cut or compressed, an offset is outside
-        their file, a descriptor is missing, or samples are of other than 8, 16 or 32 bits.
+    packet descriptor. Raises `UserError` if the file is damaged or has no waveforms, its packets are missing, cut or
+    compressed, an offset is outside their file, a descriptor is missing, or samples are of other than 8, 16 or 32 bits.
     """
     import laspy
 

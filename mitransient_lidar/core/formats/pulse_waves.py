@@ -62,13 +62,9 @@ class _Descriptor(NamedTuple):
 def pulse_blocks(path: Path, first: int, end: int | None, size: int) -> Iterator[WaveformBlock]:
     """Yield the returning waveforms of the pulses from `first` to before `end` of a file .pls, one for each segment.
 
-    At most `size` pulses are in memory. The channel is that of the sampling.
-
-    Raises
-    ------
-    UserError
-        If a file is missing, damaged, cut or compressed, an offset is outside the samples, a descriptor is missing, or
-        samples are of other than 8, 16 or 32 bits.
+    At most `size` pulses are in memory. The channel is that of the sampling. Raises `UserError` if a file is missing,
+    damaged, cut or compressed, an offset is outside the samples, a descriptor is missing, or samples are of other than
+    8, 16 or 32 bits.
     """
     with open_file(path) as file:
         with damaged_file(f"{path} is damaged, or is not a PulseWaves file."):

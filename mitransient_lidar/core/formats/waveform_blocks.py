@@ -20,34 +20,22 @@ _WINDOW = 2**22  # bytes that are read at a time where waveforms follow each oth
 
 @dataclass(frozen=True)
 class WaveformBlock:
-    """Waveforms of one length, spacing and digitiser.
+    """Waveforms of one length, spacing and digitiser."""
 
-    Attributes
-    ----------
-    number, channel, gps_time
-        Number in the file, from 0, channel and time of the pulse [s], shape (waveforms,).
-    counts
-        Samples as digitised, unsigned integers of shape (waveforms, samples).
-    spacing_ns, gain, offset
-        Time between samples [ns]; a sample is offset + gain x count [V], or a count where the gain is 0.
-    first_ns
-        Time of the first sample after the pulse left the scanner [ns]; NaN where the file does not state it.
-    return_ns
-        Time of the first return after the first sample [ns]; NaN where there is none.
-    place, step
-        Place of the first sample [m], and the way along the pulse, away from the scanner, in 1 ns of the record [m/ns]:
-        half the speed of light. Shape (waveforms, 3).
-    """
-
+    #: Number in the file, from 0, channel and time of the pulse [s], shape (waveforms,).
     number: npt.NDArray[np.int64]
     channel: npt.NDArray[np.int64]
     gps_time: FloatArray
-    counts: npt.NDArray[Any]
+    counts: npt.NDArray[Any]  #: Samples as digitised, unsigned integers of shape (waveforms, samples).
+    #: Time between samples [ns]; a sample is offset + gain x count [V], or a count where the gain is 0.
     spacing_ns: float
     gain: float
     offset: float
+    #: Time of the first sample after the pulse left the scanner [ns]; NaN where the file does not state it.
     first_ns: FloatArray
-    return_ns: FloatArray
+    return_ns: FloatArray  #: Time of the first return after the first sample [ns]; NaN where there is none.
+    #: Place of the first sample [m], and the way along the pulse, away from the scanner, in 1 ns of the record [m/ns]:
+    #: half the speed of light. Shape (waveforms, 3).
     place: FloatArray
     step: FloatArray
 
@@ -71,10 +59,7 @@ class PacketFile:
     def take(self, start: int, count: int, whose: str, *, begins: bool = False) -> bytes:
         """Return bytes of `whose` from a position on, where its samples begin or go on.
 
-        Raises
-        ------
-        UserError
-            If the samples begin outside the file, or it ends before the last byte.
+        Raises `UserError` if the samples begin outside the file, or it ends before the last byte.
         """
         if begins and not HEADER <= start < max(self._size, HEADER + 1):
             raise UserError(

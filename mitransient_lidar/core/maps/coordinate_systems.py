@@ -120,11 +120,8 @@ def is_east_north(system: Any) -> bool:
 def map_system(path: object, text: Any, name: object = None) -> MapSystem:
     """Return a map's system from a code, a WKT or attributes, which belong to `name` or to the map's own file.
 
-    Raises
-    ------
-    UserError
-        If pyproj does not know it, its coordinates are degrees or geocentric, or its axes do not point to east and
-        north.
+    Raises `UserError` if pyproj does not know it, its coordinates are degrees or geocentric, or its axes do not point
+    to east and north.
     """
     system = parsed_system(path if name is None else name, text)
     horizontal, vertical = system, None
@@ -180,20 +177,10 @@ def read_prj(path: Path) -> MapSystem | None:
 
 
 def distortions(system: Any, longitude: FloatArray, latitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the azimuth of true north from grid north [deg], and the scale of a projection.
+    """Return the azimuth of true north from grid north [deg], and the scale of a projection, at positions [deg].
 
-    Parameters
-    ----------
-    system : pyproj.CRS
-        Projected coordinate system.
-    longitude, latitude : ndarray, shape (n,)
-        Positions [deg].
-
-    Returns
-    -------
-    north, scale : ndarray, shape (n,)
-        Azimuths, and lengths in the projection divided by lengths on the ground, along the meridian or the parallel,
-        whichever differs more from 1; NaN outside the projection.
+    The scale is of lengths in the projection to lengths on the ground, along the meridian or the parallel, whichever
+    differs more from 1; NaN outside the projection.
     """
     import pyproj
 

@@ -35,61 +35,34 @@ def is_green(wavelength_nm: float | None) -> bool:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A plugin parameter.
+    """A plugin parameter."""
 
-    Attributes
-    ----------
-    name, kind, meaning
-        Name, type as in the manual (``float``, ``integer``, ``boolean``, ``string``, or kind of an object), meaning.
-    default
-        Value where none is given; None without one.
-    unit
-        Unit as in data files, ``1`` of a plain number; empty for texts.
-    low, high
-        Range of a number, or of each number in a list.
-    above
-        Whether `low`, which is then 0, is itself outside the range.
-    choices
-        Allowed texts; empty for any.
-    is_list
-        Whether the value is a text of numbers, one for each layer or one for all.
-    may_be_auto, may_be_empty
-        Whether ``auto`` leaves the choice to the scene, and whether an empty text counts as not given.
-    is_file
-        Whether the value is a file name.
-    by_id
-        Whether its name alone means a parameter in other plugins, so that only one with an id or its plugin's name
-        reaches it.
-    of_green
-        Whether `default` holds for green lasers alone (`is_green`).
-    otherwise
-        Rule without a value where `default` does not state it.
-    """
-
+    #: Name, type as in the manual (``float``, ``integer``, ``boolean``, ``string``, or kind of an object), meaning.
     name: str
     kind: str
     meaning: str
-    default: Any = None
-    unit: str = ""
+    default: Any = None  #: Value where none is given; None without one.
+    unit: str = ""  #: Unit as in data files, ``1`` of a plain number; empty for texts.
+    #: Range of a number, or of each number in a list.
     low: float = -math.inf
     high: float = math.inf
-    above: bool = False
-    choices: tuple[str, ...] = ()
-    is_list: bool = False
+    above: bool = False  #: Whether `low`, which is then 0, is itself outside the range.
+    choices: tuple[str, ...] = ()  #: Allowed texts; empty for any.
+    is_list: bool = False  #: Whether the value is a text of numbers, one for each layer or one for all.
+    #: Whether ``auto`` leaves the choice to the scene, and whether an empty text counts as not given.
     may_be_auto: bool = False
     may_be_empty: bool = False
-    is_file: bool = False
+    is_file: bool = False  #: Whether the value is a file name.
+    #: Whether its name alone means a parameter in other plugins, so that only one with an id or its plugin's name
+    #: reaches it.
     by_id: bool = False
-    of_green: bool = False
-    otherwise: str = ""
+    of_green: bool = False  #: Whether `default` holds for green lasers alone (`is_green`).
+    otherwise: str = ""  #: Rule without a value where `default` does not state it.
 
     def checked(self, value: Any) -> Any:
         """Return a value of this parameter: a float, an integer or a truth value within its range; others as given.
 
-        Raises
-        ------
-        UserError
-            If it is not allowed; the sentence names the parameter, the value and the allowed values.
+        Raises `UserError` if it is not allowed; the sentence names the parameter, the value and the allowed values.
         """
         if value is None or (self.may_be_auto and value == AUTO) or self.is_list:
             return value

@@ -125,13 +125,9 @@ def read_headings(
 ) -> list[Heading | None]:
     """Return the meaning of each heading in a file.
 
-    None stands for those without a name, with one of `ignored`, or at another wavelength than the one given.
-
-    Raises
-    ------
-    UserError
-        If a name or unit is unknown, a column is there twice, none has the wavelength given, or none is given and the
-        columns have several.
+    None stands for those without a name, with one of `ignored`, or at another wavelength than the one given. Raises
+    `UserError` if a name or unit is unknown, a column is there twice, none has the wavelength given, or none is given
+    and the columns have several.
     """
     headings = [parse_heading(name, columns) for name in names]
     for name, heading in zip(names, headings, strict=True):
@@ -156,11 +152,7 @@ def pick_columns(
     """Return the index and meaning of the one heading for each column group; other headings do not matter.
 
     A name with words that are no unit, such as ``depth_uncertainty``, is another heading; in brackets they are a unit.
-
-    Raises
-    ------
-    UserError
-        If a group has no heading, several, or only some in an unknown unit.
+    Raises `UserError` if a group has no heading, several, or only some in an unknown unit.
     """
     columns = [column for group in groups for column in group]
     headings = [parse_heading(name, columns) for name in names]

@@ -44,10 +44,7 @@ class LongTable(NamedTuple):
 def read_head(path: Path) -> str:
     """Return the first 64 KiB of a text, without a line that they cut.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, or is larger than 512 MiB.
+    Raises `UserError` if the file cannot be read, or is larger than 512 MiB.
     """
     with open_file(path) as file:
         size, head = os.fstat(file.fileno()).st_size, file.read(_HEAD)
@@ -66,22 +63,9 @@ def read_long_table(
     a decimal comma; they may stand in quotation marks. Comments follow a #; above the rows, they may begin with %, //
     or ! as well, and one of them may be the heading. Missing values are pandas' own, such as an empty cell or NA.
 
-    Parameters
-    ----------
-    path : Path
-        Text file in UTF-8.
-    columns, others : sequence of Column
-        The first columns in a table without a heading, and further ones that identify a line as a heading.
-    choose : callable
-        Column choice by the names in the heading.
-    names : list of str
-        Names that stand elsewhere; empty if they are in the heading.
-
-    Raises
-    ------
-    UserError
-        If the file is larger than 512 MiB or has more than 10^7 rows, no row, other columns, or entries that are no
-        numbers.
+    Without a heading, the first columns are `columns`; these and `others` identify a line as a heading, unless `names`
+    stand elsewhere. `choose` chooses columns by the names. Raises `UserError` if the file is no text in UTF-8, is
+    larger than 512 MiB or has more than 10^7 rows, no row, other columns, or entries that are no numbers.
     """
     import pandas as pd
 

@@ -92,7 +92,8 @@ def read_table(
     comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or blanks;
     between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their line with
     %, // or !. Rows with missing values (empty, nan, na, n/a, null, none, dashes) are left out with a warning in the
-    log.
+    log. Raises `UserError` if the file cannot be read or is not text; a name, unit or wavelength is unknown, or a
+    column is there twice; or a line does not contain one number for each column.
 
     Parameters
     ----------
@@ -106,12 +107,6 @@ def read_table(
         Wavelength [nm] of the columns, if the file has several.
     positional : bool
         Whether a file without heading has exactly `columns`, in their order and first units.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read or is not text; a name, unit or wavelength is unknown, or a column is there twice; or
-        a line does not contain one number for each column.
     """
     text = read_text(path)
     if (count := text.count("\n")) > _MOST_LINES:
@@ -165,10 +160,8 @@ def read_two_columns(path: str | PathLike[str], first: Column, second: Column) -
 def read_time_samples(path: str | PathLike[str], quantity: Column) -> tuple[FloatArray, FloatArray]:
     """Read times [ns] and the values of a quantity, in any order below a heading, or in this order without one.
 
-    Raises
-    ------
-    UserError
-        As `read_table`; or if the unit of time is not given and the record is shorter than a picosecond in ns.
+    Raises `UserError` as `read_table`; or if the unit of time is not given and the record is shorter than a picosecond
+    in ns.
     """
     table = read_two_columns(path, TIME, quantity)
     times, values = table.columns["time"], table.columns[quantity.name]

@@ -53,12 +53,7 @@ def write_csv(
 ) -> None:
     """Write or replace a CSV file: numbers of so many digits, or all, and a word for NaN; no index.
 
-    Further frames add rows, under the columns of the first one.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Further frames add rows, under the columns of the first one. Raises `UserError` if the file cannot be written.
     """
     form = None if digits is None else f"%.{digits}g"
     columns = None

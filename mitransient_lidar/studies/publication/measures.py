@@ -135,14 +135,7 @@ def change(waveform: Waveform, pixel: int, middle: float) -> tuple[float, float]
 
     The start is where the decay steepens fastest, the stop where it flattens fastest: the extremes of the logarithmic
     power's second derivative. A small step that a Gaussian smears has them one standard deviation before and after its
-    middle; an exponential adds nothing.
-
-    Parameters
-    ----------
-    waveform, pixel
-        Waveform, and index of the pixel.
-    middle
-        Expected time of the change [ns], to 9 ns.
+    middle; an exponential adds nothing. The expected time `middle` [ns] is known to 9 ns.
     """
     time = waveform.time
     lag = max(1, round(_LAG_NS / (time[1] - time[0])))

@@ -52,24 +52,13 @@ _APART_M, _SEED_STEP = 6.0, 1000
 class Renders:
     """Results for the publication's scenes.
 
-    Parameters
-    ----------
-    target_error
-        Relative standard error of a figure's median bin, greater than 0. The mast in figure 4 may miss it.
-    seed
-        Seed of all random numbers, 0 to 10^6.
-    progress
-        Called with a `passes.Progress` after every batch of shots.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range.
+    Raises `UserError` if a number is out of range.
     """
 
+    #: Relative standard error of a figure's median bin, greater than 0. The mast in figure 4 may miss it.
     target_error: float = 0.01
-    seed: int = 0
-    progress: ProgressCallback | None = None
+    seed: int = 0  #: Seed of all random numbers, 0 to 10^6.
+    progress: ProgressCallback | None = None  #: Called with a `passes.Progress` after every batch of shots.
     _results: dict[tuple[Any, ...], xr.Dataset] = field(default_factory=dict)
     _sessions: dict[tuple[str, int], LoadedScene] = field(default_factory=dict)
     _seas: dict[tuple[str, int], SeaMap] = field(default_factory=dict)

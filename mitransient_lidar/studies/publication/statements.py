@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.tables.written import table_lines, write_csv
 from mitransient_lidar.core.validation import FloatArray
 
 #: Column names in the written table.
@@ -40,39 +40,21 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement in the publication, reworded, and the measured quantity.
+    """A statement in the publication, reworded, and the measured quantity."""
 
-    Attributes
-    ----------
-    figure, statement, quantity
-        Name of the figure, the statement, and the measured quantity with its unit.
-    published
-        Published value, empty without a number.
-    value, error
-        Measured value and its standard error.
-    limits
-        Interval of the values for which the statement holds.
-    where
-        Measure, place and mesh.
-    share
-        Share of other locations for which it holds, None if no location was chosen.
-    places
-        Description of these locations.
-    difference
-        Reason for a difference from the publication.
-    """
-
+    #: Name of the figure, the statement, and the measured quantity with its unit.
     figure: str
     statement: str
     quantity: str
-    published: str
+    published: str  #: Published value, empty without a number.
+    #: Measured value and its standard error.
     value: float
     error: float
-    limits: tuple[float, float]
-    where: str
-    share: float | None = None
-    places: str = ""
-    difference: str = ""
+    limits: tuple[float, float]  #: Interval of the values for which the statement holds.
+    where: str  #: Measure, place and mesh.
+    share: float | None = None  #: Share of other locations for which it holds, None if no location was chosen.
+    places: str = ""  #: Description of these locations.
+    difference: str = ""  #: Reason for a difference from the publication.
 
     @property
     def holds(self) -> str:
@@ -104,38 +86,28 @@ class Statement:
 
 def statements_of(figure: str, found: Mapping[str, Measured]) -> list[Statement]:
     """Return a figure's statements in table order, with the found quantities by name."""
-    text = (resources.files(__package__) / "statements.csv").read_text("utf-8")
-    return [
-        _statement(row, found[row["measure"]]) for row in csv.DictReader(text.splitlines()) if row["figure"] == figure
-    ]
-
-
-def _statement(row: Mapping[str, str], found: Measured) -> Statement:
-    """Return the statement in a table row."""
-    texts = {name: text.format(**found.words) for name, text in row.items()}
-    low, high = float(texts["low"]), float(texts["high"])
-    return Statement(
-        **{name: texts[name] for name in ("figure", "statement", "quantity", "published", "where", "places")},
-        difference=texts["difference"],
-        value=found.value,
-        error=found.error,
-        limits=(low, high),
-        share=None if found.others is None else float(np.mean((found.others >= low) & (found.others <= high))),
-    )
+    table = (resources.files(__package__) / "statements.csv").read_text("utf-8")
+    statements = []
+    for row in csv.DictReader(table.splitlines()):
+        if row["figure"] == figure:
+            value, error, others, words = found[row["measure"]]
+            texts = {name: text.format(**words) for name, text in row.items() if name != "measure"}
+            low, high = float(texts.pop("low")), float(texts.pop("high"))
+            share = None if others is None else float(np.mean((others >= low) & (others <= high)))
+            statements.append(Statement(value=value, error=error, limits=(low, high), share=share, **texts))
+    return statements
 
 
 def write_statements(statements: Sequence[Statement], path: Path) -> None:
     """Write a CSV table of statements, in place of an existing file on success only."""
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        table.writerows(one.row() for one in statements)
+    import pandas as pd
+
+    write_csv(pd.DataFrame([one.row() for one in statements], columns=COLUMNS), path)
 
 
 def describe_statements(statements: Sequence[Statement]) -> list[str]:
     """Return the lines of a table: figure, whether it holds, value, error, published value, statement."""
-    lines = [f"{'figure':<8}{'holds':<8}{'value':>10}{'error':>10}{'published':>18}  statement: quantity"]
-    for one in statements:
-        numbers = f"{one.value:>10.4g}{one.error:>10.2g}{one.published:>18}"
-        lines.append(f"{one.figure:<8}{one.holds:<8}{numbers}  {one.statement}: {one.quantity}")
-    return lines
+    columns = (("figure", "<8"), ("holds", "<8"), ("value", ">10.4g"), ("error", ">10.2g"), ("published", ">18"))
+    rows = [(one.figure, one.holds, one.value, one.error, one.published) for one in statements]
+    texts = ["  statement: quantity", *(f"  {one.statement}: {one.quantity}" for one in statements)]
+    return [line + text for line, text in zip(table_lines(columns, rows), texts, strict=True)]

@@ -168,20 +168,15 @@ def seen(monkeypatch):
 
 def test_commands_write_the_page_of_a_scene(seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = run("scenes", "show", "table1", "--html")
-    assert (done.exit_code, done.stdout) == (0, "table1.html\n")
-    assert (tmp_path / "table1.html").read_text().startswith("<html>")
     done = run("view", "table1", "-D", "bottom_depth=5", "-o", "new/scene.html", "--no-browser")
     assert (done.exit_code, done.stdout) == (0, "new/scene.html\n")
-    assert seen == [("table1",), ("table1", {"bottom_depth": "5"})]
-    # Without --html it is the XML, as before.
+    assert (tmp_path / "new/scene.html").read_text().startswith("<html>")
+    assert seen == [("table1", {"bottom_depth": "5"})]
     assert run("scenes", "show", "table1").stdout.startswith("<")
 
 
 def test_commands_refuse_what_does_not_go_with_a_scene(seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert_refused(run("scenes", "show", "table1", "-o", "a.html"), "--output a.html needs --html")
-    assert_refused(run("scenes", "show", "table1", "--html", "-o", "a.png"), "a.png must end in .html")
     assert_refused(run("view", "table1", "--plot"), "--plot needs a result: table1 is a scene or points")
     assert_refused(run("view", "shot.nc", "-D", "bottom_depth=5"), "-D needs a scene: shot.nc is none")
     assert_refused(run("view", "missing.laz", "--shot", 2), "--shot needs a result")

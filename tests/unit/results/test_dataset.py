@@ -92,27 +92,18 @@ def test_build_orders_an_imager_row_by_row():
         ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0 must be greater than 0"),
         ({"time": TimeAxis(0.0, float("nan"), 3)}, "bin_width_ns = nan"),
         ({"time": TimeAxis(float("inf"), 1.0, 3)}, "time_start_ns = inf must be finite"),
-        ({"time": TimeAxis(0.0, 1.0, 4)}, "time has 4 bins; it must have those of impulse_response, 3"),
         ({"pixel_names": ["a"]}, "must be 2 different names"),
         ({"pixel_names": ["a", "a"]}, "must be 2 different names"),
-        ({"pixel_centres_mrad": [(0, 0)]}, "pixel_centres_mrad must be 2 finite pairs"),
-        ({"pixel_centres_mrad": [(0, 0), (0, np.nan)]}, "pixel_centres_mrad must be 2 finite pairs"),
-        ({"grid": (2, 2)}, r"grid = \(2, 2\)"),
         ({"attributes": {"bad": None}}, "attribute bad = None"),
         ({"attributes": {"bad": ["a", 1]}}, "attribute bad"),
         ({"attributes": {"bad": 2**63}}, "attribute bad"),
-        ({"waveform": np.ones((2, 4))}, r"waveform has shape \(2, 4\)"),
-        ({"impulse_response": np.ones(3)}, r"impulse_response has shape \(3,\)"),
     ],
 )
 def test_build_rejects(change, sentence):
-    arguments = dict.fromkeys(
-        ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr"), np.ones((2, 3))
-    )
-    arguments |= {"time": TimeAxis(0.0, 1.0, 3), "pixel_names": ["a", "b"]}
+    arguments = {"time": TimeAxis(0.0, 1.0, 3), "pixel_names": ["a", "b"]}
     arguments |= {"pixel_centres_mrad": np.zeros((2, 2)), "attributes": {}} | change
     with pytest.raises(ValueError, match=sentence):
-        results.build(**arguments)
+        results.build(*[np.ones((2, 3))] * 4, **arguments)
 
 
 def test_build_warns_of_non_finite_values_and_keeps_them(caplog):

@@ -7,7 +7,7 @@ from closed_form_waveform import METRES_PER_NS, SURFACE_NS
 
 import mitransient_lidar
 from mitransient_lidar.analysis.information.alignment import light_duration
-from mitransient_lidar.analysis.information.bandwidth import BehindBandwidth
+from mitransient_lidar.analysis.information.bandwidth import behind_bandwidth
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 
@@ -124,7 +124,7 @@ def test_a_scene_that_does_not_explain_waveforms_of_unknown_noise_is_refused(tmp
 
 def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
     """A single pole of 80 MHz, from a start of 100 MHz: parameters and bandwidth within their errors."""
-    behind = BehindBandwidth(model)({**TRUTH, "bandwidth_mhz": 80.0})["waveform"].values[0]
+    behind = behind_bandwidth(model)({**TRUTH, "bandwidth_mhz": 80.0})["waveform"].values[0]
     random = np.random.default_rng(5)
     path = write(tmp_path / "shot.csv", 1e6 * behind + random.normal(0, 0.003, TIME.size), TIME)
     fitted = fit(path, (0.8, 1.2, 0.9), free=[*TRUTH, "bandwidth_mhz"], noise=0.003 * SCALE)
@@ -136,5 +136,5 @@ def test_the_bandwidth_of_a_receiver_is_fitted(tmp_path):
     with pytest.raises(UserError, match="alternatives"):
         fit(path, (1, 1, 1), free=[*TRUTH, "bandwidth_mhz"], receiver="apd")
     # A scene of which nothing is free has no derivatives.
-    alone = BehindBandwidth(lambda _: model(TRUTH).drop_dims("parameter"))({"bandwidth_mhz": 80.0})
+    alone = behind_bandwidth(lambda _: model(TRUTH).drop_dims("parameter"))({"bandwidth_mhz": 80.0})
     assert alone["waveform_derivative"].sizes["parameter"] == 1

@@ -8,7 +8,7 @@ from mitransient_lidar.analysis.retrieval import scattered_light
 LEVEL = 1.13  # of the columns of `synthetic_shots` over that of bb
 
 
-def light_of(view, decay, backscatter, path, weights, deepest, ratio, phase_factor):
+def light_of(view, decay, backscatter, path, weights, deepest, ratio):
     """Column and bottom decay alike, with a + bb, and the column ends at the bottom."""
     bb = 2 * np.pi * backscatter / LEVEL
     at = np.linspace(0, 2 * deepest, 2001)

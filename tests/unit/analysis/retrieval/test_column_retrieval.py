@@ -68,17 +68,9 @@ def test_reflectance_is_the_ratio_of_bottom_and_column():
 
 
 def test_classes():
-    names, share = bottom_class([0.05, 0.1, 0.3, np.nan], [0.05, 0.02, 0.0, 0.1])
-    assert names == ["dark", "medium", "bright"]
+    share = bottom_class([0.05, 0.1, 0.3, np.nan], [0.05, 0.02, 0.0, 0.1])
     # Normal distribution function at 1 and 3, and at 0 and 5.
     np.testing.assert_allclose(share[0], [0.8413447, 0.9986501 - 0.8413447, 1 - 0.9986501], atol=1e-6)
     np.testing.assert_allclose(share[1], [0.5, 0.5, 2.9e-7], atol=1e-6)
     assert share[2].tolist() == [0, 0, 1]
     assert np.isnan(share[3]).all()
-    assert bottom_class(0.3, 0.01, {"mud": 0, "sand": 0.15})[1].round(6).tolist() == [0, 1]
-
-
-@pytest.mark.parametrize("edges", [{}, {"mud": 0.1}, {"mud": 0.0, "sand": 0.0}])
-def test_classes_out_of_order(edges):
-    with pytest.raises(ValueError, match="must have lower edges that increase from 0"):
-        bottom_class(0.1, 0.01, edges)

@@ -309,7 +309,6 @@ def drop(name):
             lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
             "slope_deviation = .* and wind_speed = 6 are alternatives",
         ),
-        (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
         (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
         (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),

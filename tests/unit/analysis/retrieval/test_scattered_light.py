@@ -29,7 +29,7 @@ def test_light_of_rendered_columns(name, monkeypatch):
     monkeypatch.setattr(scattered_light, "_PATHS", (512, 1024, 1024, 2048))
     path = np.arange(*window, 0.11)
     weights = np.linspace(1.0, 0.57, path.size)
-    found = light_of(VIEW, decay, level, path, weights, deepest, 0.0193, None)
+    found = light_of(VIEW, decay, level, path, weights, deepest, 0.0193)
     assert decay - found.excess == pytest.approx(absorption, rel=0.04)
     assert 2 * np.pi * level / found.level == pytest.approx(backscattering, rel=0.08)
     # Noise of the estimate, and of the water that is found.

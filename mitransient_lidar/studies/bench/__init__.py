@@ -1,1 +1,0 @@
-"""Benchmarks: integrator speed and accuracy, narrow beams, and images."""
