@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
+from mitransient_lidar.cli.files import write_page
 from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.written import aligned_lines
 
@@ -27,8 +29,18 @@ def list_scenes() -> None:
     _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
-def _show(name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]) -> None:
-    """Print the XML of a scene, self-contained."""
+def _show(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")],
+    html: Annotated[bool, typer.Option("--html", help="Write NAME.html, a page of the scene, instead.")] = False,
+) -> None:
+    """Print the XML of a scene, self-contained, or write its page."""
+    if html:
+        from mitransient_lidar.plots.viewer import view_scene
+
+        with reporting(quiet=False):
+            page = view_scene(name)
+        write_page(page, Path(f"{Path(name).stem}.html"))
+        return
     from mitransient_lidar.loading.catalogue import scene_text
 
     typer.echo(scene_text(name), nl=False)
@@ -108,7 +120,12 @@ COMMANDS = {
 
 SCENES = {
     "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
-    "show": Command("Commands", "", _show, "Print the XML of a scene, self-contained; view NAME shows it as a page."),
+    "show": Command(
+        "Commands",
+        "",
+        _show,
+        "Print the XML of a scene, self-contained, or write a page that shows it, as view NAME does.",
+    ),
     "copy": Command("Commands", "", _copy, "Copy a scene or an example file to edit."),
     "instruments": Command(
         "Commands",

@@ -168,6 +168,9 @@ def seen(monkeypatch):
 
 def test_commands_write_the_page_of_a_scene(seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    done = run("scenes", "show", "table1", "--html")
+    assert (done.exit_code, done.stdout) == (0, "table1.html\n")
+    assert (tmp_path / "table1.html").read_text().startswith("<html>")
     done = run("view", "table1", "-D", "bottom_depth=5", "-o", "new/scene.html", "--no-browser")
     assert (done.exit_code, done.stdout) == (0, "new/scene.html\n")
     assert (tmp_path / "new/scene.html").read_text().startswith("<html>")
