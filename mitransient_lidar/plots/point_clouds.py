@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -136,7 +137,8 @@ def _draw_side(ax: Axes, points: xr.Dataset) -> None:
             ax.plot(points[along].values[chosen], points["z"].values[chosen], ".", color=colour, ms=size, label=label)
     ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title=f"Points by class, from the side{_exaggeration(ax)}")
     drawing.add_grid(ax)
-    setp(ax.legend(loc="best", fontsize="small").legend_handles, markersize=7)
+    handles: Any = ax.legend(loc="best", fontsize="small").legend_handles
+    setp(handles, markersize=7)
 
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
