@@ -51,23 +51,25 @@ class _PageFigure(Figure):
     def draw(self, renderer: Any) -> None:
         if not self._is_legible:
             self._is_legible = True
-            self._enlarge_texts()
-            if layout := self.get_layout_engine():
-                layout.execute(self)
-            for ax in self.axes:
-                if (legend := ax.get_legend()) and _hides_data(ax, legend.get_window_extent(renderer)):
-                    legend.set_loc("upper left")
-                    legend.set_bbox_to_anchor((1.0, 1.0))
+            make_legible(self, renderer)
         super().draw(renderer)
 
-    def _enlarge_texts(self) -> None:
-        least = _LEAST_POINTS * self.get_figwidth() / _PAGE_INCHES
-        for ax in [one for parent in self.axes for one in (parent, *parent.child_axes)]:
-            for axis in (ax.xaxis, ax.yaxis):
-                if any(float(label.get_fontsize()) < least for label in axis.get_ticklabels(which="both")):
-                    axis.set_tick_params(which="both", labelsize=least)
-        for text in self.findobj(Text):
-            text.set_fontsize(max(float(text.get_fontsize()), least))
+
+def make_legible(figure: Figure, renderer: Any) -> None:
+    """Enlarge the texts of a figure to 7 pt at the width of a page, and move legends from data to the right."""
+    least = _LEAST_POINTS * figure.get_figwidth() / _PAGE_INCHES
+    for ax in [one for parent in figure.axes for one in (parent, *parent.child_axes)]:
+        for axis in (ax.xaxis, ax.yaxis):
+            if any(float(label.get_fontsize()) < least for label in axis.get_ticklabels(which="both")):
+                axis.set_tick_params(which="both", labelsize=least)
+    for text in figure.findobj(Text):
+        text.set_fontsize(max(float(text.get_fontsize()), least))
+    if layout := figure.get_layout_engine():
+        layout.execute(figure)
+    for ax in figure.axes:
+        if (legend := ax.get_legend()) and _hides_data(ax, legend.get_window_extent(renderer)):
+            legend.set_loc("upper left")
+            legend.set_bbox_to_anchor((1.0, 1.0))
 
 
 def _hides_data(ax: Axes, box: Bbox) -> bool:
