@@ -20,7 +20,7 @@ from mitransient_lidar.physics.lidar.refraction import snell
 from mitransient_lidar.plots import drawing, palette
 
 INDEX = 1.34
-SEA, WATER, SAND, GREY, BEAM, DIM = palette.BLUE, "#dcebf7", palette.BOTTOM, palette.GREY, palette.BEAM, "#333333"
+SEA, WATER, SAND, GREY, BEAM, DIM = palette.BLUE, "#dcebf7", "#c9a86a", palette.GREY, palette.BEAM, "#333333"
 FOUR = palette.pixel_colours(4)
 NAMES = ("red", "green", "blue", "black")
 

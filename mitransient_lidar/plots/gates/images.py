@@ -157,7 +157,9 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
         top = float(finite.max()) if finite.max() > 0 else 1.0
     brighter = np.count_nonzero(finite > top) / finite.size
     factor, unit = unit_of(stack, top)
-    label = f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit})"
+    label = (
+        f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit}{', logarithmic' if log else ''})"
+    )
     if brighter:
         surface = "" if below.all() else ", including the surface echo,"
         label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
