@@ -108,7 +108,12 @@ def campaign():
     # Below its range a waveform is not drawn as if it were a signal.
     data["waveform"][1][..., 10:20] = 0
     labels = {"time": np.arange(1000, 1050.0), "echo": ["surface", "column", "target", "bottom"]}
-    coords = {name: ("run", values) for name, values in inputs.items()} | labels | {"run": np.arange(runs)}
+    units = {"attenuation": "1/m", "bottom_depth": "m", "wind_speed": "m/s", "petzold": "1"}
+    coords = (
+        {name: ("run", values, {"units": units[name]}) for name, values in inputs.items()}
+        | labels
+        | {"run": np.arange(runs)}
+    )
     return xr.Dataset(data, coords, {"title": "Campaign of 60 runs", "inputs": {name: name for name in inputs}})
 
 

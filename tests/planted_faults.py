@@ -205,7 +205,7 @@ FAULTS = (
         near=_FIGURES,
     ),
     Fault(*("even_bands", f"{_G}/drawing.py"), "lowest), y + above", "lowest), y + below", near=_FIGURES),
-    Fault(*("black_for_blue", f"{_G}/drawing.py"), '"#1f5fd6", "#111111")', '"#111111", "#1f5fd6")', near=_FIGURES),
+    Fault(*("black_for_blue", f"{_G}/palette.py"), '"#014c7f", "#111111")', '"#111111", "#014c7f")', near=_FIGURES),
     Fault(
         *("share_of_lost_bottoms", f"{_G}/campaigns.py"),
         "(flags & _NO_ECHO) == 0",

@@ -48,7 +48,7 @@ print(f"error of the depths found: median {100 * float(error.median()):+.1f} cm"
 figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
 for run in range(4):
     one = data.isel(run=run, pixel=0)
-    label = f"{float(one.bottom_depth):.1f} m, c = {float(one.attenuation):.2f}"
+    label = f"{float(one.bottom_depth):.1f} m, c = {float(one.attenuation):.2f} /m"
     left.semilogy(one.time, 1e6 * one.waveform.where(one.waveform > 0), label=label, linewidth=1)
 left.set(xlabel="time (ns)", ylabel="power (µW)", xlim=(1400, 1580), ylim=(0.1, 5000))
 left.legend(frameon=False, fontsize="small")

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from mitransient_lidar import render_passive
+from mitransient_lidar.plots.drawing import plain_logarithms
 
 # %%
 # ``passive_sea`` looks 35 degrees off nadir at a bottom of 8 m with a white plate and a dark sphere; the sun stands 40
@@ -29,7 +30,8 @@ half = 0.5 * float(image.attrs["scene.field_of_view_mrad"])
 figure, axis = plt.subplots(figsize=(6, 5), layout="constrained")
 drawn = axis.imshow(1e3 * image.radiance, extent=(half, -half, -half, half), cmap="gray", norm="log")
 axis.set(xlabel="to the left (mrad)", ylabel="away from nadir (mrad)")
-figure.colorbar(drawn, label="radiance (mW m⁻² sr⁻¹ nm⁻¹)")
+bar = figure.colorbar(drawn, label="radiance (mW m⁻² sr⁻¹ nm⁻¹), logarithmic")
+plain_logarithms(bar.long_axis)
 plt.show()
 
 row, column = np.unravel_index(np.argmax(image.radiance.values), image.radiance.shape)

@@ -105,7 +105,13 @@ figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
 for name, style in names.items():
     signal = mitransient_lidar.record(far, receivers[name], 1, gain=10 * auto).signal_mean.isel(pixel=0)
     axis.plot(signal.time, 1e3 * signal, style, color="black" if name == "none" else None, label=name)
-axis.set(xlabel="time (ns)", ylabel="signal (mV)", yscale="symlog", xlim=(1400, 1770), ylim=(-100, 1e5))
+axis.set(
+    xlabel="time (ns)",
+    ylabel="signal (mV), linear below 2 mV, logarithmic above",
+    yscale="symlog",
+    xlim=(1400, 1770),
+    ylim=(-100, 1e5),
+)
 axis.legend(frameon=False, ncols=2)
 plt.show()
 

@@ -37,7 +37,7 @@ print(f"chi-squared {fitted.chi_squared:.0f}, expected {fitted.expected:.0f}; {f
 one = fitted.isel(pixel=0)
 figure, (upper, lower) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, height_ratios=(2, 1), layout="constrained")
 upper.plot(one.time, 1e3 * one.measured, ".", color="0.6", label="record")
-upper.plot(one.time, 1e3 * one.fitted, color="tab:red", linewidth=1, label="fit")
+upper.plot(one.time, 1e3 * one.fitted, color="C0", linewidth=1, label="fit")
 upper.legend(frameon=False)
 upper.set_ylabel("signal (mV)")
 lower.axhline(0, color="0.7", linewidth=0.7)

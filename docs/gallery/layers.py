@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.plots.drawing import pixel_colours
+from mitransient_lidar.plots.palette import pixel_colours
 
 # %%
 # The published case: c = 0.9 1/m down to 3 m, and 0.5 1/m below it.

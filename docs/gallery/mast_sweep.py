@@ -50,7 +50,7 @@ for number, (grazing, rows) in enumerate(found.items()):
         reach = height / np.tan(np.radians(grazing))
         left.plot([0, reach], [height, 0], color=f"C{number}", label=f"{grazing:g}°" if height == HEIGHTS[0] else None)
     right.loglog(rows[:, 0], rows[:, 1], "o-", color=f"C{number}", label=f"{grazing:g}°")
-left.plot([0, 0], [0, max(HEIGHTS)], color="0.3", linewidth=3)
+left.plot([0, 0], [0, max(HEIGHTS)], color="0.3", linestyle="-", linewidth=3)
 left.axhline(0, color="0.6")
 left.set(xlabel="distance from the mast (m)", ylabel="height (m)")
 left.legend(frameon=False, title="grazing angle")

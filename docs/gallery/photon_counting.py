@@ -31,7 +31,7 @@ for axis, (density, record) in zip(axes, records.items(), strict=True):
     counts = record.signal.isel(pixel=0).mean("shot")
     expected = record.signal_mean.isel(pixel=0)
     axis.step(record.time, counts, where="mid", color="0.6", label=f"mean of {SHOTS} shots")
-    axis.plot(record.time, expected, color="tab:red", linewidth=1, label="closed form")
+    axis.plot(record.time, expected, color="C0", linewidth=1, label="closed form")
     axis.set(ylabel="counts a bin", title=f"optical density {density}")
     print(f"density {density}: {float(counts.sum()):.2f} counts a shot, in closed form {float(expected.sum()):.2f}")
     late = {"light": shot.waveform.isel(pixel=0), "counts": expected}

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.plots.drawing import pixel_colours
+from mitransient_lidar.plots.palette import pixel_colours
 
 # %%
 # A layout is one parameter of the scene. All three renders have the same sea, with a wind of 3 m/s, and the same

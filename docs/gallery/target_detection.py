@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.plots.drawing import pixel_colours
+from mitransient_lidar.plots.palette import pixel_colours
 
 # %%
 # A square target of 1.5 m at 8 m, in the published scenes with 2x2 pixels and with four strips; with ``components`` the

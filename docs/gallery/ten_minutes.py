@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitransient_lidar
-from mitransient_lidar.plots.drawing import pixel_colours
+from mitransient_lidar.plots.palette import pixel_colours
 from mitransient_lidar.rendering.shots.truth import SeaMap
 
 shot = mitransient_lidar.render("fig09_2x2", passes=8, seed=1)
@@ -66,10 +66,10 @@ print(f"signal-to-noise ratio at the bottom: {snr.values.round(1)}")
 red = recorded.sel(pixel="red")
 figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3), layout="constrained")
 left.plot(red.time, 1e3 * red.signal.isel(shot=0), color="0.6", label="one shot")
-left.plot(red.time, 1e3 * red.signal_mean, color="#d81e1e", linewidth=1, label="mean in closed form")
+left.plot(red.time, 1e3 * red.signal_mean, color="C0", linewidth=1, label="mean in closed form")
 left.set(xlabel="time (ns)", ylabel="signal of pixel red (mV)")
 left.legend(frameon=False)
-right.plot(red.time, red.snr, color="#d81e1e")
+right.plot(red.time, red.snr, color="C0")
 right.set(xlabel="time (ns)", ylabel="signal-to-noise ratio of one shot")
 plt.show()
 

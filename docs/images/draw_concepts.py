@@ -16,11 +16,11 @@ from matplotlib.patches import Arc, Ellipse, Polygon
 import mitransient_lidar
 from mitransient_lidar.physics.lidar.level_sea import LevelSea, snell
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 INDEX = 1.34
-SEA, WATER, SAND, GREY, BEAM, DIM = "#2b7bba", "#dcebf7", "#c9a86a", "#8a9099", "#e07b00", "#333333"
-FOUR = drawing.pixel_colours(4)
+SEA, WATER, SAND, GREY, BEAM, DIM = palette.BLUE, "#dcebf7", "#c9a86a", palette.GREY, palette.BEAM, "#333333"
+FOUR = palette.pixel_colours(4)
 NAMES = ("red", "green", "blue", "black")
 
 
@@ -129,7 +129,7 @@ def draw_pixels(path: Path) -> None:
         pixels = sensor.receiver.pixels
         centres = 1e3 * np.asarray(pixels.centres())
         for index, (loops, centre) in enumerate(zip(pixel_outlines(pixels), centres, strict=True)):
-            colour = FOUR[index] if pixels.count == 4 else drawing.pixel_colours(pixels.count)[index]
+            colour = FOUR[index] if pixels.count == 4 else palette.pixel_colours(pixels.count)[index]
             for loop in loops:
                 ax.add_patch(Polygon(1e3 * loop[:, ::-1], facecolor=colour, alpha=0.35, edgecolor="white"))
             label = f"{index}\n{NAMES[index]}" if pixels.count == 4 else f"{index}"

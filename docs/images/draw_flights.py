@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.poses.attitude import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Fixed
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 #: Angles of the drawing [deg].
 _YAW, _ROLL, _PITCH, _NADIR_ANGLE, _AZIMUTH = 35.0, 20.0, 20.0, 32.0, 65.0
@@ -31,7 +31,7 @@ _LEVER_ARM = (0.0, 0.45, -0.22)
 #: Axes of the scene to the right and up in the views from above, from behind, and from the right of a northward flight.
 _ABOVE, _BEHIND, _SIDE = ((0, 1), (0, 2), (1, 2))
 
-_GREY, _BLUE, _GREEN, _RED = "#9aa0a6", "#1f5fd6", "#17963f", "#d81e1e"
+_GREY, _BLUE, _GREEN, _RED = palette.GREY, palette.BLUE, palette.GREEN, palette.RED
 
 
 def main(path: Path) -> None:

@@ -165,14 +165,12 @@ def table(scores: dict[str, Score | None]) -> str:
 
 def draw(pairs: dict[str, tuple[Result, Result]], path: Path) -> None:
     """Draw energies of results and references, with their ratios below."""
-    import matplotlib.pyplot as plt
+    from mitransient_lidar.plots import drawing, palette
 
-    columns = min(5, len(pairs))
+    columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
-    figure, axes = plt.subplots(
-        2 * rows, columns, figsize=(3.2 * columns, 4.2 * rows), squeeze=False, height_ratios=[2, 1] * rows,
-        layout="constrained",
-    )  # fmt: skip
+    figure = drawing.new_figure(path, 3.2 * columns, 3.6 * rows)
+    axes = figure.subplots(2 * rows, columns, squeeze=False, height_ratios=[2, 1] * rows)
     for axis in axes.flat:
         axis.set_visible(False)
     for number, (name, (result, reference)) in enumerate(pairs.items()):
@@ -181,7 +179,7 @@ def draw(pairs: dict[str, tuple[Result, Result]], path: Path) -> None:
         time = 0.5 * (reference.start + reference.end) - reference.start[0]
         counts = (reference.energy > 0) & (reference.stderr <= KNOWN * reference.energy)
         upper.plot(time, reference.energy, color="0.6", lw=3, label="reference")
-        upper.errorbar(time, result.energy, result.stderr, color="C0", fmt=".", ms=3, lw=0.8, label="result")
+        upper.errorbar(time, result.energy, result.stderr, color=palette.BLUE, fmt=".", ms=3, lw=0.8, label="result")
         upper.set_yscale("log")
         upper.set_ylim(0.5 * reference.energy[counts].min(), 2 * reference.energy[counts].max())
         upper.set_title(name)
@@ -189,17 +187,24 @@ def draw(pairs: dict[str, tuple[Result, Result]], path: Path) -> None:
         error = reference.stderr[counts] / reference.energy[counts]
         lower.fill_between(time[counts], 1 - 2 * error, 1 + 2 * error, color="0.85")
         lower.errorbar(
-            time[counts], ratio, result.stderr[counts] / reference.energy[counts], color="C0", fmt=".", ms=3, lw=0.8
+            time[counts],
+            ratio,
+            result.stderr[counts] / reference.energy[counts],
+            color=palette.BLUE,
+            fmt=".",
+            ms=3,
+            lw=0.8,
         )
         lower.set_ylim(*np.clip([min(ratio.min(), 0.95) - 0.02, max(ratio.max(), 1.05) + 0.02], 0, 2))
-        lower.set_xlabel("time from the first gate (ns)")
+        if number >= len(pairs) - columns:
+            lower.set_xlabel("time from the first gate (ns)")
+        if column == 0:
+            upper.set_ylabel("energy of a gate (J)")
+            lower.set_ylabel("ratio (1)")
         for axis in (upper, lower):
             axis.set_visible(True)
-    axes[0, 0].set_ylabel("energy of a gate (J)")
-    axes[1, 0].set_ylabel("over reference")
-    axes[0, 0].legend()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+    drawing.save(figure, path)
 
 
 def main() -> None:

@@ -288,30 +288,31 @@ def markdown(rows: list[dict[str, str]]) -> str:
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
     """Draw the ratios of rows with errors, and the variation under waves by depth."""
-    import matplotlib.pyplot as plt
+    from mitransient_lidar.plots import drawing, palette
 
     known = [row for row in rows if row["error"]]
-    figure, ax = plt.subplots(figsize=(10, 1 + 0.22 * len(known)), layout="constrained")
+    figure = drawing.new_figure(path / "ratios.png", 9, 1 + 0.24 * len(known))
+    ax = figure.subplots()
     ratio = np.array([float(row["ratio"]) for row in known])
     error = np.array([float(row["error"]) / abs(float(row["theirs"])) for row in known])
     ax.axvline(1, color="0.5", lw=1)
-    ax.errorbar(ratio, np.arange(len(known)), xerr=error, fmt=".", capsize=2)
-    ax.set_yticks(range(len(known)), [f"{row['quantity']} ({row['source']})" for row in known], fontsize=7)
-    ax.set_xlabel("ours over theirs, with one standard error of ours")
+    ax.errorbar(ratio, np.arange(len(known)), xerr=error, fmt=".", color=palette.BLUE, capsize=2)
+    ax.set_yticks(range(len(known)), [f"{row['quantity']} ({row['source']})" for row in known])
+    ax.set_xlabel("computed over expected (1), ±1 s.e.")
     ax.invert_yaxis()
-    figure.savefig(path / "ratios.png", dpi=100)
+    drawing.save(figure, path / "ratios.png")
     waves = [row for row in rows if row["case"] == "flicker"]
     if waves:
-        figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
+        figure = drawing.new_figure(path / "flicker.png", 6, 4)
+        ax = figure.subplots()
         depths = list(FLICKER)
         ours = np.array([float(row["ours"]) for row in waves]).reshape(-1, len(depths))
-        for wind, values in zip((3, 5, 7), ours, strict=True):
-            ax.plot(depths, values, "-o", ms=4, label=f"direct sunlight, closed form, {wind} m/s")
-        ax.plot(depths, list(FLICKER.values()), "k-s", ms=4, label="downward irradiance, measured")
+        for wind, values, style in zip((3, 5, 7), ours, palette.marked(3), strict=True):
+            ax.plot(depths, values, ms=4, label=f"direct sunlight, closed form, {wind} m/s", **style)
+        ax.plot(depths, list(FLICKER.values()), "k--D", ms=4, label="downward irradiance, measured")
         ax.set(xlabel="depth (m)", ylabel="coefficient of variation", yscale="log")
         ax.legend()
-        figure.savefig(path / "flicker.png", dpi=100)
-    plt.close("all")
+        drawing.save(figure, path / "flicker.png")
 
 
 def main() -> None:

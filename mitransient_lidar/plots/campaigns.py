@@ -12,11 +12,13 @@ import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 #: Sample records, most parameters and parameter pairs that are drawn, and runs that give the responses.
 _SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
@@ -63,7 +65,7 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
     inputs = _inputs(dataset, used)
     rows: Any = figure.subfigures(3, 1, height_ratios=[1.2, 0.9, 1.2])
     _draw_sample(rows[0].subplots(), dataset, np.sort(rng.choice(done, min(done.size, _SAMPLE), replace=False)))
-    _draw_distributions(rows[1], inputs)
+    _draw_distributions(rows[1], dataset, inputs)
     _draw_responses(rows[2], dataset, used, inputs)
     total, failed = dataset.sizes["run"], int(np.count_nonzero(dataset["status"].values == _DONE + 1))
     figure.suptitle(f"{dataset.attrs.get('title', 'campaign')}: {done.size} of {total} done, {failed} failed")
@@ -99,15 +101,28 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     values[(values < 1 / _DYNAMIC_RANGE[name]) | (values <= values[:, :1])] = np.nan
     ax.set_yscale("log")
     ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
-    for run, line, colour in zip(runs, values, drawing.pixel_colours(len(runs) + 11)[::-1], strict=False):
-        ax.plot(time, line, color=colour, linewidth=0.9, label=f"run {run}")
+    name_of, column = next(iter(_numbers(_inputs(dataset, runs)).items()), ("run", runs))
+    # The lightest colours are hard to see on white.
+    colours = ScalarMappable(Normalize(column.min(), column.max() + 0.08 * np.ptp(column)), palette.SEQUENCE)
+    for line, value in zip(values, column, strict=True):
+        ax.plot(time, line, color=colours.to_rgba(value), linewidth=0.9)
+    ax.figure.colorbar(colours, ax=ax, label=_labelled(dataset, name_of))
     ax.set_xlabel(drawing.TIME_LABEL)
     ax.set_ylabel(f"{name}, relative to its peak")
-    ax.legend(frameon=False, fontsize="x-small", ncols=2)
     drawing.add_grid(ax)
 
 
-def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> None:
+def _numbers(inputs: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    return {name: column for name, column in inputs.items() if column.dtype.kind in "if"}
+
+
+def _labelled(dataset: xr.Dataset, name: str) -> str:
+    """Return a parameter's name with its unit, if known."""
+    unit = dataset[dataset.attrs.get("inputs", {}).get(name, name)].attrs.get("units", "1")
+    return name if unit == "1" else f"{name} ({unit})"
+
+
+def _draw_distributions(figure: Any, dataset: xr.Dataset, inputs: dict[str, npt.NDArray[Any]]) -> None:
     """Draw how often each parameter value occurs."""
     shown = dict(itertools.islice(inputs.items(), _MOST_PARAMETERS))
     if not shown:
@@ -119,7 +134,7 @@ def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> Non
         else:
             ax.hist(column, bins=_edges(column), color="0.55")
             _set_scale(ax.set_xscale, ax.xaxis, column)
-        ax.set_xlabel(name)
+        ax.set_xlabel(_labelled(dataset, name))
         drawing.add_grid(ax, "y", hide=("top", "right"))
     figure.axes[0].set_ylabel("runs")
 
@@ -129,7 +144,7 @@ def _draw_responses(
 ) -> None:
     """Draw the mean response over parameter pairs."""
     response, label = _response(dataset, runs)
-    axes = {name: column for name, column in inputs.items() if column.dtype.kind in "if"}
+    axes = _numbers(inputs)
     pairs = list(itertools.islice(itertools.combinations(axes, 2), _MOST_PAIRS))
     if not pairs:
         return
@@ -147,8 +162,8 @@ def _draw_responses(
         total = np.bincount(index[known], weights=response[known], minlength=shape[0] * shape[1])
         with np.errstate(invalid="ignore"):
             mean = (total / count).reshape(shape)
-        image = ax.pcolormesh(edges[0], edges[1], mean.T, vmin=limits[0], vmax=limits[1], cmap="viridis")
-        ax.set(xlabel=x, ylabel=y)
+        image = ax.pcolormesh(edges[0], edges[1], mean.T, vmin=limits[0], vmax=limits[1], cmap=palette.SEQUENCE)
+        ax.set(xlabel=_labelled(dataset, x), ylabel=_labelled(dataset, y))
         _set_scale(ax.set_xscale, ax.xaxis, axes[x])
         _set_scale(ax.set_yscale, ax.yaxis, axes[y])
     figure.colorbar(image, ax=figure.axes, label=label)

@@ -8,10 +8,13 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.comparison import Comparison
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 #: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
 _MOST_CURVES = 64
+
+#: Bins from one marker on a curve to the next one.
+_MARK_EVERY = 12
 
 
 def plot_comparison(
@@ -26,7 +29,7 @@ def plot_comparison(
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
     time = first["time"].values
     are_few = len(outcome.z) <= _MOST_CURVES
-    palette = drawing.pixel_colours(len(outcome.z) if are_few else 1)
+    marks = palette.marked(len(outcome.z) if are_few else 1)
     powers, errors = ([_by_pixel(one, name) for one in (first, second)] for name in ("waveform", "waveform_stderr"))
     counted = np.isfinite(outcome.z)
     if not are_few:
@@ -35,8 +38,15 @@ def plot_comparison(
         powers = [np.where(known, power, 0).sum(axis=0, keepdims=True) for power in powers]
         errors = [np.zeros_like(power) for power in powers]
     for power, error, style, label in zip(powers, errors, ("-", "--"), _labels(first, second), strict=True):
-        for i, colour in enumerate(palette):
-            curve = {"color": colour, "linestyle": style, "linewidth": 0.9, "label": "_" if i else label}
+        for i, mark in enumerate(marks):
+            curve = {
+                **mark,
+                "markevery": _MARK_EVERY,
+                "markersize": 3.5,
+                "linestyle": style,
+                "linewidth": 0.9,
+                "label": "_" if i else label,
+            }
             drawing.draw_band(upper, time, power[i], 2 * error[i], lowest=1e-30, **curve)
     shown = powers[0][counted if are_few else counted.any(axis=0, keepdims=True)]
     upper.set_yscale("log")
@@ -46,11 +56,11 @@ def plot_comparison(
     upper.set_ylabel(f"{quantity}{'' if are_few else ', all pixels'} ({unit})")
     upper.legend(frameon=False)
     if are_few:
-        for z, colour in zip(outcome.z, palette, strict=True):
-            lower.plot(time, z, ".", color=colour, markersize=3)
+        for z, mark in zip(outcome.z, marks, strict=True):
+            lower.plot(time, z, linestyle="none", markersize=3, **mark)
     else:
         lowest, highest = np.where(counted, outcome.z, np.inf).min(0), np.where(counted, outcome.z, -np.inf).max(0)
-        lower.vlines(time[counted.any(0)], lowest[counted.any(0)], highest[counted.any(0)], color=palette[0])
+        lower.vlines(time[counted.any(0)], lowest[counted.any(0)], highest[counted.any(0)], color=marks[0]["color"])
     for level in (-outcome.limit, outcome.limit):
         lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
     largest = 1.5 * max(outcome.limit, outcome.largest)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -57,7 +57,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
         value = float(dataset["parameter_value"].values[number])
         scale = np.where(lit, (value or 1.0) / np.where(lit, power, 1.0), np.nan)
         change, spread = slopes[number] * scale, errors[number] * np.abs(scale)
-        time, colour = dataset["time"].values, f"C{number % 10}"
+        time, colour = dataset["time"].values, palette.CATEGORIES[number % len(palette.CATEGORIES)]
         ax.axhline(0, color="0.6", linewidth=0.8)
         ax.fill_between(time, change - spread, change + spread, color=colour, alpha=0.35, linewidth=0)
         ax.plot(time, change, color=colour, linewidth=1.2)
@@ -70,6 +70,6 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
         ax.set_xlim(drawing.time_limits(dataset))
         drawing.add_grid(ax, hide=("right", "top"))
     bands = "standard errors" if dataset["waveform"].isel(time=0).size == 1 else "upper bounds of standard errors"
-    text = f"change of the received power with parameters of the scene; bands: {bands}"
+    text = f"change of the received power with parameters of the scene; bands, where wider than lines: {bands}"
     figure.suptitle(text, fontsize="medium")
     return drawing.save(figure, path)

@@ -1,4 +1,4 @@
-"""Elements shared by all figures: file, colours, units, titles, axes and images."""
+"""Elements shared by all figures: file, sizes of texts, legends, units, titles, axes and images."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.axis import XAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patches import PathPatch
+from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Line
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
@@ -37,8 +39,53 @@ LISTED_PIXELS = 12
 
 _FORMATS = (".png", ".pdf", ".svg")
 _DPI = 160
-_FOUR = ("#d81e1e", "#17963f", "#1f5fd6", "#111111")  # red, green, blue, black: the published pixels
+_PAGE_INCHES, _LEAST_POINTS = 7.0, 7.0  # width of a page, and size of the smallest text on it
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p", -15: "f", -18: "a"}
+
+
+class _PageFigure(Figure):
+    """Figure whose texts are at least 7 pt high at the width of a page, and whose legends hide no data."""
+
+    _is_legible = False
+
+    def draw(self, renderer: Any) -> None:
+        if not self._is_legible:
+            self._is_legible = True
+            make_legible(self, renderer)
+        super().draw(renderer)
+
+
+def make_legible(figure: Figure, renderer: Any) -> None:
+    """Enlarge the texts of a figure to 7 pt at the width of a page, and move legends from data to the right."""
+    least = _LEAST_POINTS * figure.get_figwidth() / _PAGE_INCHES
+    for ax in [one for parent in figure.axes for one in (parent, *parent.child_axes)]:
+        for axis in (ax.xaxis, ax.yaxis):
+            if any(float(label.get_fontsize()) < least for label in axis.get_ticklabels(which="both")):
+                axis.set_tick_params(which="both", labelsize=least)
+    for text in figure.findobj(Text):
+        text.set_fontsize(max(float(text.get_fontsize()), least))
+    if layout := figure.get_layout_engine():
+        layout.execute(figure)
+    for ax in figure.axes:
+        if (legend := ax.get_legend()) and _hides_data(ax, legend.get_window_extent(renderer)):
+            legend.set_loc("upper left")
+            legend.set_bbox_to_anchor((1.0, 1.0))
+
+
+def _hides_data(ax: Axes, box: Bbox) -> bool:
+    """Return whether a box of the canvas covers parts of lines, points, bars or bands."""
+    for line in ax.lines:
+        path = line.get_transform().transform_path(line.get_path()).cleaned(remove_nans=True)
+        if np.size(path.vertices) and path.intersects_bbox(box, filled=False):
+            return True
+    for one in ax.collections:
+        places = one.get_offset_transform().transform(np.ma.filled(one.get_offsets(), np.nan))
+        paths = [one.get_transform().transform_path(path) for path in one.get_paths()]
+        if isinstance(one, PathCollection) and box.count_contains(places):
+            return True
+        if not isinstance(one, PathCollection) and any(path.intersects_bbox(box) for path in paths):
+            return True
+    return any(box.overlaps(patch.get_window_extent()) for patch in ax.patches if isinstance(patch, Rectangle))
 
 
 def check_format(path: FilePath) -> None:
@@ -51,7 +98,7 @@ def new_figure(path: FilePath | None, width: float, height: float) -> Figure:
     """Check the format of the file to write, and return an empty figure with a size in inches."""
     if path is not None:
         check_format(path)
-    return Figure(figsize=(width, height), layout="constrained")
+    return _PageFigure(figsize=(width, height), layout="constrained")
 
 
 def save(figure: Figure, path: FilePath | None) -> Figure:
@@ -74,17 +121,6 @@ def _save_png(figure: Figure, path: Path) -> None:
         canvas.print_png(path)
     finally:
         figure.dpi = resolution
-
-
-def pixel_colours(count: int) -> list[Any]:
-    """Return a colour for each pixel; for four pixels the red, green, blue and black of the published figures."""
-    if count == 1:
-        return [_FOUR[3]]
-    if count == 4:
-        return list(_FOUR)
-    if count <= 10:
-        return [matplotlib.colormaps["tab10"](index) for index in range(count)]
-    return list(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, count)))
 
 
 def si_prefix(largest: float) -> tuple[float, str]:

@@ -21,7 +21,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Most cells along a side of an imager that are drawn with edges.
@@ -39,8 +39,6 @@ _SAME_PLANE, _SAME_POINT = 0.05, 1e-3
 #: Longest list of target names in a title.
 _LONGEST_NAME = 32
 
-_BEAM_COLOUR = "#e07b00"
-_TARGET_COLOUR = "#7a3fb0"
 _SHADOW_COLOUR = "#00000055"
 _LEVELS = {0.6065: "e$^{-1/2}$", 0.1353: "e$^{-2}$", 1.0: "rim"}
 
@@ -266,7 +264,7 @@ def _pose(attributes: dict[str, Any], name: str) -> Pose:
 def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[Any]) -> FloatArray:
     """Draw the outlines of the pixels, or dots at their centres where there are none; return the points drawn."""
     names = [str(name) for name in dataset["pixel"].values]
-    fills = [(to_rgba(colour, 0.25), colour) for colour in drawing.pixel_colours(len(names))]
+    fills = [(to_rgba(colour, 0.25), colour) for colour in palette.pixel_colours(len(names))]
     if len(names) <= drawing.LISTED_PIXELS:
         handles += [Patch(facecolor=f, edgecolor=e, label=name) for name, (f, e) in zip(names, fills, strict=True)]
     outlines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
@@ -300,7 +298,7 @@ def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
     image = ax.pcolormesh(
         *np.moveaxis(corners, -1, 0),
         energy / factor,
-        cmap="viridis",
+        cmap=palette.SEQUENCE,
         edgecolors="white" if max(rows, columns) <= _EDGED_CELLS else "none",
         linewidth=0.5,
     )
@@ -331,7 +329,7 @@ def _draw_beam(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatAr
         label = f"beam, {_LEVELS.get(outline['share'], outline['share'])}"
         for line in outline["lines"]:
             points = ground.project(ground.transmitter, _points(line))
-            ax.plot(*points.T, style, color=_BEAM_COLOUR, linewidth=1.8, label=label, path_effects=_HALO, zorder=4)
+            ax.plot(*points.T, style, color=palette.BEAM, linewidth=1.8, label=label, path_effects=_HALO, zorder=4)
             drawn.append(points)
             label = "_"
     return np.concatenate(drawn)
@@ -339,7 +337,7 @@ def _draw_beam(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatAr
 
 def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
     """Draw the targets' outlines, with the depths of their highest points, or their shadows."""
-    marks: dict[str, Any] = {"color": _TARGET_COLOUR, "path_effects": _HALO, "zorder": 5}
+    marks: dict[str, Any] = {"color": palette.TARGET, "path_effects": _HALO, "zorder": 5}
     for target in plane.targets:
         line = _points(target.get(plane.outline, []))
         if len(line) == 0:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, integer
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 
 #: Share of the pixels that may be brighter than white, or darker than black: glints would leave the rest black.
 _CLIPPED = 0.01
@@ -42,7 +42,7 @@ def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, fram
     if "pixel" in dataset.dims:
         names = [str(name) for name in dataset["pixel"].values]
         error = 1e3 * picture["radiance_stderr"].values
-        ax.bar(names, radiance, yerr=error, color=drawing.pixel_colours(len(names)), width=0.6)
+        ax.bar(names, radiance, yerr=error, color=palette.pixel_colours(len(names)), width=0.6)
         ax.set_ylabel(unit)
         drawing.add_grid(ax, "y")
     else:

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.products import Flown
 from mitransient_lidar.physics.lidar.level_sea import refract_level
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.variables import PointClass
-
-#: Colour of the points of a class; colour-blind readers tell them apart (Okabe and Ito 2008).
-CLASS_COLOURS = {
-    PointClass.GROUND: "#e69f00",
-    PointClass.UNCLASSIFIED: "#cc79a7",
-    PointClass.SURFACE: "#56b4e9",
-    PointClass.BOTTOM: "#0072b2",
-    PointClass.OBJECT: "#d55e00",
-    PointClass.NO_ECHO: "#999999",
-}
 
 #: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
@@ -32,6 +24,9 @@ _STRIP, _MOST_WAVEFORMS = 1.5, 2000
 
 #: Heights in a profile above sea and land and below the deepest point [m], and most cell columns in its picture.
 _ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
+
+#: Most points of a class that are drawn large.
+_RARE = 50
 
 #: Range of a nanosecond between pulse and echo in the air [m].
 _PER_NS = 0.5e-9 * C0
@@ -75,9 +70,9 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
             heights,
             wet["z"].values,
             "height of bottom and land (m)",
-            {"cmap": "viridis", "vmin": deepest, "vmax": highest},
+            {"cmap": palette.SEQUENCE, "vmin": deepest, "vmax": highest},
         ),
-        (errors, error, "error of the height (m)", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+        (errors, error, "error of the height (m)", {"cmap": palette.SIGNED, "vmin": -limit, "vmax": limit}),
     ):
         drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
         _set_map(ax, "Bottom and land" if ax is heights else "Errors of heights")
@@ -92,10 +87,17 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     """Draw the scanner's track, and where its pulses' axes meet the sea level."""
     poses = flown.poses
-    ax.plot(*poses.ground_point()[:, :2].T, ".", color="#1f77b4", markersize=1.5, label="pulses at the sea level")
+    ax.plot(*poses.ground_point()[:, :2].T, ".", color=palette.BLUE, markersize=1.5, label="pulses at the sea level")
     ax.plot(*poses.origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
     if np.any(chosen := points["true_target"].values.astype(bool)):
-        ax.plot(points["x"].values[chosen], points["y"].values[chosen], ".", color="#d62728", label="above a target")
+        ax.plot(
+            points["x"].values[chosen],
+            points["y"].values[chosen],
+            "s",
+            color=palette.RED,
+            markersize=4,
+            label="above a target",
+        )
     _set_map(ax, f"{len(poses.origin)} pulses")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), fontsize="small")
 
@@ -104,6 +106,12 @@ def _set_map(ax: Axes, title: str) -> None:
     """Set the axes of a map, which may be narrow."""
     ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=title)
     ax.locator_params("x", nbins=3)
+
+
+def _exaggeration(ax: Axes) -> str:
+    """Return how much larger the scale of heights is, as text."""
+    ratio = np.ptp(ax.get_xlim()) / ax.bbox.width / (np.ptp(ax.get_ylim()) / ax.bbox.height)
+    return f"\nheights about × {float(f'{ratio:.1g}'):g}"
 
 
 def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
@@ -120,14 +128,17 @@ def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
     along = "x" if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else "y"
-    for kind, colour in CLASS_COLOURS.items():
+    for kind, colour in palette.CLASSES.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
             label = f"{kind.text} ({np.count_nonzero(chosen)})"
-            ax.plot(points[along].values[chosen], points["z"].values[chosen], ".", color=colour, ms=1.5, label=label)
-    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title="Points by class, from the side")
+            # Points of rare classes are larger, so that they are seen.
+            size = 1.5 if np.count_nonzero(chosen) > _RARE else 4
+            ax.plot(points[along].values[chosen], points["z"].values[chosen], ".", color=colour, ms=size, label=label)
+    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title=f"Points by class, from the side{_exaggeration(ax)}")
     drawing.add_grid(ax)
-    ax.legend(loc="best", fontsize="small", markerscale=5)
+    handles: Any = ax.legend(loc="best", fontsize="small").legend_handles
+    setp(handles, markersize=7)
 
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
@@ -163,14 +174,17 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
         image = np.log10(total / number).T
     highest = float(np.nanmax(image[np.isfinite(image)], initial=-np.inf))
     shown = np.where(np.isfinite(image), image, np.nan)
-    drawn = ax.pcolormesh(*cells, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
-    ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
-    for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "land, bottom or object")):
-        ax.plot(strip[along].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
+    drawn = ax.pcolormesh(*cells, shown, cmap=palette.LIGHT, vmin=highest - _DECADES, vmax=highest)
+    ax.figure.colorbar(drawn, ax=ax, label=f"log10 of the mean signal ({flown.store.attributes.get('unit', 'V')})")
+    for chosen, mark, colour, label in (
+        (surface, "v", palette.SKY, PointClass.SURFACE.text),
+        (wet, "o", palette.GREEN, "land, bottom or object"),
+    ):
+        ax.plot(strip[along].values[chosen], strip["z"].values[chosen], mark, color=colour, ms=3, label=label)
     order = np.argsort(strip[along].values[wet])
     truth = (strip[name].values[wet][order] for name in (along, "true_z"))
     ax.plot(*truth, "-", color="white", linewidth=1.2, label="truth")
     ax.set_facecolor("black")
     title = f"Waveforms and points within {_STRIP:g} m of {across} = {middle:.1f} m"
-    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title=title)
+    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title=f"{title}{_exaggeration(ax)}")
     ax.legend(loc="lower right", fontsize="small", facecolor="#555555", labelcolor="white")

@@ -18,7 +18,7 @@ from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
 from mitransient_lidar.results.files import Given, dataset_of
 
-_NOTEBOOK_MB = 20.0  # per page in a notebook, which is stored with it
+_NOTEBOOK_MB = 10.0  # per page in a notebook, which is stored with it
 _FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # for temporary pages
 
 
@@ -39,10 +39,10 @@ class View:
         self._name = name
 
     def _repr_html_(self) -> str:
-        # A sandbox without the notebook's origin: the page's scripts reach nothing in it.
+        # A sandbox without the notebook's origin: the page's scripts reach nothing in it; they may offer files to save.
         return (
-            f'<iframe sandbox="allow-scripts" srcdoc="{html.escape(self.page)}" title="{html.escape(self._name)}" '
-            f'style="width: 100%; height: {self.height}px; border: 0"></iframe>'
+            f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{html.escape(self.page)}" '
+            f'title="{html.escape(self._name)}" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
         )
 
     def __repr__(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,14 +15,11 @@ from mitransient_lidar.physics.water.phase import petzold_average_particle
 from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.physics.water.water_types import water_of
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.studies import water_report
 from mitransient_lidar.studies.water_report import PhaseFunction, fournier_forand_of
 
 _SMALLEST_DEG = 0.01
-_WATER = "#1f5fd6"
-_DEPTHS = matplotlib.colormaps["viridis_r"]
-_COLOURS = {"c": "#111111", "b": "#1f5fd6", "a": "#d81e1e", "bb": "#17963f"}
 
 #: Most phase functions drawn for a profile, and the smallest visible step of ln(bb/b) between them.
 _MOST_FUNCTIONS, _RATIO_STEP = 8, 0.02
@@ -70,7 +66,7 @@ def plot_phase_function(
             "Petzold's average particle",
             {"color": "0.2", "dashes": (5, 2), "linewidth": 1.2},
         ),
-        (phase_function, label, {"color": _WATER, "linewidth": 2.0}),
+        (phase_function, label, {"color": palette.BLUE, "linewidth": 2.0}),
     ]
     if phase_function is water_phase_function:
         del curves[0]
@@ -102,18 +98,16 @@ def plot_profile(profile: Profile, layers: WaterColumn, title: str, path: drawin
     figure = drawing.new_figure(path, 10.4, 5.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     _draw_coefficients(left, profile, layers)
-    bottom = float(profile.depth[-1])
     shown = _distinct_layers(layers)
     degrees = _angles()
-    for layer in shown:
+    for layer, style in zip(shown, palette.curves(len(shown), palette.ordered(len(shown))), strict=True):
         depth, ratio = float(layers.layer_tops[layer]), float(layers.backscatter_ratio[layer])
-        colour: Any = _WATER
         label = f"{ratio:#.3g}"
         if len(shown) > 1:
-            colour, label = _DEPTHS(0.1 + 0.9 * depth / bottom), f"{label} from {depth:.3g} m"
-            left.plot(1.0, depth, "<", color=colour, transform=left.get_yaxis_transform(), clip_on=False, markersize=7)
-        values = fournier_forand_of(ratio)(np.radians(degrees))
-        right.plot(degrees, values, color=colour, linewidth=1.6, label=label)
+            label += f" from {depth:.3g} m"
+            mark = {"color": style["color"], "clip_on": False, "markersize": 7}
+            left.plot(1.0, depth, "<", transform=left.get_yaxis_transform(), **mark)
+        right.plot(degrees, fournier_forand_of(ratio)(np.radians(degrees)), linewidth=1.6, label=label, **style)
     _style_phase_axes(right)
     if shown:
         right.legend(title="Fournier-Forand, by bb/b", frameon=False, loc="upper right", alignment="left")
@@ -135,10 +129,10 @@ def _draw_coefficients(ax: Axes, profile: Profile, column: WaterColumn) -> None:
         "a": (profile.absorption, column.absorption),
         "bb": (profile.backscattering, column.backscattering),
     }
-    for name, (nodes, means) in coefficients.items():
-        colour = _COLOURS[name]
-        ax.stairs(means, edges, orientation="horizontal", baseline=None, color=colour, alpha=0.35, linewidth=3.0)
-        ax.plot(np.interp(depth, profile.depth, nodes), depth, color=colour, linewidth=1.1, label=name)
+    for (name, (nodes, means)), style in zip(coefficients.items(), palette.curves(4), strict=True):
+        stairs: dict[str, Any] = {"orientation": "horizontal", "baseline": None, "alpha": 0.35, "linewidth": 3.0}
+        ax.stairs(means, edges, color=style["color"], **stairs)
+        ax.plot(np.interp(depth, profile.depth, nodes), depth, linewidth=1.1, label=name, **style)
     values = np.concatenate([nodes for nodes, _ in coefficients.values()])
     top = float(values.max()) or 1.0
     low = max(float(values[values > 0].min(initial=top)), top * 10.0**-_DECADES)

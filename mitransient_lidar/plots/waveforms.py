@@ -9,19 +9,17 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.lines import Line2D
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 from mitransient_lidar.results.waveform_files import FILE
 
 Scale = Literal["both", "linear", "log"]
 
 _DECADES = 7  # at most, on a logarithmic axis
-
-_ORIGIN_COLOURS = {"surface": "#8fa3ad", "water": "#3f8fc9", "bottom": "#a8743a", "target": "#d81e1e"}
 
 
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
@@ -92,21 +90,25 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
     power = parts.sum([dim for dim in parts.dims if dim not in ("origin", "time")]).values
     time, limits = dataset["time"].values, drawing.time_limits(dataset)
     names = [str(one) for one in dataset["origin"].values]
-    colours = [_ORIGIN_COLOURS.get(one, f"C{number % 10}") for number, one in enumerate(names)]
+    styles = [
+        {**style, "color": palette.ORIGINS.get(one, style["color"])}
+        for one, style in zip(names, palette.curves(len(names)), strict=True)
+    ]
     top = float(np.nanmax(power.sum(axis=0), initial=0.0)) or 1.0
     factor, prefix = drawing.si_prefix(top)
     figure = drawing.new_figure(path, 8.0, 6.0)
     upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.stackplot(time, power / factor, colors=colours, labels=names, alpha=0.85, linewidth=0)
-    upper.legend(frameon=False)
-    for values, colour in zip(power / factor, colours, strict=True):
-        lower.plot(time, np.where(values > 0, values, np.nan), color=colour, linewidth=1.3)
+    colours = [style["color"] for style in styles]
+    upper.stackplot(time, power / factor, colors=colours, labels=names, linewidth=0)
+    for values, style, label in zip(power / factor, styles, names, strict=True):
+        lower.plot(time, np.where(values > 0, values, np.nan), linewidth=1.3, label=label, **style)
     lower.set_yscale("log")
     lower.set_ylim(1e-5 * top / factor, 2 * top / factor)
     lower.set_xlabel(drawing.TIME_LABEL)
     for ax in (upper, lower):
         ax.set_xlim(limits)
         ax.set_ylabel(f"received power ({prefix}W)")
+        ax.legend(frameon=False)
         drawing.add_grid(ax, hide=("right",))
     _add_depth_axis(upper, dataset)
     figure.suptitle(f"{_title(dataset, 'mean')}  ·  by origin", fontsize="large")
@@ -166,12 +168,12 @@ def _draw_waveforms(ax: Axes, dataset: xr.Dataset, curves: _Curves, *, log: bool
     if significant.size:
         floor = max(0.5 * float(np.quantile(significant, 0.01)), top * 10.0**-_DECADES)
     bands = np.moveaxis(curves.band / factor, 1, 0)
-    for values, spread, colour in zip(power / factor, bands, drawing.pixel_colours(len(power)), strict=True):
+    for values, spread, style in zip(power / factor, bands, palette.curves(len(power)), strict=True):
         if len(power) <= drawing.LISTED_PIXELS:
             lowest = 1e-3 * floor / factor if log else -np.inf
-            drawing.draw_band(ax, time, values, spread, lowest=lowest, color=colour, linewidth=1.3)
+            drawing.draw_band(ax, time, values, spread, lowest=lowest, linewidth=1.3, **style)
         else:
-            ax.plot(time, values, color=colour, linewidth=0.6)
+            ax.plot(time, values, color=style["color"], linewidth=0.6)
     ax.set_xlim(limits)
     if log:
         ax.set_yscale("log")
@@ -197,16 +199,16 @@ def _add_depth_axis(ax: Axes, dataset: xr.Dataset) -> None:
 def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
     """Draw the pixels in the field of view: far from nadir on top, +angle_y to the left."""
     attributes, names = dataset.attrs, [str(name) for name in dataset["pixel"].values]
-    colours = drawing.pixel_colours(len(names))
+    colours, curves = palette.pixel_colours(len(names)), palette.curves(len(names))
     ax.set_axis_off()
     if len(names) <= drawing.LISTED_PIXELS:
         legend = ax.legend(
-            handles=[Patch(color=colour, label=name) for name, colour in zip(names, colours, strict=True)],
+            handles=[Line2D([], [], label=name, **style) for name, style in zip(names, curves, strict=True)],
             loc="upper center",
             bbox_to_anchor=(0.5, -0.08),
             ncols=1 if len(names) <= 4 else 2,
             frameon=False,
-            handlelength=1.0,
+            handlelength=3.0,
         )
         legend.set_in_layout(False)  # it fits into the space below the square axes
     ax.set_anchor("N")
@@ -240,7 +242,7 @@ def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
     total = dataset["signal" if recorded else "impulse_response"].sum("time")
     energy = total.mean({"shot"} & set(total.dims)).values
     factor, prefix = drawing.si_prefix(float(energy[np.isfinite(energy)].max(initial=0.0)))
-    image = drawing.draw_image(ax, energy / factor, dataset, cmap="viridis")
+    image = drawing.draw_image(ax, energy / factor, dataset, cmap=palette.SEQUENCE)
     ax.set_anchor("N")
     label = f"sum of the samples ({prefix}V)" if recorded else f"total energy ({prefix}J)"
     scale = ax.inset_axes((0.0, -0.24, 1.0, 0.05))

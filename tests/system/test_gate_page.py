@@ -4,75 +4,9 @@ import re
 
 import numpy as np
 import pytest
-import xarray as xr
-from browser_page import PLAIN, expected_colours, needs_browser
-
-METRES_PER_NS = 0.0299792458 * 5 / 1.364 * 0.967  # the depth axis at 20 degrees off nadir
-SURFACE_NS = 1420.0
-SIZE = 64  # rows and columns
-PLATE, BALL, SAND = (40, 26), (23, 41), (50, 43)  # pixels on them
-
-
-def scene_of(size, gates=40, seed=3):
-    """Return (stack, render) of a sphere and a plate over rippled sand, lit by a Gaussian beam."""
-    rng = np.random.default_rng(seed)
-    time = 1411.0 + np.arange(120)
-    angles = (np.arange(size) + 0.5) / size * 30 - 15
-    angle_y, angle_x = np.meshgrid(angles[::-1], angles[::-1])
-    x, y = 0.21 * angle_x[..., np.newaxis], 0.21 * angle_y[..., np.newaxis]
-    depth = (time - SURFACE_NS) * METRES_PER_NS
-    ripples = np.sin(2 * np.pi * (0.8 * x + 0.25 * y) / 0.7)
-    floor, reflectance = 8 + 0.06 * ripples + 0.04 * x, 0.1 + 0.035 * ripples + 0.01 * np.sin(1.7 * x - 0.9 * y)
-    ball = 0.7**2 - (x - 0.9) ** 2 - (y + 1.1) ** 2
-    floor = np.where(ball > 0, 6.4 - np.sqrt(np.maximum(ball, 0)), floor)
-    reflectance = np.where(ball > 0, 0.36 * np.sqrt(np.maximum(ball, 0)), reflectance)
-    across, along = 0.94 * (x + 0.7) + 0.34 * (y - 1.2), -0.34 * (x + 0.7) + 0.94 * (y - 1.2)
-    plate = (abs(across) < 0.75) & (abs(along) < 0.75)
-    floor = np.where(plate, 5.5 + 0.2 * across, floor)
-    reflectance = np.where(plate, 0.2 + 0.1 * ((across > 0) ^ (along > 0)), reflectance)
-    waves = 0.15 * np.sin(1.1 * x + 0.6 * y) + 0.05 * np.sin(4.1 * x - 2.3 * y + 1)
-    water = 1 / (1 + np.exp((waves - depth) / 0.09)) / (1 + np.exp((depth - floor) / 0.09))
-    power = 0.006 * water * np.exp(-0.4 * np.maximum(depth, 0))
-    power += 0.3 * reflectance * np.exp(-0.4 * floor - 0.5 * ((depth - floor) / 0.22) ** 2)
-    power += 0.003 * np.exp(3 * np.sin(5 * x + 3 * np.cos(3 * y)) - 0.5 * ((depth - waves) / 0.22) ** 2)
-    power *= 1e-6 * np.exp(-(x**2 + y**2) / (2 * 1.4**2)) * (1 + 0.06 * rng.standard_normal(power.shape))
-    start = 1412.0 + 2.5 * np.arange(gates)
-    opened = np.clip(np.minimum(time[:, None] + 0.5, start + 5) - np.maximum(time[:, None] - 0.5, start), 0, 1)
-    energy = 1e-9 * power @ opened
-    centres = {
-        "angle_x": (("row", "column"), angle_x, {"units": "mrad"}),
-        "angle_y": (("row", "column"), angle_y, {"units": "mrad"}),
-    }
-    attributes = {
-        "scene": "sphere & <b>plate",
-        "note": "</script><script>document.title = 'broken'</script>",
-        "altitude": 200.0,
-        "off_nadir_deg": 20.0,
-        "pulses": 1,
-        "surface_time_ns": SURFACE_NS,
-        "seed": seed,
-    }
-    gate_coords = {
-        "gate": np.arange(gates),
-        "gate_start": ("gate", start),
-        "gate_width": ("gate", np.full(gates, 5.0)),
-        "gate_depth": ("gate", (start + 2.5 - SURFACE_NS) * METRES_PER_NS),
-    }
-    dims = ("row", "column", "gate")
-    stack = xr.Dataset(
-        {"gate_energy": (dims, energy), "gate_energy_stderr": (dims, 0.03 * energy)}, centres | gate_coords, attributes
-    )
-    dims = ("row", "column", "time")
-    result = xr.Dataset({"waveform": (dims, power), "waveform_stderr": (dims, 0.06 * power)}, centres | {"time": time})
-    return stack, result
-
+from browser_page import BALL, METRES_PER_NS, PLAIN, PLATE, SIZE, expected_colours, needs_browser, point_at, scene_of
 
 pytestmark = pytest.mark.slow
-
-
-def point_at(page, pixel, **how):
-    """Move the mouse to a pixel, and click there."""
-    page.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)
 
 
 @pytest.fixture(scope="module")

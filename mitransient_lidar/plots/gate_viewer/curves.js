@@ -86,8 +86,8 @@ class CurveView {
     return svg("rect", { class: "gate", x: left, y: ROOM.top, width: Math.max(1, right - left), height: this.height });
   }
 
-  curve({ x, y, error, half, kind, colour }) {
-    const group = svg("g", { class: kind, ...(colour ? { style: `color: ${colour}` } : {}) });
+  curve({ x, y, error, half, kind, colour, dashes }) {
+    const group = svg("g", { class: kind, ...(colour ? { style: `color: ${colour}; --dashes: ${dashes}` } : {}) });
     const [first, last] = this.seen(x);
     let [line, upper, lower, bars] = ["", "", "", ""];
     for (let i = first; i < last; i++) {

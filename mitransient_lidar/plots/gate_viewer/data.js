@@ -1,48 +1,29 @@
-"use strict";
-
 // Data of the page: embedded arrays, quantities derived from them, and formats of numbers.
 
 const COLOUR_DECADES = 4; // at most, of a logarithmic range of colours
 const SIGNIFICANT = 5; // smallest rise of an echo, in standard errors
 
-/** Decode base64 piece by piece, without a string of the full size. */
-function decodeBase64(text) {
-  const piece = 1 << 20; // a multiple of 4 letters
-  const parts = [];
-  for (let start = 0; start < text.length; start += piece) {
-    parts.push(Uint8Array.from(atob(text.slice(start, start + piece)), (letter) => letter.charCodeAt(0)));
-  }
-  return parts;
-}
-
-/** Return an embedded array, inflated and with the bytes of each float32 rejoined; null if absent. */
+/** Return an embedded array, with the bytes of each float32 rejoined; null if absent. */
 async function loadArray(name) {
-  const element = document.getElementById(name);
-  if (element === null) return null;
-  const packed = new Blob(decodeBase64(element.textContent)).stream();
-  element.remove();
-  const inflated = packed.pipeThrough(new DecompressionStream("deflate-raw"));
-  const planes = new Uint8Array(await new Response(inflated).arrayBuffer());
-  const bytes = new Uint8Array(planes.length);
+  if (byId(name) === null) return null;
+  const planes = new Uint8Array(await unpacked(name).arrayBuffer());
   const count = planes.length / 4;
-  for (let plane = 0; plane < 4; plane++) {
-    for (let i = 0; i < count; i++) bytes[4 * i + plane] = planes[plane * count + i];
+  const words = new Uint32Array(count);
+  const [second, third, fourth] = [count, 2 * count, 3 * count];
+  for (let i = 0; i < count; i++) {
+    words[i] = planes[i] | (planes[second + i] << 8) | (planes[third + i] << 16) | (planes[fourth + i] << 24);
   }
-  return new Float32Array(bytes.buffer);
+  return new Float32Array(words.buffer);
 }
 
-/** Load the metadata, gates as (gate, row, column) and waveforms as (row, column, time). */
+/** Load the metadata and gates as (gate, row, column); waveforms only if the gates are their time bins. */
 async function loadStack() {
-  const stack = JSON.parse(document.getElementById("metadata").textContent);
+  const stack = JSON.parse(byId("metadata").textContent);
   stack.gates = stack.gate_start.length;
   stack.pixels = stack.rows * stack.columns;
   for (const name of ["gate_energy", "gate_energy_stderr", "surface_time", "depth_per_ns"]) stack[name] = await loadArray(name);
-  if (stack.waveform) {
-    stack.waveform.power = await loadArray("waveform");
-    stack.waveform.error = await loadArray("waveform_stderr");
-  }
   if (stack.gate_energy === null) {
-    // The gates of waveforms are their time bins.
+    await loadWaveforms(stack);
     stack.gate_energy = timeFirst(stack, stack.waveform.power);
     stack.gate_energy_stderr = timeFirst(stack, stack.waveform.error);
   }
@@ -52,6 +33,14 @@ async function loadStack() {
     Object.entries(stack.colour_maps).map(([name, text]) => [name, decodeBase64(text)[0]])
   );
   return stack;
+}
+
+/** Load the waveforms as (row, column, time), if there are any that are not loaded. */
+async function loadWaveforms({ waveform }) {
+  if (!waveform || waveform.power) return;
+  const power = await loadArray("waveform");
+  waveform.error = await loadArray("waveform_stderr");
+  waveform.power = power;
 }
 
 /** Return values of pixels over time as images, one after the other. */

@@ -126,6 +126,7 @@ class ImageView {
   /** Fit the drawing into its box, with the proportions of the image. */
   layOut() {
     const { rows, columns, axes } = this.stack;
+    this.canvas.classList.toggle("zoomed", this.zoom > 1);
     this.plot.style.height = ""; // the height of the style sheet is the largest
     const box = this.plot.getBoundingClientRect();
     const room = [box.width - MARGIN.left - MARGIN.right, box.height - MARGIN.top - MARGIN.bottom];

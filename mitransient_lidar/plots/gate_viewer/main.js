@@ -1,13 +1,15 @@
 // State of the page, its controls, and redrawing on changes.
 
-const COLOURS = ["#e8590c", "#1c86ee", "#2f9e44", "#b04ad0", "#e03131", "#0f9aa8", "#c99700", "#e64980"];
+const DASHES = ["none", "7 3", "2 3", "9 3 2 3", "none", "7 3", "2 3", "9 3 2 3"]; // of pinned pixels, at most eight
+const LINK_MS = 400; // from the last change to that of the address
+const PRINTED = 680; // width on paper [CSS pixels]
 const [FRAME_MS, SHORTEST_MS, PLAY_MS] = [160, 40, 20000]; // duration of a gate while playing, at least, and of all gates
-const byId = (id) => document.getElementById(id);
 
 /** Fill in the constant parts of the page, then connect the controls. */
 async function start() {
   if (!("DecompressionStream" in window)) throw new Error("this browser has no DecompressionStream");
   const stack = await loadStack();
+  byId("loading").remove();
   document.querySelectorAll("main, footer").forEach((part) => (part.hidden = false));
   fillIn(stack);
   const page = new Page(stack);
@@ -15,6 +17,13 @@ async function start() {
   connectImage(page);
   connectCurves(page);
   connectKeys(page);
+  connectPaper(page);
+  followLink(page);
+  addEventListener("hashchange", () => followLink(page));
+  // The image appears before the waveforms are decoded.
+  await new Promise((drawn) => requestAnimationFrame(() => setTimeout(drawn)));
+  await loadWaveforms(stack);
+  document.querySelector("main").setAttribute("aria-busy", "false");
   page.update();
 }
 
@@ -60,11 +69,13 @@ class Page {
     this.curves = new CurveView(stack);
     this.gate = this.brightestGate();
     this.selected = Math.floor(stack.rows / 2) * stack.columns + Math.floor(stack.columns / 2);
-    this.pins = []; // { pixel, colour }
+    this.pins = []; // { pixel, place among the styles, colour, dashes }
     this.pointed = null; // the pixel under the cursor
     this.moment = null; // the time under the cursor
     this.timer = null;
     this.waiting = false;
+    this.rests = {}; // heights around the plots
+    addEventListener("resize", () => (this.rests = {}));
   }
 
   brightestGate() {
@@ -81,10 +92,40 @@ class Page {
     this.waiting = true;
     requestAnimationFrame(() => {
       this.waiting = false;
-      this.drawImage();
-      this.drawCurves();
-      this.drawTexts();
+      this.draw();
+      if (this.timer === null) this.keepLink();
     });
+  }
+
+  draw() {
+    this.drawImage();
+    this.drawCurves();
+    this.drawTexts();
+    this.fit();
+  }
+
+  /** Keep gate and pixels in the address, which a page in a notebook has not. */
+  keepLink() {
+    clearTimeout(this.link);
+    if (location.protocol === "about:") return;
+    this.link = setTimeout(() => history.replaceState(null, "", linkOf(this)), LINK_MS);
+  }
+
+  /** Tell the style sheet what stands above and below the plots, so that they fill the window without scrolling. */
+  fit() {
+    const [body, main] = [document.body, document.querySelector("main")];
+    const around = body.getBoundingClientRect().height - main.getBoundingClientRect().height;
+    for (const name of ["image", "curves"]) {
+      const plot = byId(name);
+      const parts = [...plot.parentElement.children];
+      const [first, last] = [parts[0], parts.findLast((part) => part.offsetHeight > 0)];
+      const section = plot.parentElement.getBoundingClientRect();
+      const content = last.getBoundingClientRect().bottom - section.top + (first.getBoundingClientRect().top - section.top);
+      const rest = Math.ceil(around + content - plot.getBoundingClientRect().height) + 6;
+      // The largest since the window's size has changed: a row that comes and goes moves nothing.
+      this.rests[name] = Math.max(this.rests[name] ?? 0, rest);
+      document.documentElement.style.setProperty(`--around-${name}`, `${this.rests[name]}px`);
+    }
   }
 
   setGate(gate) {
@@ -97,13 +138,16 @@ class Page {
     const duration = Math.max(SHORTEST_MS, Math.min(FRAME_MS, PLAY_MS / this.stack.gates));
     this.timer = on ? setInterval(() => this.setGate((this.gate + 1) % this.stack.gates), duration) : null;
     byId("play").textContent = on ? "Pause" : "Play";
+    byId("caption").setAttribute("aria-live", on ? "off" : "polite");
+    if (!on) this.keepLink();
     byId("play").setAttribute("aria-pressed", String(on));
   }
 
   pin(pixel) {
     if (this.pins.some((pin) => pin.pixel === pixel)) return this.unpin(pixel);
-    const free = COLOURS.find((colour) => this.pins.every((pin) => pin.colour !== colour));
-    if (free) this.pins.push({ pixel, colour: free });
+    const free = DASHES.findIndex((_, place) => this.pins.every((pin) => pin.place !== place));
+    const { colours } = this.stack;
+    if (free >= 0) this.pins.push({ pixel, place: free, colour: colours[free % colours.length], dashes: DASHES[free] });
     this.update();
   }
 
@@ -156,7 +200,7 @@ class Page {
   }
 
   drawCurves() {
-    const source = byId("source").value;
+    const source = this.stack.waveform?.power ? byId("source").value : "gates";
     this.records = this.drawn().map((pixel) => ({ ...pixel, ...record(this.stack, source, pixel.pixel) }));
     byId("whole-label").hidden = source === "gates";
     const options = { gate: this.gate, log: byId("curve-log").checked, whole: byId("whole").checked, moment: this.moment };
@@ -174,7 +218,7 @@ class Page {
     byId("reading").textContent = `${describePixel(this.stack, pixel)}: ${value}`;
     const pinned = this.pins.some((pin) => pin.pixel === this.selected);
     byId("pin").textContent = pinned ? "Unpin pixel" : "Pin pixel";
-    byId("pin").disabled = !pinned && this.pins.length === COLOURS.length;
+    byId("pin").disabled = !pinned && this.pins.length === DASHES.length;
     this.drawList();
   }
 
@@ -195,11 +239,11 @@ class Page {
     byId("hint").hidden = this.pins.length > 0;
   }
 
-  listEntry({ pixel, colour, kind, x, y, error, unit }, time) {
+  listEntry({ pixel, colour, dashes, kind, x, y, error, unit }, time) {
     const nearest = x.reduce((best, other, i) => (Math.abs(other - time) < Math.abs(x[best] - time) ? i : best), 0);
     const entry = document.createElement("li");
-    const swatch = textElement("span", "", "swatch");
-    if (colour) swatch.style.color = colour;
+    const line = svg("path", { d: "M0 6h26", stroke: colour || "currentColor", "stroke-width": 2.5, "stroke-dasharray": dashes || "none" });
+    const swatch = svg("svg", { class: "swatch", "aria-hidden": "true" }, line);
     if (kind === "preview") swatch.style.opacity = "0.5";
     const value = textElement("span", withUnit(y[nearest], unit, error && error[nearest]), "value");
     entry.append(swatch, textElement("span", describePixel(this.stack, pixel), "who"), value);
@@ -227,6 +271,8 @@ function connectControls(page) {
     "zoom-in": () => page.image.zoomBy(2),
     "zoom-out": () => page.image.zoomBy(0.5),
     "zoom-reset": () => page.image.reset(),
+    "save-csv": () => save(recordsAsCsv(page.stack, page.records), "text/csv", `${document.title}.csv`),
+    "save-png": async () => save(await pictureAsPng(`${page.stack.title} · ${page.gateText()}`), "image/png", `${document.title}.png`),
   };
   for (const [id, act] of Object.entries(buttons)) {
     byId(id).addEventListener("click", () => {
@@ -238,37 +284,51 @@ function connectControls(page) {
   for (const id of ["image", "curves"]) resized.observe(byId(id));
 }
 
-/** Clicks select pixels, drags move the image, the wheel zooms. */
+/** Clicks and taps select pixels, drags move the image, wheel and pinch zoom. */
 function connectImage(page) {
   const { canvas } = page.image;
-  let drag = null; // last position, and whether the pointer has moved
+  const pointers = new Map(); // last position of each that is down
+  let moved = false; // since the first one has gone down
   const show = (pixel) => {
     page.pointed = pixel;
     page.update();
   };
+  const middle = (places) => [0, 1].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length);
+  const spread = (places) => (places.length < 2 ? 1 : Math.hypot(places[0][0] - places[1][0], places[0][1] - places[1][1]));
   canvas.addEventListener("pointerdown", (event) => {
-    drag = { x: event.clientX, y: event.clientY, moved: false };
+    document.documentElement.classList.toggle("touched", event.pointerType === "touch");
+    moved = pointers.size > 0;
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
     canvas.setPointerCapture(event.pointerId);
   });
   canvas.addEventListener("pointermove", (event) => {
-    show(page.image.pixelAt(event));
-    if (drag === null) return;
-    const [across, along] = [drag.x - event.clientX, drag.y - event.clientY];
-    if (!drag.moved && Math.hypot(across, along) < 5) return;
+    if (pointers.size < 2) show(page.image.pixelAt(event));
+    if (!pointers.has(event.pointerId)) return;
+    const before = [...pointers.values()];
+    const place = [event.clientX, event.clientY];
+    if (!moved && Math.hypot(place[0] - before[0][0], place[1] - before[0][1]) < 5) return;
+    moved = true;
     canvas.classList.add("dragged");
-    page.image.moveBy(across / page.image.width, along / page.image.height);
-    drag = { x: event.clientX, y: event.clientY, moved: true };
+    pointers.set(event.pointerId, place);
+    const after = [...pointers.values()];
+    const box = canvas.getBoundingClientRect();
+    const [from, to] = [middle(before), middle(after)];
+    page.image.zoomBy(spread(after) / Math.max(spread(before), 1), (from[0] - box.left) / box.width, (from[1] - box.top) / box.height);
+    page.image.moveBy((from[0] - to[0]) / box.width, (from[1] - to[1]) / box.height);
+    page.update();
   });
+  // Else the browser would take two fingers for its own.
+  canvas.addEventListener("touchstart", (event) => event.touches.length > 1 && event.preventDefault(), { passive: false });
   canvas.addEventListener("pointerup", (event) => {
-    if (drag !== null && !drag.moved) {
+    if (!moved && pointers.has(event.pointerId)) {
       page.selected = page.image.pixelAt(event) ?? page.selected;
       if (event.shiftKey) page.pin(page.selected);
       page.update();
     }
   });
   for (const end of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(end, () => {
-      drag = null;
+    canvas.addEventListener(end, (event) => {
+      pointers.delete(event.pointerId);
       canvas.classList.remove("dragged");
     });
   }
@@ -312,11 +372,23 @@ function connectCurves(page) {
     page.moment = null;
     page.update();
   });
-  plot.addEventListener("click", (event) => {
+  // No click: a redrawing between press and release would swallow it.
+  plot.addEventListener("pointerup", (event) => {
     const time = page.curves.timeAt(event);
     const distances = page.stack.gate_middle.map((middle) => Math.abs(middle - time));
     page.setGate(distances.indexOf(Math.min(...distances)));
   });
+}
+
+/** Draw for the width of paper while the page is printed. */
+function connectPaper(page) {
+  const draw = (width) => {
+    document.body.style.width = width;
+    page.rests = {};
+    page.draw();
+  };
+  addEventListener("beforeprint", () => draw(`${PRINTED}px`));
+  addEventListener("afterprint", () => draw(""));
 }
 
 /** Keys of the page, except while a control uses them itself. */
@@ -331,6 +403,10 @@ function connectKeys(page) {
     "+": () => page.image.zoomBy(2),
     "-": () => page.image.zoomBy(0.5),
     0: () => page.image.reset(),
+    "?": () => {
+      byId("help").open = !byId("help").open;
+      byId("help").scrollIntoView({ block: "nearest" });
+    },
   };
   document.addEventListener("keydown", (event) => {
     if (!(event.key in acts) || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -343,6 +419,7 @@ function connectKeys(page) {
 }
 
 start().catch((error) => {
+  byId("loading")?.remove();
   byId("notes").append(textElement("p", `The page cannot be shown: ${error.message}.`, "note"));
   throw error;
 });

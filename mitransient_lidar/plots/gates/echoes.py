@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.gates.range_images import DepthImage, depth_image
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.gates.images import known_depths, reached_by_surface
 from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import optional_number
@@ -74,7 +74,7 @@ def _draw_depth_image(figure: Figure, stack: xr.Dataset, found: DepthImage) -> N
     if high - low < 0.01:
         low, high = low - 0.005, high + 0.005
     # Reversed: the deeper, the darker.
-    colours = ScalarMappable(Normalize(low, high), "viridis_r")
+    colours = ScalarMappable(Normalize(low, high), f"{palette.SEQUENCE}_r")
     drawing.draw_image(left, depth, stack, norm=colours.norm, cmap=colours.cmap, alpha=confidence)
     bar = figure.colorbar(colours, ax=left, extend="both", aspect=25, shrink=0.9, label="depth (m)")
     bar.ax.invert_yaxis()
@@ -96,7 +96,7 @@ def _draw_pixel_depths(figure: Figure, stack: xr.Dataset, found: DepthImage) -> 
     confidence = np.clip(np.nan_to_num(found.confidence), 0.0, 1.0)
     figure.set_figheight(4.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    for place, colour in enumerate(drawing.pixel_colours(len(names))):
+    for place, colour in enumerate(palette.pixel_colours(len(names))):
         style = {"color": colour, "alpha": max(float(confidence[place]), 0.15)}
         stated = np.hypot(found.sigma[place], np.nan_to_num(found.method_error[place]))
         upper.errorbar(place, found.depth[place], stated, fmt="o", capsize=4, **style)

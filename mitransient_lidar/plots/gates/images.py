@@ -23,7 +23,7 @@ from matplotlib.image import AxesImage
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import optional_number
 
@@ -50,7 +50,7 @@ class ColourScale(NamedTuple):
 
     def draw(self, ax: Axes, energy: FloatArray, stack: xr.Dataset, *, label: bool = True) -> AxesImage:
         """Draw the energies [J] of one gate; pixels with non-finite values are grey."""
-        colours = matplotlib.colormaps["magma"].with_extremes(bad="0.6")
+        colours = matplotlib.colormaps[palette.LIGHT].with_extremes(bad="0.6")
         return drawing.draw_image(ax, energy / self.factor, stack, label=label, norm=self.norm, cmap=colours)
 
     def add_bar(self, figure: Figure, image: AxesImage, axes: Any, label: str, **options: Any) -> Colorbar:
@@ -157,7 +157,9 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
         top = float(finite.max()) if finite.max() > 0 else 1.0
     brighter = np.count_nonzero(finite > top) / finite.size
     factor, unit = unit_of(stack, top)
-    label = f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit})"
+    label = (
+        f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit}{', logarithmic' if log else ''})"
+    )
     if brighter:
         surface = "" if below.all() else ", including the surface echo,"
         label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
@@ -259,7 +261,7 @@ def _animated_figure(stack: xr.Dataset, *, log: bool) -> tuple[Figure, Callable[
     axis = stack["gate_start"].values if depths is None else depths
     mean = energy.mean(axis=(0, 1)) / scale.factor
     right.plot(mean, axis, color="0.25", linewidth=1.2)
-    (marker,) = right.plot([], [], "o", color="#d4472e", markersize=8, clip_on=False)
+    (marker,) = right.plot([], [], "o", color=palette.RED, markersize=8, clip_on=False)
     top = float(np.nanmax(mean, initial=0.0))
     if top > 0:
         right.set_xscale("log")
@@ -293,8 +295,8 @@ def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
     depths = known_depths(stack)
     axis = stack["gate_start"].values if depths is None else depths
     ax = figure.subplots()
-    for i, (name, colour) in enumerate(zip(names, drawing.pixel_colours(len(names)), strict=True)):
-        style = {"color": colour, "linewidth": 1.3, "marker": "o", "markersize": 3.5, "label": name}
+    for i, (name, mark) in enumerate(zip(names, palette.marked(len(names)), strict=True)):
+        style = {"linewidth": 1.3, "markersize": 4, "label": name, **mark}
         lowest = 1e-3 * floor if log else -np.inf
         drawing.draw_band(ax, axis, energy[i] / factor, stderr[i] / factor, lowest=lowest, **style)
     if log and top > 0:

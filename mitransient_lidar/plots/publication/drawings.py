@@ -10,11 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mitransient_lidar.physics.lidar.level_sea import LevelSea, refract
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, System, outlines
-
-_BEAM, _VIEW, _WATER, _BOTTOM = "#17963f", "#555555", "#3f8fc9", "#a8743a"
 
 #: Half side of the drawn part of the sea, and distance between the refracted axes [m].
 _HALF_SIDE, _AXES_APART = 1.3, 0.25
@@ -27,13 +25,13 @@ def system(_renders: Renders) -> Figure:
     left, right = figure.subplots(1, 2)
     origin = np.array([-numbers.height * math.tan(numbers.off_nadir), 0.0, numbers.height])
     sea = LevelSea((numbers.refractive_index,))
-    edges = {_VIEW: 0.5 * numbers.field_of_view, _BEAM: 0.5 * numbers.divergence}
+    edges = {palette.VIEW: 0.5 * numbers.field_of_view, palette.BEAM: 0.5 * numbers.divergence}
     depths = np.linspace(0, numbers.bottom_depth, 2)
     for colour, half in edges.items():
         for angle in (numbers.off_nadir - half, numbers.off_nadir + half):
             down = np.array([math.sin(angle), 0.0, -math.cos(angle)])
             x = sea.at_height(origin, np.broadcast_to(down, (2, 3)), -depths)[:, 0]
-            style = "-" if colour == _BEAM else "--"
+            style = "-" if colour == palette.BEAM else "--"
             left.plot([origin[0], x[0]], [origin[2], 0], color=colour, linestyle=style, linewidth=1)
             above = x[0] - 3 * math.tan(angle)
             right.plot([above, *x], [3, *-depths], color=colour, linestyle=style, linewidth=1.2)
@@ -51,13 +49,13 @@ def system(_renders: Renders) -> Figure:
         f"θ$_w$ = {in_water:.2f}°", (0.5 * x[1], -0.5 * numbers.bottom_depth), backgroundcolor="white", ha="center"
     )
     for ax, title in ((left, "5  system in air"), (right, "5  sea, level, and bottom")):
-        ax.axhline(0, color=_WATER, linewidth=2)
+        ax.axhline(0, color=palette.SEA, linewidth=2)
         ax.set_title(title, fontsize="medium")
         ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
         drawing.add_grid(ax, hide=("top", "right"))
-    right.axhline(-numbers.bottom_depth, color=_BOTTOM, linewidth=2)
-    right.plot([], [], color=_BEAM, label="beam, e$^{-1/2}$")
-    right.plot([], [], color=_VIEW, linestyle="--", label="field of view")
+    right.axhline(-numbers.bottom_depth, color=palette.BOTTOM, linewidth=2)
+    right.plot([], [], color=palette.BEAM, label="beam, e$^{-1/2}$")
+    right.plot([], [], color=palette.VIEW, linestyle="--", label="field of view")
     right.legend(frameon=False, fontsize="small", loc="upper right")
     return figure
 
@@ -76,11 +74,13 @@ def mesh(renders: Renders) -> Figure:
     _draw_section(left, numbers, lines, heights[count])
     reach = 0.55 * numbers.field_of_view * numbers.slant_range / math.cos(numbers.off_nadir)
     wide = np.arange(-reach, reach, 2 * sea.cell_size)
-    image = right.imshow(sea.heights(wide, wide), origin="lower", extent=(-reach, reach, -reach, reach), cmap="Blues_r")
+    image = right.imshow(
+        sea.heights(wide, wide), origin="lower", extent=(-reach, reach, -reach, reach), cmap=palette.ELEVATION
+    )
     x, y = np.meshgrid(lines, lines)
     right.triplot(x.ravel(), y.ravel(), color="white", linewidth=0.3, alpha=0.8)
     figure.colorbar(image, ax=right, label="elevation (m)", shrink=0.7)
-    for colour, angle, style in ((_BEAM, numbers.divergence, "-"), ("black", numbers.field_of_view, "--")):
+    for colour, angle, style in ((palette.BEAM, numbers.divergence, "-"), ("black", numbers.field_of_view, "--")):
         across = angle * numbers.slant_range
         along = across / math.cos(numbers.off_nadir)
         right.add_patch(Ellipse((0, 0), along, across, fill=False, color=colour, linestyle=style, linewidth=1.6))
@@ -91,7 +91,7 @@ def mesh(renders: Renders) -> Figure:
 
 def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndarray) -> None:
     """Draw a section of the sea along x, and parallel axes that its facets refract."""
-    ax.plot(lines, heights, color=_WATER, linewidth=1.6)
+    ax.plot(lines, heights, color=palette.SEA, linewidth=1.6)
     down = np.array([math.sin(numbers.off_nadir), -math.cos(numbers.off_nadir)])
     step = max(1, round(_AXES_APART / (lines[1] - lines[0])))
     for first in range(0, len(lines) - 1, step):
@@ -99,8 +99,8 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
         point = 0.5 * np.array([lines[first] + lines[first + 1], heights[first] + heights[first + 1]])
         start = point - 0.8 * down
         end = point + 2.0 * refract(down, np.array([-slope, 1.0]), numbers.refractive_index)
-        ax.plot([start[0], point[0]], [start[1], point[1]], color=_BEAM, linewidth=1)
-        ax.plot([point[0], end[0]], [point[1], end[1]], color=_BEAM, linestyle="--", linewidth=1)
+        ax.plot([start[0], point[0]], [start[1], point[1]], color=palette.BEAM, linewidth=1)
+        ax.plot([point[0], end[0]], [point[1], end[1]], color=palette.BEAM, linestyle="--", linewidth=1)
     ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
     ax.set_title("6 (a)  axes refracted by facets, section at y = 0", fontsize="medium")
     drawing.add_grid(ax, hide=("top", "right"))
@@ -111,7 +111,7 @@ def pixels(renders: Renders) -> Figure:
     figure = drawing.new_figure(None, 8.4, 3.0)
     for ax, scene, panel in zip(figure.subplots(1, 3), LAYOUTS, "abc", strict=True):
         shapes = outlines(renders, scene)
-        for number, (shape, colour) in enumerate(zip(shapes, drawing.pixel_colours(len(shapes)), strict=True)):
+        for number, (shape, colour) in enumerate(zip(shapes, palette.pixel_colours(len(shapes)), strict=True)):
             for line in shape:
                 # angle_y to the left, angle_x, away from nadir, up.
                 ax.fill(1e3 * line[:, 1], 1e3 * line[:, 0], facecolor=colour, edgecolor="white", alpha=0.85)

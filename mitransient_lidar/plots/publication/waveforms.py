@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.layout import draw_sea_level
 from mitransient_lidar.studies.publication import scenes
 from mitransient_lidar.studies.publication.measures import change
@@ -44,9 +44,9 @@ def draw_waveforms(
     depth = geometry_of(result).depth_of_time(series.time)
     shown = (depth >= limits[0]) & (depth <= limits[1])
     factor, prefix = drawing.si_prefix(float(series.power.mean(axis=0)[:, shown].max()))
-    colours = drawing.pixel_colours(len(mean))
+    styles = palette.curves(len(mean))
     for pixel in range(len(mean)) if pixels is None else pixels:
-        curve = {"color": colours[pixel], "linewidth": 1.2, "label": label or None, **style}
+        curve = {"linewidth": 1.2, "label": label or None, **styles[pixel], **style}
         lowest = 1e-12 / factor if log else -np.inf
         drawing.draw_band(
             ax, depth[shown], mean[pixel, shown] / factor, error[pixel, shown] / factor, lowest=lowest, **curve
@@ -89,7 +89,7 @@ def _with_part(result: xr.Dataset, limits: tuple[float, float], title: str, labe
     figure = drawing.new_figure(None, 6.0, 3.4)
     ax = figure.subplots()
     draw_waveforms(ax, result, limits, log=log)
-    draw_waveforms(ax, result, limits, log=log, origin="target", color="#7a3fb0", label=label)
+    draw_waveforms(ax, result, limits, log=log, origin="target", color=palette.TARGET, linestyle="--", label=label)
     ax.legend(frameon=False)
     ax.set_title(title, fontsize="medium")
     return figure
@@ -114,7 +114,7 @@ def layer_zoom(renders: Renders) -> Figure:
         result = renders.shot(scene)
         mean, geometry = as_series(result).mean(), geometry_of(result)
         factor, _ = drawing.si_prefix(float(mean.power[:, geometry.depth_of_time(mean.time) >= 1.8].max()))
-        colours = drawing.pixel_colours(len(mean.power))
+        colours = palette.pixel_colours(len(mean.power))
         for pixel, middle in enumerate(scenes.layer_times(result)):
             for time in change(mean, pixel, float(middle)):
                 point = float(geometry.depth_of_time(time)), float(np.interp(time, mean.time, mean.power[pixel]))
@@ -166,6 +166,6 @@ def _show_decades(axes: Sequence[Axes]) -> None:
 
 
 def add_pixel_legend(ax: Axes, loc: Literal["best", "upper left"] = "best") -> None:
-    """Name the four pixels by their colours."""
-    handles = [Line2D([], [], color=colour) for colour in drawing.pixel_colours(4)]
+    """Name the four pixels by their lines."""
+    handles = [Line2D([], [], **style) for style in palette.curves(4)]
     ax.legend(handles, PIXELS, frameon=False, fontsize="small", loc=loc)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.physics.lidar.level_sea import refract
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
 from mitransient_lidar.plots.studies.shots import draw_sea
 from mitransient_lidar.studies.find_shots import render_found_shots
@@ -57,9 +57,9 @@ def paths(renders: Renders) -> Figure:
         ray = refract(down, np.array([-slope, 1.0]), system.refractive_index)
         path = system.bottom_depth / -ray[1]
         end = path * ray
-        ax.plot([-1.5, 1.5], [-1.5 * slope, 1.5 * slope], color="#3f8fc9", linewidth=2)
-        ax.plot([-2, 3], [-system.bottom_depth] * 2, color="#a8743a", linewidth=2)
-        ax.plot([-2 * down[0], 0, end[0]], [-2 * down[1], 0, end[1]], color="#17963f")
+        ax.plot([-1.5, 1.5], [-1.5 * slope, 1.5 * slope], color=palette.SEA, linewidth=2)
+        ax.plot([-2, 3], [-system.bottom_depth] * 2, color=palette.BOTTOM, linewidth=2)
+        ax.plot([-2 * down[0], 0, end[0]], [-2 * down[1], 0, end[1]], color=palette.BEAM)
         ax.plot([0, 0], [0, -system.bottom_depth], color="0.6", linestyle=":")
         slope_deg, angle = math.degrees(math.atan(slope)), math.degrees(math.atan2(ray[0], -ray[1]))
         ax.set_title(
@@ -80,4 +80,4 @@ def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:
         along, across = (round(math.degrees(math.atan(slope)), 1) + 0.0 for slope in (shot.along, shot.across))
         if index:
             ax.set_ylabel("")
-        ax.set_title(f"{number} (a)  {shot.kind}: {along:+.1f}° to the lidar, {across:+.1f}° left", fontsize="small")
+        ax.set_title(f"{number} (a)  {shot.kind}:\n{along:+.1f}° to the lidar, {across:+.1f}° left", fontsize="medium")

@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
-import zlib
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.plots.gate_viewer.page import POLICY
+from mitransient_lidar.plots.gate_viewer.page import POLICY, packed, part
 
 
 def page_text(
@@ -43,16 +41,11 @@ def page_text(
         "kind": html.escape(kind),
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
         "views": html.escape(json.dumps(boxes)),
-        "figure": _packed(go.Figure(list(traces)).to_json()),
-        "library": _packed(get_plotlyjs()),
+        "figure": packed(go.Figure(list(traces)).to_json().encode(), 9),
+        "unpack": part("unpack.js"),
+        "library": packed(get_plotlyjs().encode(), 9),
     }
     text = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     for name, value in filled.items():
         text = text.replace(f"{{{{{name}}}}}", value)
     return text
-
-
-def _packed(text: str) -> str:
-    """Return base64 of the raw deflate data of a text."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-    return base64.b64encode(packer.compress(text.encode()) + packer.flush()).decode("ascii")

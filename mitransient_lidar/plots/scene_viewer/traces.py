@@ -9,26 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from matplotlib.colors import to_hex
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.sea.sea_mesh import grid_faces
-from mitransient_lidar.plots import drawing
-from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
+from mitransient_lidar.plots import palette
 from mitransient_lidar.results.variables import PointClass
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid
-
-#: Colours that colour-blind readers tell apart (Okabe and Ito 2008), of four pixels by their published names.
-_FOUR = ("#d55e00", "#009e73", "#0072b2", "#222222")
-_BEAM, _TARGET, _LAYER = "#e6ab02", "#cc79a7", "#777777"
-
-#: Colours of the sea from troughs to crests.
-_SEA = [[0.0, "#1f78b4"], [1.0, "#b5e2fa"]]
-
-#: Colours of reflectances from 0 to the larger of 0.5 and the largest, from wet mud to white sand.
-_SAND = [[0.0, "#4a3b2a"], [0.2, "#957d5b"], [0.6, "#d3bd95"], [1.0, "#faf4e4"]]
 
 #: Rays drawn along a beam or pixel, and most boundaries of layers drawn.
 _RAYS, _MOST_LAYERS = 4, 12
@@ -48,13 +36,19 @@ def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:
     for row in _drawn_layers(geometry):
         yield _layer(row, geometry.box)
     pixels = [one for one in geometry.bundles if one.kind == "pixel"]
-    colours = _FOUR if len(pixels) == 4 else [to_hex(one) for one in drawing.pixel_colours(len(pixels))]
+    colours = palette.pixel_colours(len(pixels))
     for bundle in geometry.bundles:
-        colour = colours[pixels.index(bundle)] if bundle in pixels else _BEAM if bundle.kind == "beam" else _FOUR[3]
+        colour = (
+            colours[pixels.index(bundle)]
+            if bundle in pixels
+            else palette.BEAM
+            if bundle.kind == "beam"
+            else palette.VIEW
+        )
         yield from _bundle(bundle, colour)
     for name, place in geometry.lidar.items():
         text = f"{name}<br>height {place[2]:.4g} m"
-        marker = {"size": 5, "color": _BEAM if name == "laser" else _FOUR[3], "symbol": "diamond"}
+        marker = {"size": 5, "color": palette.BEAM if name == "laser" else palette.VIEW, "symbol": "diamond"}
         yield _points(place[None], mode="markers", marker=marker, name=name, hovertext=text, hoverinfo="text")
 
 
@@ -100,7 +94,7 @@ def point_traces(points: xr.Dataset) -> Iterator[dict[str, Any]]:
         lines = [f"{key} %{{customdata[{number}]:.1f}} cm" for number, key in enumerate(listed)]
         text = "<br>".join([name, "x %{x:.2f} m, y %{y:.2f} m", "height %{z:.2f} m", *lines]) + "<extra></extra>"
         style = {"name": f"{name} ({own.sizes['point']})", "mode": "markers", "hovertemplate": text}
-        marker = {"size": 2, "color": CLASS_COLOURS.get(kind, _LAYER)}
+        marker = {"size": 2, "color": palette.CLASSES.get(kind, palette.LAYER)}
         custom = {"customdata": np.stack([*listed.values()], axis=1)} if listed else {}
         yield _points(places - origin, marker=marker, **style, **custom)
 
@@ -172,10 +166,10 @@ def _relief(relief: Relief, brightest: float) -> dict[str, Any]:
     if relief.is_sea:
         light = {"ambient": 0.8, "diffuse": 0.5, "specular": 0.1}
         text = f"{name}<br>{place}height %{{z:.3f}} m<extra></extra>"
-        return trace | {"colorscale": _SEA, "opacity": 0.6, "hovertemplate": text, "lighting": light}
+        return trace | {"colorscale": palette.WAVES, "opacity": 0.6, "hovertemplate": text, "lighting": light}
     return trace | {
         "surfacecolor": relief.reflectance.astype(np.float32),
-        "colorscale": _SAND,
+        "colorscale": palette.SAND,
         "cmin": 0.0,
         "cmax": brightest,
         "lighting": {"ambient": 0.75, "diffuse": 0.4, "specular": 0.0},
@@ -190,15 +184,17 @@ def _solid(solid: Solid) -> dict[str, Any]:
     name = escape(solid.name) or "target"
     text = f"{name}<br>height {_span(solid.points[:, 2])} m<br>{sides} m<br>reflectance {reflectance}"
     if not len(solid.faces):
-        return _points(solid.points, mode="markers", marker={"size": 2, "color": _TARGET}, name=name, hovertext=text)
-    return _mesh(solid.points, solid.faces, text, name=name, color=_TARGET, lighting={"ambient": 0.8})
+        return _points(
+            solid.points, mode="markers", marker={"size": 2, "color": palette.TARGET}, name=name, hovertext=text
+        )
+    return _mesh(solid.points, solid.faces, text, name=name, color=palette.TARGET, lighting={"ambient": 0.8})
 
 
 def _layer(row: FloatArray, box: FloatArray) -> dict[str, Any]:
     depth, above, below = row
     corners = np.array([[x, y, -depth] for y in box[:, 1] for x in box[:, 0]])
     text = f"boundary of layers, {depth:.3g} m deep<br>attenuation {above:.3g} /m above, {below:.3g} /m below"
-    return _mesh(corners, grid_faces(2, 2), text, name=f"layer below {depth:.3g} m", color=_LAYER, opacity=0.3)
+    return _mesh(corners, grid_faces(2, 2), text, name=f"layer below {depth:.3g} m", color=palette.LAYER, opacity=0.3)
 
 
 def _bundle(bundle: Bundle, colour: str) -> Iterator[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -12,11 +11,15 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish, name_sides, new_panels
 
 #: Colours for the orders from the strictest on, for none, and for an unknown depth.
-_ORDER_COLOURS = ("#1a7f37", "#8fd19e", "#f2c14e", "#e07a2f", "#b3261e", "0.9")
+_ORDER_COLOURS = (*palette.ordered(5), "0.9")
+
+#: Their names and letters, and the first one of a light colour.
+_NAMES = (*(one.name for one in SURVEY_ORDERS), "none", "no depth")
+_LETTERS, _LIGHT = (*(one.name[0].upper() for one in SURVEY_ORDERS), "–", ""), 2
 
 
 def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -29,9 +32,9 @@ def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> 
     names = [str(name) for name in found["estimator"].values]
     for number, ax in enumerate(axes):
         one = cells.isel(cell=number)
-        for name, colour in zip(names, drawing.pixel_colours(10), strict=False):
+        for name, mark in zip(names, palette.marked(len(names)), strict=True):
             bias, spread = (100 * one[part].sel(estimator=name).values for part in ("bias", "spread"))
-            style = {"color": colour, "marker": "o", "markersize": 3.5, "linewidth": 1.3, "capsize": 2}
+            style = {"markersize": 4, "linewidth": 1.3, "capsize": 2, **mark}
             ax.errorbar(found["off_nadir_deg"], bias, spread, label=name.replace("_", " "), **style)
         wind, water, depth = one["cell"].item()
         sea = f"{wind:g} m/s" if wind else f"level sea, ripples of {float(one['ripples']):g} m/s"
@@ -49,15 +52,15 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
     """
     waters = found["water"].values
     figure, axes, lowest, first = new_panels(path, waters.size, (3.9, 3.1), (1.2, 0.6), sharex=True, sharey=True)
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, found.sizes["wind_speed"]))
-    for ax, water in zip(axes, waters, strict=True):
-        _draw_orders(ax, float(found["depth"].max()))
-        for wind, colour in zip(found["wind_speed"].values, colours, strict=True):
+    winds = found["wind_speed"].values
+    marks = palette.marked(winds.size, palette.ordered(winds.size))
+    for number, (ax, water) in enumerate(zip(axes, waters, strict=True), start=1):
+        _draw_orders(ax, float(found["depth"].max()), named=number in (3, 6, 9, waters.size))
+        for wind, mark in zip(winds, marks, strict=True):
             one = found["tvu"].sel(water=water, wind_speed=wind)
-            style = {"color": colour, "linewidth": 1.4, "markersize": 4.5, "marker": "o"}
-            ax.plot(found["depth"], one.isel(correction=-1), label=f"{wind:g} m/s", **style)
             if one.sizes["correction"] > 1:
-                ax.plot(found["depth"], one.isel(correction=0), **{**style, "linestyle": "none"}, mfc="none")
+                ax.plot(found["depth"], one.isel(correction=0), ":", markersize=7, mfc="none", linewidth=0.8, **mark)
+            ax.plot(found["depth"], one.isel(correction=-1), markersize=4.5, label=f"{wind:g} m/s", **mark)
         finish(ax, f"Jerlov {water}")
     axes[0].set_ylim(0, 1.15 * max(float(found["tvu"].fillna(0).max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
     name_sides(figure, lowest, "depth (m)", first, "TVU at 95 % (m)", title="wind")
@@ -73,7 +76,6 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     """
     depths = found["depth"].values
     figure = drawing.new_figure(path, 2.3 * depths.size + 1.8, 3.4)
-    names = [one.name for one in SURVEY_ORDERS]
     colours = ListedColormap(_ORDER_COLOURS)
     norm = BoundaryNorm(np.arange(len(_ORDER_COLOURS) + 1) - 0.5, len(_ORDER_COLOURS))
     axes = figure.subplots(1, depths.size, sharey=True, squeeze=False)[0]
@@ -82,26 +84,31 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     shown = np.where(rendered, np.where(orders < 0, len(_ORDER_COLOURS) - 1, orders), np.nan)
     for number, (ax, depth) in enumerate(zip(axes, depths, strict=True)):
         image = ax.imshow(shown[..., number], cmap=colours, norm=norm, origin="upper", aspect="auto")
+        for (row, column), order in np.ndenumerate(shown[..., number]):
+            if np.isfinite(order):
+                colour = "white" if order < _LIGHT else "black"
+                ax.text(column, row, _LETTERS[int(order)], ha="center", va="center", size=7, color=colour)
         ax.set_xticks(range(found.sizes["wind_speed"]), [f"{wind:g}" for wind in found["wind_speed"].values])
         ax.set_yticks(range(found.sizes["water"]), found["water"].values.tolist())
         ax.set_title(f"{depth:g} m", fontsize="medium")
         ax.set_xlabel("wind (m/s)")
     axes[0].set_ylabel("Jerlov type")
     bar = figure.colorbar(image, ax=axes, ticks=range(len(_ORDER_COLOURS)), pad=0.01)
-    bar.ax.set_yticklabels([*names, "none", "no depth"])
+    bar.ax.set_yticklabels([f"{letter}  {name}" for letter, name in zip(_LETTERS, _NAMES, strict=True)])
     bar.ax.invert_yaxis()
     figure.suptitle(_title(found, "order of S-44"))
     return drawing.save(figure, path)
 
 
-def _draw_orders(ax: Axes, deepest: float) -> None:
-    """Draw the largest vertical uncertainty of each order, with its name at the right end."""
+def _draw_orders(ax: Axes, deepest: float, *, named: bool) -> None:
+    """Draw the largest vertical uncertainty of each order, with its name on the right."""
     depth = np.linspace(0, 1.05 * deepest, 50)
     for one in SURVEY_ORDERS:
         ax.plot(depth, one.largest_tvu(depth), color="0.6", linewidth=0.9, linestyle="--")
-        end = (depth[-1], float(one.largest_tvu(depth[-1])))
-        text: dict[str, Any] = {"ha": "right", "fontsize": 7, "color": "0.4", "textcoords": "offset points"}
-        ax.annotate(one.name, end, (-2, 2), annotation_clip=True, **text)
+        if named:
+            end = (depth[-1], float(one.largest_tvu(depth[-1])))
+            text: dict[str, Any] = {"va": "center", "color": "0.4", "textcoords": "offset points"}
+            ax.annotate(one.name, end, (3, 0), annotation_clip=True, **text)
     ax.set_xlim(0, depth[-1])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -13,10 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish
-
-_DEPTHS = matplotlib.colormaps["viridis_r"]
 
 #: Light share at which a panel's horizontal axis begins.
 _SMALLEST_SHARE = 3e-3
@@ -37,32 +34,32 @@ def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -
     figure = drawing.new_figure(path, 12.4, 4.4)
     axes = figure.subplots(1, 3, sharey=True)
     depths = spread["depth"].values
-    colours = [_DEPTHS(0.18 + 0.82 * (rank + 1) / len(depths)) for rank in range(len(depths))]
+    styles = palette.curves(len(depths), palette.ordered(len(depths))[::-1])
     for ax, (name, coordinate, label, title) in zip(axes, _PANELS, strict=True):
         values = spread[coordinate].values
-        for rank, colour in enumerate(colours):
+        for rank, style in enumerate(styles):
             row = spread.isel(depth=rank)
-            drawing.draw_band(ax, values, row[name].values, row[f"{name}_stderr"].values, color=colour, linewidth=1.5)
+            drawing.draw_band(ax, values, row[name].values, row[f"{name}_stderr"].values, linewidth=1.5, **style)
             if name == "within_radius":
-                ax.plot([row["radius_50"], row["radius_90"]], [0.5, 0.9], "o", color=colour, markersize=4)
+                ax.plot([row["radius_50"], row["radius_90"]], [0.5, 0.9], "o", color=style["color"], markersize=4)
         first = max(int(np.argmax(spread[name].values.max(axis=0, initial=0) > _SMALLEST_SHARE)) - 1, 0)
         ax.set(xscale="log", xlim=(values[first], values[-1]), ylim=(0, 1.02), xlabel=label)
         ax.xaxis.set_major_formatter("{x:g}")
         ax.set_title(title, fontsize="medium", color="0.25")
         drawing.add_grid(ax, hide=("top", "right"))
     axes[0].set_ylabel("share of the light at the depth")
-    _add_legend(axes[0], spread, colours)
+    _add_legend(axes[0], spread, styles)
     figure.suptitle(f"{spread.attrs.get('scene', '')}  ·  spread of the light at depth", fontsize="large")
     return drawing.save(figure, path)
 
 
-def _add_legend(ax: Axes, spread: xr.Dataset, colours: list[Any]) -> None:
+def _add_legend(ax: Axes, spread: xr.Dataset, styles: list[dict[str, Any]]) -> None:
     """List the depths with the share of their light that is in the field of view."""
     handles = []
-    for depth, in_view, colour in zip(spread["depth"].values, spread["in_view"].values, colours, strict=True):
+    for depth, in_view, style in zip(spread["depth"].values, spread["in_view"].values, styles, strict=True):
         text = f"{100 * in_view:.3g} % in view" if np.isfinite(in_view) else "no light"
-        handles.append(Line2D([], [], color=colour, linewidth=2, label=f"{depth:.4g} m: {text}"))
-    ax.legend(handles=handles, loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
+        handles.append(Line2D([], [], linewidth=2, label=f"{depth:.4g} m: {text}", **style))
+    ax.legend(handles=handles, loc="upper left", frameon=False, fontsize="small", handlelength=3)
 
 
 def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -75,10 +72,10 @@ def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     low, high = 0.6 * scaled.min(), 1.7 * scaled.max()
     ax = figure.subplots()
     limits = {
-        "c": (c, "#111111", "-"),
-        "Kd": (kd, "#d81e1e", "-"),
-        "a + bb": (a_plus_bb, "#17963f", "-"),
-        "a": (a, "#17963f", ":"),
+        "c": (c, palette.BLACK, "-"),
+        "Kd": (kd, palette.RED, "-."),
+        "a + bb": (a_plus_bb, palette.GREEN, "--"),
+        "a": (a, palette.GREEN, ":"),
     }
     for label, (value, colour, style) in limits.items():
         ax.axhline(value, color=colour, linestyle=style, linewidth=1.2, label=f"{label} = {value:.3f} /m")
@@ -86,13 +83,13 @@ def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     fit = system_attenuation(c, min(kd, c), 2 * np.hypot(line / c, beam))
     ax.plot(line, fit, "--", color="0.45", linewidth=1.3, label="Kd + (c - Kd) exp(-0.85 c D)")
     attenuation, error = (found[f"effective_attenuation{end}"].values for end in ("", "_stderr"))
-    points: dict[str, Any] = {"fmt": "o-", "color": "#1f5fd6", "markersize": 5, "linewidth": 1.3, "capsize": 3}
+    points: dict[str, Any] = {"fmt": "o-", "color": palette.BLUE, "markersize": 5, "linewidth": 1.3, "capsize": 3}
     ax.errorbar(scaled, attenuation, error, label="K of the column, ±1 standard error", **points)
     ax.set(xscale="log", xlim=(low, high))
     if low < c * beam < high:
         ax.axvline(c * beam, color="0.7", linestyle=":", linewidth=1.2)
         ax.text(c * beam, 0.02 * c, "  c R$_b$ of the beam", color="0.4", fontsize="small")
-    text = "c R$_s$: beam attenuation times radius of the spot in the field of view"
+    text = "c R$_s$ (beam attenuation times radius of the spot in the field of view)"
     finish(ax, ylim=(0, None), xlabel=text, ylabel="attenuation coefficient (1/m)")
     top = drawing.add_top_axis(ax, 0.0, found["field_of_view"].values[0] / scaled[0], "field of view (mrad)")
     for axis in (ax.xaxis, top):
@@ -117,15 +114,15 @@ def plot_scattering_orders(result: xr.Dataset, path: drawing.FilePath | None = N
     by_order = result["waveform"].sum(("pixel", "reversals")).values
     total = by_order.sum(axis=0)
     several = result["waveform"].sel(reversals="several").sum(("pixel", "order")).values
-    colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.92, len(by_order)))
+    styles = palette.curves(len(by_order), palette.ordered(len(by_order)))
     upper.plot(time, total, color="black", linewidth=1.6, label="all")
-    for order, (power, colour) in enumerate(zip(by_order, colours, strict=True)):
+    for order, (power, style) in enumerate(zip(by_order, styles, strict=True)):
         label = f"≥ {order}" if order == len(by_order) - 1 else str(order)
-        upper.plot(time, power, color=colour, linewidth=1.1, label=label)
+        upper.plot(time, power, linewidth=1.1, label=label, **style)
     finish(upper, yscale="log", ylim=(1e-5 * total.max(), 2 * total.max()), ylabel="received power (W)")
     upper.legend(title="scattering events", frameon=False, ncols=2, fontsize="small")
     lit = total > 1e-5 * total.max()
-    lower.plot(time[lit], 100 * several[lit] / total[lit], color="#b3421f", linewidth=1.2)
+    lower.plot(time[lit], 100 * several[lit] / total[lit], color=palette.RED, linewidth=1.2)
     finish(lower, xlabel=drawing.TIME_LABEL, ylabel="several\nreversals (%)", ylim=(0, None))
     upper.set_title(str(result.attrs.get("scene", "")))
     return drawing.save(figure, path)

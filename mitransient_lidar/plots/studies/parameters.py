@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish, new_panels
 
 _SHOWN = 20  # designs in a panel, the best ones
@@ -40,10 +40,10 @@ def _rank(ax: Axes, one: xr.Dataset) -> None:
     ranked = one.isel(design=order)
     places = np.arange(order.size)
     ratio, error = ranked["ratio"].values, np.nan_to_num(ranked["ratio_stderr"].values)
-    colours = ["#d81e1e" if number == 0 else "#1f5fd6" for number in order]
+    styles = [palette.marked(3)[2 * bool(number)] for number in order]
     drawn = np.isfinite(ratio)
     for place in places[drawn]:
-        style = {"fmt": "o", "color": colours[place], "markersize": 5, "capsize": 3}
+        style = {"linestyle": "none", "markersize": 5, "capsize": 3, **styles[place]}
         ax.errorbar(ratio[place], place, xerr=error[place], **style)
     for place in places:
         value = float(ranked["bound"][place])
@@ -73,8 +73,8 @@ def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
         for name, size, unit in zip(names, value, one["parameter_units"].values, strict=True)
     ]
     for key, colour, fill, text in (
-        ("bound", "#1f5fd6", "#1f5fd6", "all unknown"),
-        ("bound_known", "#1f5fd6", "none", "others known"),
+        ("bound", palette.BLUE, palette.BLUE, "all unknown"),
+        ("bound_known", palette.BLUE, "none", "others known"),
     ):
         relative = one[key].values / scale
         drawn = np.isfinite(relative)
@@ -85,7 +85,7 @@ def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
     text = "bound over the value, absolute where a unit is given"
     finish(left, grid="x", xscale="log", ylim=(len(names) - 0.5, -0.5), xlabel=text)
     left.legend(frameon=False, fontsize="small")
-    image = right.imshow(one["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
+    image = right.imshow(one["correlation"].values, vmin=-1, vmax=1, cmap=palette.SIGNED)
     for (row, column), number in np.ndenumerate(one["correlation"].values):
         if math.isfinite(number):
             colour = "white" if abs(number) > 0.6 else "black"
@@ -114,13 +114,13 @@ def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure
     figure = drawing.new_figure(path, 9.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
     shown = used[strongest].any(axis=0)
-    for pixel, colour in zip(strongest, drawing.pixel_colours(strongest.size), strict=True):
+    for pixel, mark in zip(strongest, palette.marked(strongest.size), strict=True):
         values = np.where(used[pixel] > 0, rows["measured"][pixel], np.nan)
         error = np.nan_to_num(rows["measured_stderr"][pixel])
-        style = {"color": colour, "markersize": 2.5, "elinewidth": 0.7, "alpha": 0.75}
-        upper.errorbar(time, values, error, fmt=".", label=str(names[pixel]), **style)
-        upper.plot(time, np.where(used[pixel] > 0, rows["fitted"][pixel], np.nan), color=colour, linewidth=1.1)
-        lower.plot(time, residual[pixel], ".", color=colour, markersize=3)
+        style = {"linestyle": "none", "markersize": 3, "elinewidth": 0.7, "alpha": 0.75, **mark}
+        upper.errorbar(time, values, error, label=str(names[pixel]), **style)
+        upper.plot(time, np.where(used[pixel] > 0, rows["fitted"][pixel], np.nan), color=mark["color"], linewidth=1.1)
+        lower.plot(time, residual[pixel], linestyle="none", markersize=3, **mark)
     peak = float(np.nanmax(rows["fitted"][strongest]))
     # Noise would fill the lower decades of a logarithmic axis.
     noise = float(np.median(np.nan_to_num(rows["measured_stderr"][strongest])))

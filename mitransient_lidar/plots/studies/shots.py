@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
@@ -62,16 +62,21 @@ def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
     left, right = sea.x[0] + windows[0][[0, -1]] * spacing
     near, far = sea.y[0] + windows[1][[0, -1]] * spacing
     image = ax.imshow(
-        heights, origin="lower", extent=(left, right, near, far), cmap="Blues_r", interpolation="bilinear"
+        heights, origin="lower", extent=(left, right, near, far), cmap=palette.ELEVATION, interpolation="bilinear"
     )
     ax.figure.colorbar(image, ax=ax, label="elevation (m)", shrink=0.6)
-    palette = drawing.pixel_colours(rendered.pixel_count)
+    styles = palette.curves(rendered.pixel_count)
     for number, shot in enumerate(shots, start=first):
         for pixel in np.unique(rendered.pixel_map[rendered.pixel_map >= 0]):
             lines, mask = rendered.pixel_lines, (rendered.pixel_map == pixel).astype(np.float64)
-            ax.contour(lines + shot.x, lines + shot.y, mask, [0.5], colors=[palette[pixel]], linewidths=1.2)
+            line: dict[str, Any] = {
+                "colors": [styles[pixel]["color"]],
+                "linestyles": [styles[pixel]["linestyle"]],
+                "linewidths": 1.2,
+            }
+            ax.contour(lines + shot.x, lines + shot.y, mask, [0.5], **line)
         angle = math.degrees(rendered.azimuth)
-        ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color="gold"))
+        ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color=palette.BEAM))
         # Beside the footprint, whose lines would cross the number.
         edge = shot.y + rendered.pixel_lines.max()
         style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontweight": "bold", "fontsize": "large"}
@@ -100,19 +105,19 @@ def _time_limits(results: Sequence[xr.Dataset]) -> tuple[float, float]:
 def _draw_waveforms(ax: Axes, name: str, shot: Shot, result: xr.Dataset) -> None:
     """Draw the waveforms of a shot, with the slopes that the beam meets."""
     power = result["waveform"].values.reshape(-1, result.sizes["time"])
-    for values, colour in zip(power, drawing.pixel_colours(len(power)), strict=True):
-        ax.plot(result["time"].values, 1e3 * values, color=colour, linewidth=1.1)
+    for values, style in zip(power, palette.curves(len(power)), strict=True):
+        ax.plot(result["time"].values, 1e3 * values, linewidth=1.1, **style)
     ax.set_ylim(0, None)
     slopes = f"{math.degrees(math.atan(shot.along)):+.1f}°, {math.degrees(math.atan(shot.across)):+.1f}°"
-    ax.set_title(f"{name} ({slopes})", fontsize="small")
+    ax.set_title(f"{name} ({slopes})", fontsize="medium")
     ax.set(xlabel="time (ns)", ylabel="power (mW)")
 
 
 _LABELS = {
-    "strength": "surface echo (log10 W)",
-    "separation": "far pair after near pair (ns)",
-    "sideways": "green after red (ns)",
-    "depth": "bottom too deep (m)",
+    "strength": "power of the surface echo (log10 W)",
+    "separation": "delay, far after near pair (ns)",
+    "sideways": "delay, green after red (ns)",
+    "depth": "depth minus true depth (m)",
 }
 
 
@@ -124,16 +129,18 @@ def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None
     figure = drawing.new_figure(path, 9.6, 7.0)
     effects, correlations = slope_effects(shots), slope_correlations(shots)
     for ax, (name, (slope, value)) in zip(figure.subplots(2, 2).flat, effects.items(), strict=True):
-        ax.plot(np.degrees(np.arctan(slope)), value, ".", color="#1f5fd6", markersize=4)
+        ax.plot(np.degrees(np.arctan(slope)), value, ".", color=palette.BLUE, markersize=4)
         along = "mean rise to the left (deg)" if name == "sideways" else "mean slope towards the lidar (deg)"
         finish(ax, xlabel=along, ylabel=_LABELS[name])
-        ax.set_title(f"correlation {correlations[name]:+.2f}, {np.isfinite(value).sum()} shots", fontsize="small")
+        ax.set_title(
+            f"correlation {correlations[name]:+.2f}, {np.isfinite(value).sum()} of {value.size} shots", fontsize="small"
+        )
         if name == "depth":
             slopes = np.linspace(slope.min(), slope.max(), 100)
             names = ("scene.bottom_depth", "off_nadir_deg", "refractive_index")
             depth, off_nadir_deg, index = (float(shots.attrs[attribute]) for attribute in names)
             bias = depth_bias(slopes, depth, math.radians(off_nadir_deg), index)
-            ax.plot(np.degrees(np.arctan(slopes)), bias, color="#d81e1e", label="refraction alone")
+            ax.plot(np.degrees(np.arctan(slopes)), bias, color=palette.RED, label="refraction alone")
             ax.legend(frameon=False)
     figure.suptitle(drawing.titled(shots.attrs, f"{shots.sizes['shot']} shots"))
     return drawing.save(figure, path)

@@ -9,10 +9,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish
 
 _DASHES = (0, (4, 2))
+_EVERY: dict[str, Any] = {"markevery": 0.1, "markersize": 4}
 
 
 def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -26,9 +27,9 @@ def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None)
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = result["time"].values
     draw_against_background(upper, result, "waveform")
-    for i, colour in enumerate(drawing.pixel_colours(result.sizes["pixel"])):
+    for i, mark in enumerate(palette.marked(result.sizes["pixel"])):
         signal, error = (1e6 * result[name].values[i] for name in ("difference", "difference_stderr"))
-        drawing.draw_band(lower, time, signal, error, color=colour, linewidth=1.4)
+        drawing.draw_band(lower, time, signal, error, linewidth=1.4, **_EVERY, **mark)
     top = float(1e6 * result["waveform"].max())
     upper.legend(frameon=False, fontsize="small", ncols=2)
     finish(upper, yscale="log", ylim=(1e-4 * top, 2 * top), ylabel="received power (µW)")
@@ -44,9 +45,10 @@ def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None)
 def draw_against_background(ax: Axes, result: xr.Dataset, name: str) -> None:
     """Draw a variable [W] of every pixel as a line, and its background, the power without the target, dashed."""
     time, names = result["time"].values, [str(name) for name in result["pixel"].values]
-    for i, (pixel, colour) in enumerate(zip(names, drawing.pixel_colours(len(names)), strict=True)):
-        ax.plot(time, 1e6 * result[name].values[i], color=colour, linewidth=1.4, label=pixel)
-        ax.plot(time, 1e6 * result["background"].values[i], color=colour, linewidth=0.9, linestyle=_DASHES)
+    for i, (pixel, mark) in enumerate(zip(names, palette.marked(len(names)), strict=True)):
+        ax.plot(time, 1e6 * result[name].values[i], linewidth=1.4, label=pixel, **_EVERY, **mark)
+        background = 1e6 * result["background"].values[i]
+        ax.plot(time, background, linewidth=0.9, linestyle=_DASHES, **_EVERY, **mark)
     ax.plot([], [], color="0.4", linewidth=0.9, linestyle=_DASHES, label="without the target")
 
 
@@ -68,7 +70,7 @@ def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> F
     steps = [np.diff(axis).mean() / 2 if len(axis) > 1 else 0.5 for axis in (y, x)]
     extent = (y[0] - steps[0], y[-1] + steps[0], x[0] - steps[1], x[-1] + steps[1])
     for ax, (title, values, low, high, digits) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        image = ax.imshow(values, origin="lower", extent=extent, vmin=low, vmax=high, cmap="viridis")
+        image = ax.imshow(values, origin="lower", extent=extent, vmin=low, vmax=high, cmap=palette.SEQUENCE)
         for (i, j), value in np.ndenumerate(values):
             colour = "black" if value > low + 0.6 * (high - low) else "white"
             ax.text(y[j], x[i], f"{value:{digits}}", ha="center", va="center", size=7, color=colour)
@@ -80,7 +82,7 @@ def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> F
     return drawing.save(figure, path)
 
 
-_COLOURS = {"single": "0.25", "sum": "#e69f00", "brightest": "#56b4e9", "best": "#d55e00"}
+_STYLES = dict(zip(("best", "brightest", "sum", "single"), palette.marked(4), strict=True))
 _LABELS = {
     "single": "one pixel for all light",
     "sum": "sum of the pixels",
@@ -145,7 +147,7 @@ def _plot_image_detection(found: xr.Dataset, path: drawing.FilePath | None) -> F
     for ax, (gate, name, label) in zip(axes, [*shown, (best[0], "filter_weight", "weight (1/DN)")], strict=False):
         values, depth = found[name].sel(gate=gate), float(found["gate_depth"].sel(gate=gate))
         reach = float(np.abs(found[name]).max()) or 1.0
-        style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -reach, "vmax": reach}
+        style: dict[str, Any] = {"cmap": palette.SIGNED, "vmin": -reach, "vmax": reach}
         if "row" in found.dims:
             image = drawing.draw_image(ax, values.transpose("row", "column").values, found, **style)
             figure.colorbar(image, ax=ax, label=label, shrink=0.8)
@@ -197,11 +199,12 @@ def _draw_light(ax: Axes, found: xr.Dataset) -> None:
 def _draw_characteristic(ax: Axes, found: xr.Dataset) -> None:
     """Draw closed forms as lines, and simulated shots at a few thresholds with the intervals of both rates."""
     for name, one in _combinations(found):
-        ax.plot(one["false_alarm"], one["expected_detection"], color=_COLOURS[name], linewidth=1.3, label=_LABELS[name])
+        ax.plot(one["false_alarm"], one["expected_detection"], color=_STYLES[name]["color"], linewidth=1.3)
         few = one.sel(false_alarm=[found.attrs["pfa"], *np.logspace(-3, -1, 5)], method="nearest")
         x, y = few["drawn_false_alarm"], few["drawn_detection"]
         bars = [[rate - few[f"{rate.name}_low"], few[f"{rate.name}_high"] - rate] for rate in (x, y)]
-        ax.errorbar(x, y, bars[1], bars[0], fmt="o", color=_COLOURS[name], markersize=2.5, linewidth=0.9)
+        style: dict[str, Any] = {"linestyle": "none", "markersize": 4, "elinewidth": 0.9, "label": _LABELS[name]}
+        ax.errorbar(x, y, bars[1], bars[0], **style, **_STYLES[name])
     ax.axvline(found.attrs["pfa"], color="0.6", linewidth=0.8)
     ax.set(xscale="log", xlim=(float(found["false_alarm"][0]), 0.9), ylim=(0, 1.02))
     ax.errorbar([], [], 1, 1, fmt="o", color="0.5", markersize=2.5, label=f"{found.attrs['shots']} simulated shots")
@@ -213,10 +216,10 @@ def _draw_depths(ax: Axes, found: xr.Dataset) -> None:
     for name, one in _combinations(found):
         share, low, high = (100 * one[f"needed_at_depth{end}"].values for end in ("", "_low", "_high"))
         bars = np.maximum([share - low, high - share], 0)
-        ax.errorbar(one["depth"], share, yerr=bars, color=_COLOURS[name], marker="o", markersize=3, linewidth=1.3)
+        ax.errorbar(one["depth"], share, yerr=bars, markersize=4, linewidth=1.3, **_STYLES[name])
         reached = float(one["detectable_depth"])
         if np.isfinite(reached):
-            ax.plot([reached], [100], color=_COLOURS[name], marker="v", markersize=8, zorder=3)
+            ax.plot([reached], [100], color=_STYLES[name]["color"], marker="|", markersize=14, zorder=3)
     labels: dict[str, Any] = {"xlabel": "depth of the target (m)", "ylabel": "required share of its signal (%)"}
     finish(ax, "detectable below 100 %", zero=100, yscale="log", **labels)
 
@@ -231,10 +234,10 @@ def _draw_groups(ax: Axes, found: xr.Dataset, kinds: dict[str, str], scale: floa
                 continue
             x = group + 0.2 * (place - 1.5)
             interval = [[max(value - low, 0)], [max(high - value, 0)]]
-            style: dict[str, Any] = {"color": _COLOURS[name], "ecolor": "black", "capsize": 2, "linewidth": 0.9}
+            style: dict[str, Any] = {"ecolor": "black", "capsize": 2, "linewidth": 0.9, **_STYLES[name]}
             if bars:
-                ax.bar(x, value, 0.18, color=_COLOURS[name])
-            ax.errorbar(x, value, interval, fmt="none" if bars else "o", **style)
+                ax.bar(x, value, 0.18, color=_STYLES[name]["color"])
+            ax.errorbar(x, value, interval, linestyle="none", markersize=5, **style)
             if not bars or abs(value) > 0.05 * scale * largest:
                 text = f"{value:.2g}" if value < 1 else f"{value:.3g}"
                 ax.annotate(text, (x, high), (0, 3), textcoords="offset points", ha="center", fontsize=7)

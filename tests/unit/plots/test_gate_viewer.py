@@ -117,6 +117,28 @@ def test_page_contains_all_data(scene, tmp_path):
     assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
 
 
+def test_many_values_are_rounded(tmp_path, monkeypatch, scene):
+    monkeypatch.setattr("mitransient_lidar.plots.gate_viewer.page._EXACT", 100)
+    stack, result = scene[0].copy(deep=True), scene[1]
+    stack["gate_energy_stderr"][0, 0, 0] = 0.0
+    stack["gate_energy"][0, 0, 1] = np.nan
+    write_page(stack, tmp_path / "page.html", result)
+    _, arrays, letters = embedded(tmp_path / "page.html")
+    for name, values in (
+        ("gate_energy", np.moveaxis(stack["gate_energy"].values, -1, 0)),
+        ("waveform", result["waveform"]),
+    ):
+        errors = stack["gate_energy_stderr"] if name == "gate_energy" else result["waveform_stderr"]
+        errors = np.ravel(np.moveaxis(errors.values, -1, 0) if name == "gate_energy" else errors)
+        difference = np.abs(arrays[name] - np.ravel(values))
+        # Without an error, to 12 binary digits.
+        assert np.nanmax(difference - np.where(errors > 0, errors / 16, 2 / 2**12)) <= 0
+        assert 0.3 < np.nanmean(difference / np.maximum(errors, 0.1)) * 16 * 1.5 < 1
+        np.testing.assert_allclose(arrays[f"{name}_stderr"], errors, rtol=1 / 64)
+        assert letters[name] < 0.3 * 4 / 3 * 4 * difference.size
+    assert np.isnan(arrays["gate_energy"][ROWS * COLUMNS])
+
+
 def test_large_pages_show_means(scene, tmp_path, caplog):
     stack, result = scene
     path = tmp_path / "page.html"

@@ -174,7 +174,7 @@ def test_commands_write_the_page_of_a_scene(seen, tmp_path, monkeypatch):
     done = run("view", "table1", "-D", "bottom_depth=5", "-o", "new/scene.html", "--no-browser")
     assert (done.exit_code, done.stdout) == (0, "new/scene.html\n")
     assert (tmp_path / "new/scene.html").read_text().startswith("<html>")
-    assert seen == [("table1", {"bottom_depth": "5"})]
+    assert seen == [("table1",), ("table1", {"bottom_depth": "5"})]
     assert run("scenes", "show", "table1").stdout.startswith("<")
 
 

@@ -7,10 +7,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 from command_line import run
+from matplotlib.colors import to_rgb
 from rows import each_row
 from scipy.special import erf
 
 import mitransient_lidar
+from mitransient_lidar.plots import palette
 from mitransient_lidar.plots.publication import figures as publication
 from mitransient_lidar.studies.publication import measures
 from mitransient_lidar.studies.publication.measures import Series, Waveform
@@ -123,7 +125,7 @@ def test_drawn_figures_need_no_render(tmp_path):
     assert "14.79" in done.stdout
     assert not done.stderr
     picture = matplotlib.image.imread(tmp_path / "fig08.png")[..., :3]
-    for colour in ((0.85, 0.12, 0.12), (0.12, 0.37, 0.84)):
+    for colour in map(to_rgb, (palette.RED, palette.BLUE)):
         # Drawn with an opacity of 0.85 over white.
         drawn = 0.85 * np.array(colour) + 0.15
         assert (np.abs(picture - drawn).max(axis=-1) < 0.03).sum() > 1000
