@@ -40,7 +40,7 @@ from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.target_signal import find_target, target_gates, target_signal
+from mitransient_lidar.studies.target_signal import find_target, signal_at, target_gates, target_signal
 
 if TYPE_CHECKING:
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -198,7 +198,11 @@ def detect(
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
             own = pass_seed(seed, i) >> 1  # render seeds are signed
             options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator, "seed": own}
-            one = target_signal(sea, axis=axis, **options) if camera is None else target_gates(sea, **options)
+            if camera is not None:
+                one = target_gates(sea, **options)
+            else:
+                # Deep targets may be lost.
+                one = (target_signal if place is None else signal_at)(sea, axis=axis, **options)
             found.append(cases.keep(one))
             cases.step()
         first = first or found

@@ -86,7 +86,8 @@ def target_signal(
     ------
     UserError
         If the scene or a parameter is invalid, a number is out of range, there is no such shape, or it is above the sea
-        or below the bottom, or returns no light.
+        or below the bottom, or the sum of the pixels' echoes is not positive: the target returns no light, or too
+        little for these passes. Places of a map are not refused for that.
 
     Notes
     -----
@@ -100,7 +101,25 @@ def target_signal(
         options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed, "integrator": integrator}
         options |= {"instrument": instrument, "max_time": max_time, "axis": axis, "progress": progress}
         return target_map(scene, params, offsets, offsets, **options)
-    session = open_scene(scene, params, instrument)
+    result = signal_at(
+        open_scene(scene, params, instrument), target_id, passes, max_time, seed, integrator, axis, progress
+    )
+    if not result["combined_echo"].sel(combination="sum") > 0:
+        raise UserError("target: it returns no light within the record; check its place, and the start of the record")
+    return result
+
+
+def signal_at(
+    session: LoadedScene,
+    target_id: str = "target",
+    passes: int = 64,
+    max_time: float | None = None,
+    seed: int = 0,
+    integrator: Any = None,
+    axis: TimeAxis | None = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Return the result of `target_signal` for one of several places or depths, even where the target is not seen."""
     chosen, with_target, without = _pair(session, target_id, integrator, axis)
     lidar = with_target.scene
     pixels, pulse = lidar.receiver.pixels, lidar.transmitter.pulse
@@ -284,8 +303,6 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
         data[name] = (("pixel", "time"), statistics.mean)
         data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr)
     summed = data["difference"][1].sum(axis=0)
-    if not np.any(summed > 0):
-        raise UserError("target: it returns no light within the record; check its place, and the start of the record")
     peak = float(time[np.argmax(summed)])
     start, end = peak - _HALF_GATE * pulse_width, peak + _HALF_GATE * pulse_width
     gate = (time >= start) & (time <= end)

@@ -85,7 +85,7 @@ def test_table_lists_pixels_and_combinations(published):
         ("fig13_2x2", {}, {"target_id": "mine"}, "target_id = 'mine' must be the id of a shape of the scene: .*bottom"),
         ("fig13_2x2", {}, {"target_id": "surface"}, "target_id = 'surface' must not be the sea surface"),
         ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
-        pytest.param("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light", marks=pytest.mark.long),
+        ("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light"),
         ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
     ],
 )

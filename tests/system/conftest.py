@@ -41,13 +41,13 @@ def show(browser, tmp_path):
     assert browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def campaign(tmp_path_factory):
     """The quick campaign, of a scene with few paths a pass."""
     return {"scene": str(few_paths("table1", tmp_path_factory.mktemp("scene"))), **QUICK}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def quick(campaign, tmp_path_factory):
     """Store of the quick campaign, rendered in two shards."""
     path = tmp_path_factory.mktemp("campaign") / "quick.zarr"

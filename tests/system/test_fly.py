@@ -300,6 +300,8 @@ def test_flight_over_a_pier(tmp_path):
             "instrument": "riegl_vq880g2",
             "parameters": {"wind_speed": 1},
             "scanner": {"kind": "fixed"},
+            # Over moving waves, every 0.05 s of pulses is a render of its own.
+            "still_sea": True,
         },
         "platform": {
             **{"kind": "lines", "start": [-3.25, 0.0], "heading_deg": 90.0, "speed": 50.0, "height": 600.0},

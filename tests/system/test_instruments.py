@@ -91,9 +91,8 @@ def test_a_result_names_its_instrument_and_gives_the_same_bits():
 def test_the_infrared_channel_gives_the_surface_above_shallow_bottoms():
     """Green echoes of surface and bottom merge in half a metre, 5 cm too shallow; both channels see the same waves."""
     params = {"wind_speed": 3, "bottom_depth": 0.5, "bottom_reflectance": 0.15, "infrared.off_nadir_deg": 0}
-    series = mitransient_lidar.render_shots(
-        "table1", params, instrument="riegl_vq880g2", infrared=True, count=10, passes=3, seed=3
-    )
+    options = {"instrument": "riegl_vq880g2", "infrared": True, "pass_share": 0.25}
+    series = mitransient_lidar.render_shots("table1", params, count=10, passes=4, seed=3, **options)
     heights = series["true_surface_height"].values
     np.testing.assert_allclose(series["infrared_true_surface_height"], heights, atol=0.02)
     recorded = detect_waveforms(series, seed=5)
@@ -108,8 +107,9 @@ def test_the_infrared_channel_gives_the_surface_above_shallow_bottoms():
     assert np.sqrt(np.mean(errors["both"] ** 2)) < 0.5 * np.sqrt(np.mean(errors["green"] ** 2))
     assert np.median(stated["both"]) < 0.5 * np.median(stated["green"])
     assert np.mean((errors["both"] / stated["both"]) ** 2) < variance_limits(10)[1]
-    again = mitransient_lidar.render(series)
-    assert again["infrared_waveform"].values.tobytes() == series["infrared_waveform"].values.tobytes()
+    few = mitransient_lidar.render_shots("table1", params, count=2, passes=2, **options)
+    again = mitransient_lidar.render(few)
+    assert again["infrared_waveform"].values.tobytes() == few["infrared_waveform"].values.tobytes()
 
 
 @each_row(
