@@ -66,3 +66,23 @@ def test_entries_of_the_changelog_are_short_and_sorted() -> None:
     entries = re.findall(r"^- (.*(?:\n  .*)*)", text, re.MULTILINE)
     assert len(entries) > 100
     assert [entry for entry in entries if len(entry.split()) > 25] == []
+
+
+@each_row(
+    ("word", "page"),
+    [
+        *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
+        *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
+        *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
+    ],
+)
+def test_words_of_a_search_are_headings_or_terms(word: str, page: str) -> None:
+    """The site's search ranks these first."""
+    (path,) = DOCS.glob(f"{page}.*")
+    titles = re.findall(r"^(?:#+ (.*)|\"\"\"(.*)|(\w.*)(?=\n  \w))", path.read_text("utf-8"), re.MULTILINE)
+    assert re.search(rf"\b{word}\b", "\n".join(map("".join, titles)), re.IGNORECASE)
+
+
+def test_pages_of_search_words_have_them_in_the_text() -> None:
+    for word in ("bathymetry", "hydrography"):
+        assert all(word in (ROOT / page).read_text("utf-8") for page in ("README.md", "docs/index.md")), word
