@@ -34,7 +34,7 @@ def test_wheel_holds_every_module_plugin_scene_and_data_file(wheel):
     expected = set()
     for folder, package in (("mitransient_lidar", ""), ("plugins", "plugins/"), ("scenes", "scenes/")):
         for path in (ROOT / folder).rglob("*"):
-            kinds = (".py", ".xml", ".ply", ".csv", ".typed", ".html", ".css", ".js")
+            kinds = (".py", ".xml", ".ply", ".csv", ".typed", ".html", ".css", ".js", ".toml", ".tif")
             if path.suffix in kinds and "__pycache__" not in path.parts:
                 expected.add(f"mitransient_lidar/{package}{path.relative_to(ROOT / folder).as_posix()}")
     assert expected <= set(wheel)
