@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -13,10 +15,20 @@ sys.path.insert(0, str(DOCS / "extensions"))
 os.environ["MPLBACKEND"] = "agg"
 
 import mitransient_lidar  # noqa: E402  (before mitsuba: it finds LLVM for Dr.Jit)
+from mitransient_lidar import _version  # noqa: E402
 
 project = "mitransient-lidar"
 author = copyright = "The developers of mitransient-lidar"
 version = release = mitransient_lidar.__version__
+#: Day of the release, as CITATION.cff states it.
+_released = re.search(r"^date-released: (\S+)$", (DOCS.parent / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
+myst_substitutions = {
+    "version": release,
+    "released": _released[1],
+    "commit": _version.commit() or "unknown",
+    "mitsuba": importlib.metadata.version("mitsuba"),
+    "drjit": importlib.metadata.version("drjit"),
+}
 
 _mathjax = importlib.util.find_spec("sphinx-mathjax-offline")
 
@@ -37,7 +49,7 @@ templates_path = ["templates"]
 default_role = "py:obj"
 
 # Markdown.
-myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath", "substitution"]
 myst_heading_anchors = 4
 
 # Python API.
@@ -72,6 +84,8 @@ if any((DOCS / "gallery").glob("*.py")):
         "image_scrapers": ("gallery_style.scrape",),
         "show_memory": False,
         "min_reported_time": 0,
+        # The page of times would load scripts from the network.
+        "write_computation_times": False,
         "within_subsection_order": "FileNameSortKey",
     }
 

@@ -1,5 +1,5 @@
-"""One shot, from scene to image, in ten minutes
-=============================================
+"""Tutorial: from one shot to an image in ten minutes
+==================================================
 
 A laser pulse from an aircraft passes a wavy sea, is reflected by a bottom at 8 m and returns. This tutorial renders
 what four pixels receive, records it with a noisy receiver, measures the echoes, retrieves slope, bottom and water

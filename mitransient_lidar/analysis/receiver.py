@@ -385,8 +385,9 @@ def describe_recording(recorded: xr.Dataset) -> list[str]:
         f"{name.replace('_', ' ')} {_span(attributes[name])}{' (auto)' if name in attributes['chosen'] else ''}"
         for name in ("gain", "optical_density")
     )
+    count = recorded.sizes["shot"]
     lines = [
-        f"{recorded.sizes['shot']} shots, receiver {attributes.get('receiver', 'custom')}, {used}",
+        f"{count} shot{'s' * (count != 1)}, receiver {attributes.get('receiver', 'custom')}, {used}",
         saturation_advice(recorded),
     ]
     if "block_level" in recorded:

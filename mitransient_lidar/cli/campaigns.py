@@ -148,7 +148,7 @@ COMMANDS = {
 
         Each run has its own values of scene parameters. Runs use this machine's cores or a Dask cluster, and fill one
         Zarr store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
-        docs/guide/campaigns.md describes the file.
+        The documentation's guide Campaigns describes the file.
         """,
     ),
     "fly": Command(
@@ -159,7 +159,7 @@ COMMANDS = {
 
         Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr with all pulses.
         Prints the points' height errors against the truth [cm]. After an interruption, the same command goes
-        on. Failed pulses end it with exit code 1. docs/guide/flights.md describes the file.
+        on. Failed pulses end it with exit code 1. The documentation's guide Flights describes the file.
         """,
     ),
 }

@@ -50,7 +50,7 @@ def _copy(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Shipped scene, or file of a guide or flight, e.g. bottoms.toml.")
     ],
-    destination: Annotated[Path, typer.Argument(metavar="[DEST]", help="Folder, or path of the new file.")] = Path("."),
+    destination: Annotated[Path, typer.Argument(metavar="DEST", help="Folder, or path of the new file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Copy a scene or an example file to edit, with the data that it names, and print its path."""
@@ -60,7 +60,7 @@ def _copy(
 
 
 def _instruments(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of an instrument.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of an instrument.")] = None,
     xml: Annotated[
         bool, typer.Option("--xml", help="Print the XML of laser and receiver, to include in a scene.")
     ] = False,
@@ -84,7 +84,7 @@ def _instruments(
 
 
 def _info(
-    file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="An EXR or NetCDF result.")] = None,
+    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")] = None,
 ) -> None:
     """Print versions and paths, or the parameters of a result."""
     if file is None:

@@ -108,9 +108,11 @@ Seed = Annotated[int, Option("Random seed", 0, 2**53)]
 FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
 TargetId = Annotated[str, Option("Id of the target's shape")]
 BackgroundPower = Annotated[float, Option("Daylight power on each pixel", 0, unit="W")]
-Instrument = Annotated[str | None, Option("Instrument that replaces the scene's lidar, as listed by instruments")]
+Instrument = Annotated[
+    str | None, Option("Instrument that replaces the scene's lidar, as listed by scenes instruments")
+]
 Infrared = Annotated[
-    bool, Option("Also render the instrument's infrared channel, whose -D parameters begin with infrared.")
+    bool, Option("Also render the instrument's infrared channel; -D infrared.NAME sets its parameters")
 ]
 Sensor = Annotated[str | None, Option("Id of the scene's receiver, by default the first one")]
 

@@ -228,7 +228,7 @@ def tell_forecast(saturated: int, sampled: int, pulses: int, seconds: float) -> 
         )
     else:
         _LOG.info("none of %d sampled pulses saturates the receiver", sampled)
-    _LOG.info("%d pulses take about %.2g s of processor time, by those of the sample", pulses, pulses * seconds)
+    _LOG.info("%d pulses take about %.0f s of processor time, estimated from the sample", pulses, pulses * seconds)
 
 
 def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:

@@ -77,7 +77,7 @@ def example_files() -> dict[str, Path]:
 def copy_scene(
     name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".", overwrite: bool = False
 ) -> Path:
-    """Write a scene as one self-contained file, with copies of its data files from the same folder.
+    """Write a scene as one self-contained file, with copies of the files in its folder that it names.
 
     Raises UserError if there is no such scene, a file exists already, or one cannot be read or written. No file is
     written then.
@@ -92,12 +92,10 @@ def copy_scene(
         Whether to replace files.
     """
     source = example_files().get(str(name)) or scene_path(name)
-    text = read_document(source).text if source.suffix == ".xml" else read_text(source)
     destination = Path(destination)
     target = destination / source.name if destination.is_dir() else destination
-    neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)
-    copies = {target.parent / file.name: file for file in neighbours if f'"{file.name}"' in text}
-    for copy, original in ((target, source), *copies.items()):
+    copies = {target: source, **{target.parent / file.name: file for file in files_named_by(source)}}
+    for copy, original in copies.items():
         if copy.exists() and copy.samefile(original):
             raise UserError(f"{copy} is the file to be copied: choose another place")
         if os.path.lexists(copy) and not overwrite:
@@ -105,10 +103,25 @@ def copy_scene(
     with together():
         for copy, original in copies.items():
             with replacing(copy) as temporary:
-                shutil.copyfile(original, temporary)
-        with replacing(target) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+                if original.suffix == ".xml":
+                    temporary.write_text(read_document(original).text, encoding="utf-8")
+                else:
+                    shutil.copyfile(original, temporary)
     return target
+
+
+def files_named_by(source: Path) -> list[Path]:
+    """Return the files in the folder of a scene or flight that it names, and those that these name."""
+    found, left = [source], [source]
+    while left:
+        file = left.pop()
+        if file.suffix in (".xml", ".toml"):
+            text = read_document(file).text if file.suffix == ".xml" else read_text(file)
+            near = (one for one in sorted(file.parent.iterdir()) if one.is_file() and one not in found)
+            named = [one for one in near if f'"{one.name}"' in text]
+            found += named
+            left += named
+    return found[1:]
 
 
 def folder_of_scenes() -> Path:

@@ -233,6 +233,8 @@ def _path(name: str) -> Path:
     if not isinstance(name, str) or name not in names:
         close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(close)}" if close else f"instruments are {', '.join(names)}"
+        if Path(str(name)).suffix:
+            hint = "a lidar of a file is a part of a scene, by <include>, and its receiver an argument of record"
         raise UserError(f"instrument = {shown(name)} is not known; {hint}")
     return _folder() / f"{name}.xml"
 

@@ -272,11 +272,12 @@ def describe() -> dict[str, str]:
     import drjit as dr
     import mitsuba as mi
 
-    from mitransient_lidar._version import __version__
+    from mitransient_lidar._version import __version__, commit
 
     llvm = loaded_llvm()
     return {
         "mitransient-lidar": __version__,
+        "commit": commit() or "unknown",
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
         "python": platform.python_version(),

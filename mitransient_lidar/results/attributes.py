@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar._version import __version__
+from mitransient_lidar._version import release
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import limits
 from mitransient_lidar.core.validation import shown as printed
@@ -87,7 +87,7 @@ def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "Conventions": "CF-1.11",
         "title": titled("Received lidar power", attributes),
-        "source": f"mitransient-lidar {__version__}",
+        "source": release(),
         "history": step_of_history("rendered"),
         **{text(name): attribute(name, value) for name, value in attributes.items()},
     }
@@ -105,7 +105,7 @@ def titled(what: str, attributes: Mapping[Any, Any]) -> str:
 
 def step_of_history(done: str, attributes: Mapping[Any, Any] | None = None) -> str:
     """Return a dataset's attribute ``history`` with a line about the latest operation."""
-    line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {done} by mitransient-lidar {__version__}"
+    line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {done} by {release()}"
     return "\n".join(part for part in (str((attributes or {}).get("history", "")), line) if part)
 
 

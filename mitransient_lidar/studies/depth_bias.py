@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar._version import __version__
+from mitransient_lidar._version import release
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
@@ -226,7 +226,7 @@ def depth_bias(
         raise UserError(f"depth = {axes['depth'].tolist()} must hold one below the waves of {winds} m/s")
     attributes = {
         "title": f"Errors of the depths of {instrument}",
-        "source": f"mitransient-lidar {__version__}",
+        "source": release(),
         "instrument": instrument,
         "receiver": receiver or instrument,
         "infrared_surface": int(infrared),

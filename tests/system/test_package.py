@@ -1,5 +1,8 @@
 """What is installed: the wheel holds every plugin and scene, and importing costs little."""
 
+import re
+import runpy
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -12,20 +15,18 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wheel")
     source = tmp_path_factory.mktemp("source") / "project"
     # A clean copy: a build folder of an earlier wheel would hide what the configuration forgets.
-    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(source)], check=True)
-    for name in subprocess.check_output(
-        ["git", "-C", str(ROOT), "ls-files", "--modified", "--others", "--exclude-standard"], text=True
-    ).split():
-        if (ROOT / name).is_file():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            (source / name).write_bytes((ROOT / name).read_bytes())
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "build", "dist", "site", "*.egg-info", "*.nc"))
+    for path in (ROOT / "scenes" / "instruments").glob("*.nc"):
+        shutil.copy(path, source / "scenes" / "instruments")
+    (source / "mitransient_lidar" / "commit.txt").write_text("0123456789ab\n")
+    folder = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(folder)]
     subprocess.run([*command, str(source)], check=True)
     (path,) = folder.glob("*.whl")
-    return set(zipfile.ZipFile(path).namelist())
+    with zipfile.ZipFile(path) as found:
+        return {name: found.read(name) for name in found.namelist()}
 
 
 @pytest.mark.slow
@@ -33,11 +34,45 @@ def test_wheel_holds_every_module_plugin_scene_and_data_file(wheel):
     expected = set()
     for folder, package in (("mitransient_lidar", ""), ("plugins", "plugins/"), ("scenes", "scenes/")):
         for path in (ROOT / folder).rglob("*"):
-            kinds = (".py", ".xml", ".ply", ".csv", ".typed", ".html", ".css", ".js")
+            kinds = (".py", ".xml", ".ply", ".csv", ".typed", ".html", ".css", ".js", ".toml", ".tif")
             if path.suffix in kinds and "__pycache__" not in path.parts:
                 expected.add(f"mitransient_lidar/{package}{path.relative_to(ROOT / folder).as_posix()}")
-    assert expected <= wheel
+    assert expected <= set(wheel)
     assert any(name.endswith("licenses/LICENSE") for name in wheel)
+    assert wheel["mitransient_lidar/commit.txt"] == b"0123456789ab\n"
+
+
+@pytest.mark.slow
+def test_links_of_the_description_are_addresses(wheel):
+    """On an index page links to files of the repository would be dead."""
+    (description,) = (text.decode() for name, text in wheel.items() if name.endswith("METADATA"))
+    targets = re.findall(r"\]\(([^)]*)", description)
+    assert targets
+    assert [target for target in targets if not target.startswith("https://")] == []
+    assert "A simulator of airborne laser bathymetry" in description
+
+
+def test_the_commit_is_that_of_the_checkout_or_of_the_build(tmp_path):
+    def commit():
+        return runpy.run_path(str(module))["commit"]()
+
+    def git(*arguments):
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
+        return subprocess.check_output(command, text=True).strip()
+
+    module = tmp_path / "package" / "_version.py"
+    module.parent.mkdir()
+    shutil.copy(ROOT / "mitransient_lidar" / "_version.py", module)
+    assert commit() == ""
+    git("init", "--quiet")
+    git("add", "package")
+    git("commit", "--quiet", "--message", "one")
+    head = git("rev-parse", "HEAD")[:12]
+    assert commit() == head
+    module.write_text(module.read_text() + "\n")
+    assert commit() == f"{head}-dirty"
+    (module.parent / "commit.txt").write_text("0123456789ab\n")
+    assert commit() == "0123456789ab"
 
 
 def test_every_plugin_file_is_registered():

@@ -413,7 +413,7 @@ def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | N
     state = _read_waves(read, spectrum, wind if wind >= _CALM else 0.0, 0.0)
     if state is None or not is_limited(state, depths):
         return None
-    logger.info("the waves follow the depth of the bottom, by %.3g m at least: shoaling", depths.least)
+    logger.info("the waves follow the depth of the bottom, which rises to z = %.3g m (shoaling)", -depths.least)
     return depths
 
 

@@ -95,7 +95,7 @@ def render_shots(
     ] = None,
     pass_share: float | None = None,
     light: LightOption = "merging",
-    seed: Annotated[int, Option("Seed of random places, 1 by default", 0, 2**53)] = 1,
+    seed: Annotated[int, Option("Seed of random places, by default 1", 0, 2**53)] = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
     shot_passes: npt.ArrayLike | None = None,

@@ -286,7 +286,7 @@ def test_automatic_filter_is_the_least_without_saturation(caplog):
     plain = detect_waveforms(strong, CHAIN)
     assert f"a filter of optical density {density:.1f} (factor {10**density:.3g})" in caplog.text
     assert plain.attrs["fitting_optical_density"] == density
-    assert describe_recording(chosen)[0] == f"1 shots, receiver custom, gain 1, optical density {density:.4g} (auto)"
+    assert describe_recording(chosen)[0] == f"1 shot, receiver custom, gain 1, optical density {density:.4g} (auto)"
 
 
 def test_automatic_gain_is_the_largest_without_saturation():

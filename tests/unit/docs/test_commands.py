@@ -66,6 +66,8 @@ def test_files_that_commands_read_are_shipped_or_written(page: Path) -> None:
         files = {word for word in arguments if re.search(r"\.(xml|toml|csv|ply)$", word)}
         if arguments[:2] == ["scenes", "copy"]:
             assert arguments[2] in {*catalogue.example_files(), *catalogue.scene_names()}, arguments
+            if source := catalogue.example_files().get(arguments[2]):
+                files |= {path.name for path in catalogue.files_named_by(source)}
         elif ">" not in arguments:
             missing = files - made - {arguments[i + 1] for i, word in enumerate(arguments) if word == "--csv"}
             assert not missing, f"{' '.join(arguments)} reads {missing}"
@@ -81,6 +83,7 @@ def test_the_guides_list_the_example_files() -> None:
 def test_example_files_are_those_of_the_text() -> None:
     for page, names in {
         "campaigns": ["bottoms.toml"],
+        "shore": ["shore.toml"],
         "instruments": ["own_receiver.toml", "detector_effects.toml", "own_camera.toml"],
     }.items():
         text = (ROOT / "docs" / "guide" / f"{page}.md").read_text("utf-8")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rows import each_row
 
+from mitransient_lidar import __version__
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 ROOT = Path(__file__).parents[3]
@@ -56,3 +57,32 @@ def test_every_plugin_has_a_picture() -> None:
     names = {name.rpartition(".")[2] for name in PLUGIN_MODULES} - {"bases", "tabulated"}
     pictures = {path.stem for path in (DOCS / "images" / "plugins").glob("*.png")}
     assert names == {name.removesuffix("_angles") for name in pictures}
+
+
+def test_entries_of_the_changelog_are_short_and_sorted() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert f"\n## {__version__} (" in text
+    assert set(re.findall(r"^### (.*)", text, re.MULTILINE)) <= {"Names", "Added", "Changed", "Fixed", "Removed"}
+    entries = re.findall(r"^- (.*(?:\n  .*)*)", text, re.MULTILINE)
+    assert len(entries) > 100
+    assert [entry for entry in entries if len(entry.split()) > 25] == []
+
+
+@each_row(
+    ("word", "page"),
+    [
+        *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
+        *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
+        *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
+    ],
+)
+def test_words_of_a_search_are_headings_or_terms(word: str, page: str) -> None:
+    """The site's search ranks these first."""
+    (path,) = DOCS.glob(f"{page}.*")
+    titles = re.findall(r"^(?:#+ (.*)|\"\"\"(.*)|(\w.*)(?=\n  \w))", path.read_text("utf-8"), re.MULTILINE)
+    assert re.search(rf"\b{word}\b", "\n".join(map("".join, titles)), re.IGNORECASE)
+
+
+def test_pages_of_search_words_have_them_in_the_text() -> None:
+    for word in ("bathymetry", "hydrography"):
+        assert all(word in (ROOT / page).read_text("utf-8") for page in ("README.md", "docs/index.md")), word

@@ -152,6 +152,7 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     ("name", "sentence"),
     [
         ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
+        ("own.xml", "instrument = 'own.xml' is not known; a lidar of a file is a part of a scene, by <include>"),
         ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
         (5, "instrument = 5 is not known"),
         ("../instruments/riegl_vq840g", "is not known"),
