@@ -278,7 +278,8 @@ class LightMapRenderer(PassRenderer):
         seen = dr.gather(_Seen, seen, lanes.shot * of_shot + lanes.number - part * of_shot)
         u, pick, path = _spaced(shots, lanes, origin, 3)
         rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / _DEPTHS)
-        down = -rays.direction.z
+        # Before all light is received: a new number in memory ends the kernel.
+        down, group_index = -rays.direction.z, opaque(scene.group_index)
         if from_bed:
             along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / _PATHS_AT_BOTTOM
             active, turned = rays.active & (along < _NO_BED), seen.turned
@@ -292,7 +293,7 @@ class LightMapRenderer(PassRenderer):
             for flight in (water.absorption_flight, water.scattering_flight)
         )
         kept = opaque(scene.transmitter.energy) * rays.weight * dr.exp(-absorbed) * turned
-        length, depth = rays.length + opaque(scene.group_index) * along, -place.z
+        length, depth = rays.length + group_index * along, -place.z
         turns, solid = mi.UInt32(0 if from_bed else 1), seen.solid if from_bed else mi.UInt32(0)
 
         def receive(events: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
@@ -317,9 +318,7 @@ class LightMapRenderer(PassRenderer):
             # Half of the displacement lies on the way up.
             excess -= (seen.slope.x * x + seen.slope.y * y) / down
         energy = kept * share * lit
-        receive(
-            dr.gather(mi.UInt32, self._events, entry), length + way + opaque(scene.group_index) * excess, energy, active
-        )
+        receive(dr.gather(mi.UInt32, self._events, entry), length + way + group_index * excess, energy, active)
 
 
 def _spread_of(
