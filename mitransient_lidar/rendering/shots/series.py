@@ -219,7 +219,7 @@ def render_shots(
     channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or (), "light": light}
     try:
         series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
-        suits = light == "merging" or not merge_unsuited or suits_maps(series.lidar, ShotPoses(places)).all()
+        suits = light == "merging" or not merge_unsuited or bool(suits_maps(series.lidar, ShotPoses(places)).all())
     except UnsuitedError:
         suits = False
         if not merge_unsuited:

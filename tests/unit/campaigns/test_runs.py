@@ -53,7 +53,7 @@ def test_rows_that_maps_do_not_suit_are_merged():
     """Over foam, and with a cube in the beam; over a bottom alone maps give other light."""
     for scene, fixed, is_merged in (
         ("table1", {**FLAT, "foam": 0.1}, True),
-        ("flight", {"cube_x": 0, "cube_y": 0, "cube_size": 1}, True),
+        ("flight", {"cube_x": 0, "cube_y": 0, "aim_x": 0, "aim_y": 0}, True),
         ("table1", FLAT, False),
     ):
         rows = []
