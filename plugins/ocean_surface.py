@@ -270,7 +270,7 @@ class SeaPatches:
     """
 
     def __init__(self, surface: OceanSurface) -> None:
-        self._surface, self._later = surface, (np.nan, surface.sea)
+        self._surface = surface
         props = mi.Properties()
         props["bsdf"], props["face_normals"] = surface.bsdf(), True
         self.shape = mi.Mesh("sea_patches", 3, 1, props, has_vertex_texcoords=True)
@@ -278,15 +278,9 @@ class SeaPatches:
             self.shape.add_attribute(FOAM, 1, [0.0])
         self.shapes: mi.Scene | None = None
 
-    def _at(self, time_s: float) -> SeaSurface:
-        """Return the sea at a time [s]."""
-        if self._later[0] != time_s:
-            self._later = time_s, self._surface.sea.at(time_s)
-        return self._later[1]
-
     def _seas(self, places: FloatArray, times_s: FloatArray | None) -> Iterable[SeaSurface]:
         """Return the sea at the time of each place."""
-        return [self._surface.sea] * len(places) if times_s is None else map(self._at, times_s.tolist())
+        return [self._surface.sea] * len(places) if times_s is None else map(self._surface.sea.at, times_s.tolist())
 
     def heights(self, places: FloatArray, times_s: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Return the heights of the patches, as of `SeaSurface.height_patches`, without a mesh."""

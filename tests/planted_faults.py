@@ -358,7 +358,7 @@ FAULTS = (
     Fault(
         "map_detour_at_phase_index",
         "mitransient_lidar/transport/light_maps/renderer.py",
-        "length + way + opaque(scene.group_index) * excess",
+        "length + way + group_index * excess",
         "length + way + excess",
         near="tests/analytic/test_light_maps.py",
     ),

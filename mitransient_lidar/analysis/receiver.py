@@ -79,6 +79,7 @@ def detect_waveforms(
     *,
     gain: Gain = None,
     optical_density: OpticalDensity = None,
+    advice: bool = True,
 ) -> xr.Dataset:
     """Record shots of a result, or of each shot in a series, with a receiver chain, or gates with a camera.
 
@@ -95,6 +96,8 @@ def detect_waveforms(
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
+    advice : bool
+        Whether to find the gain and the optical density that fit, too, where they are not 'auto'.
 
     Returns
     -------
@@ -137,19 +140,19 @@ def detect_waveforms(
     """
     dataset, infrared = split(results.dataset_of("dataset", dataset, "waveforms", "gates"))
     if infrared is not None:
-        given: dict[str, Any] = {"gain": gain, "optical_density": optical_density}
+        given: dict[str, Any] = {"gain": gain, "optical_density": optical_density, "advice": advice}
         own = detect_waveforms(dataset, chain, shots, seed, background_power, **given)
-        return join(own, detect_waveforms(infrared, None, shots, seed + 1))
+        return join(own, detect_waveforms(infrared, None, shots, seed + 1, advice=advice))
     if (camera := _camera_of(dataset, chain)) is not None:
         return record_gates(dataset, camera, shots, seed, background_power, (gain, optical_density))
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     if len(groups) == 1:
-        recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky)
+        recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky, advice)
     else:
         parts = []
         for number, (channel, pixels) in enumerate(groups):
             part, light = dataset.isel(pixel=pixels), sky if np.ndim(sky) == 0 else sky[pixels]
-            parts.append(_record_channel(part, channel, shots, (seed, seed + number), light))
+            parts.append(_record_channel(part, channel, shots, (seed, seed + number), light, advice))
         recorded = _joined(parts, [pixels for _, pixels in groups])
     recorded.attrs |= {"noise_seed": int(seed)} | ({} if receiver.name == "custom" else {"receiver": receiver.name})
     if receiver.pulse_repetition_khz is not None:
@@ -203,7 +206,7 @@ def pixel_chains(
     found: dict[int, PixelChain] = {}
     for channel, pixels in groups:
         own = backgrounds[pixels]
-        used, density, _ = _in_range(channel.chain, channel.gain, channel.optical_density, light[pixels], width, own)
+        used, density, _ = _in_range(channel, light[pixels], width, own, advice=False)
         found |= {pixel: PixelChain(used, 10**-density, float(backgrounds[pixel])) for pixel in pixels}
     return [found[pixel] for pixel in range(len(light))]
 
@@ -273,7 +276,7 @@ def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
 
 
 def _record_channel(
-    dataset: xr.Dataset, channel: Channel, shots: int, seeds: tuple[int, int], sky: FloatArray
+    dataset: xr.Dataset, channel: Channel, shots: int, seeds: tuple[int, int], sky: FloatArray, advice: bool
 ) -> xr.Dataset:
     """Return the record for pixels that share a channel.
 
@@ -286,7 +289,7 @@ def _record_channel(
     smoothed = given.low_pass(width).weights.size > 1
     if smoothed and float(dataset.attrs.get("response_time_ns", 0)) > 0:
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
-    receiver, density, fitting = _in_range(given, channel.gain, channel.optical_density, light, width, sky)
+    receiver, density, fitting = _in_range(channel, light, width, sky, advice)
     number = integer("shots", shots, 1, 10**9)
     require_memory(f"{number} records of {light.size} samples", _BYTES_PER_SAMPLE * number * light.size, "take fewer")
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
@@ -368,7 +371,7 @@ def saturation_advice(recorded: xr.Dataset) -> str:
     if share == 0:
         return "no sample is saturated"
     text = f"{_percent(share)} of the shots have saturated samples"
-    if "fitting_optical_density" in recorded.attrs:
+    if {"fitting_optical_density", "fitting_gain"} <= recorded.attrs.keys():
         density = float(np.max(recorded.attrs["fitting_optical_density"]))
         text += f": a filter of optical density {density:.1f} (factor {10**density:.3g})"
         gain = float(np.min(recorded.attrs["fitting_gain"]))
@@ -414,36 +417,39 @@ def _percent(share: float) -> str:
 
 
 def _in_range(
-    chain: ReceiverChain, gain: float | str, density: float | str, light: FloatArray, width: float, sky: FloatArray
+    channel: Channel, light: FloatArray, width: float, sky: FloatArray, advice: bool
 ) -> tuple[ReceiverChain, float, dict[str, float | str]]:
-    """Return the chain with its gain, the optical density of the filter, and attributes with those that fit."""
+    """Return the chain with its gain, the optical density of the filter, and attributes with those that fit.
+
+    Without `advice` only those that are automatic are sought.
+    """
+    chain, gain, density = channel.chain, channel.gain, channel.optical_density
     if gain == density == "auto":
         raise UserError("gain = 'auto' and optical_density = 'auto' are alternatives: give one of them")
     if chain.amplifier is None and "auto" in (gain, density):
         name = "gain" if gain == "auto" else "optical_density"
         raise UserError(f"{name} = 'auto' needs a receiver with an amplifier: without one, nothing saturates")
     background = np.broadcast_to(sky, light.shape[:-1])
-    wanted = 0.0 if density == "auto" else in_range("optical_density", density, 0, DENSEST)
+    chosen = 0.0 if density == "auto" else in_range("optical_density", density, 0, DENSEST)
     used = chain if gain in ("auto", 1) else chain.with_gain(finite("gain", gain))
-    attenuation = used.fitting_attenuation(light, width, background)
-    if math.isinf(attenuation) and density == "auto":
-        raise UserError("optical_density = 'auto' finds no filter: the noise alone exceeds the receiver's range")
-    # The margin keeps a density of 0.3 that rounding has raised.
-    fitting = math.ceil(10 * math.log10(attenuation) - 1e-6) / 10 if math.isfinite(attenuation) else math.inf
-    chosen = fitting if density == "auto" else wanted
-    largest = chain.fitting_gain(10**-chosen * light, width, 10**-chosen * background)
-    if gain == "auto" and largest == 0:
-        raise UserError("gain = 'auto' finds no gain of the photomultiplier: use optical_density = 'auto'")
-    factor = largest if gain == "auto" else float(gain)
+    fitting: dict[str, float | str] = {}
+    if advice or density == "auto":
+        attenuation = used.fitting_attenuation(light, width, background)
+        if math.isfinite(attenuation):
+            # The margin keeps a density of 0.3 that rounding has raised.
+            fitting["fitting_optical_density"] = math.ceil(10 * math.log10(attenuation) - 1e-6) / 10
+        elif density == "auto":
+            raise UserError("optical_density = 'auto' finds no filter: the noise alone exceeds the receiver's range")
+        chosen = float(fitting["fitting_optical_density"]) if density == "auto" else chosen
+    factor = 0.0 if gain == "auto" else float(gain)
+    if advice or gain == "auto":
+        largest = chain.fitting_gain(10**-chosen * light, width, 10**-chosen * background)
+        if gain == "auto" and largest == 0:
+            raise UserError("gain = 'auto' finds no gain of the photomultiplier: use optical_density = 'auto'")
+        fitting["fitting_gain"] = largest
+        factor = largest if gain == "auto" else factor
     automatic = "gain" if gain == "auto" else "optical_density" if density == "auto" else ""
-    attributes: dict[str, float | str] = {
-        "gain": factor,
-        "optical_density": chosen,
-        "chosen": automatic,
-        "fitting_gain": largest,
-    }
-    if math.isfinite(fitting):
-        attributes["fitting_optical_density"] = fitting
+    attributes = {"gain": factor, "optical_density": chosen, "chosen": automatic, **fitting}
     return (chain.with_gain(factor) if gain == "auto" and factor < 1 else used), chosen, attributes
 
 

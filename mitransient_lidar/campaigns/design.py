@@ -20,9 +20,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.formats.toml_files import parse_toml, table
 from mitransient_lidar.core.options import BackgroundPower, Option, positive_option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
 from mitransient_lidar.physics.receiver.receiver_files import Setting
+from mitransient_lidar.rendering.options import LIGHT, LightOption
 
 #: Design kinds: every combination; points of a sequence, of a Latin hypercube, or random ones; file rows.
 DesignKind = Literal["grid", "sobol", "latin_hypercube", "random", "table"]
@@ -109,6 +110,7 @@ class Campaign(Plan):
         float | None,
         positive_option("Longest time for the passes of each run; one that it ends has other bits elsewhere", "s"),
     ] = None
+    light: LightOption = "merging"
     keep: Annotated[tuple[str, ...], Option(f"Store contents, of {', '.join(KEPT)}")] = ("waveform", "truth")
     instrument: Annotated[str | None, Option("Instrument instead of the scene's lidar")] = None
     derivatives: Annotated[
@@ -128,6 +130,9 @@ class Campaign(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        one_of("light", self.light, LIGHT)
+        if self.light == "maps" and self.derivatives:
+            raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
         if not self.keep:
             raise UserError(f"keep = [] must be a list of {', '.join(KEPT)}")
         if unknown := [name for name in self.keep if name not in KEPT]:
@@ -167,6 +172,10 @@ class Campaign(Plan):
     def from_json(cls, text: str) -> Campaign:
         """Return the campaign of a `text`."""
         return cls.of_file(json.loads(text))
+
+    def lit_by(self, light: str | None) -> Campaign:
+        """Return the campaign with another `light`; itself if None."""
+        return self if light is None else Campaign.of_file({**json.loads(self.text), "light": light}, self.folder)
 
     @property
     def needed_names(self) -> set[str]:

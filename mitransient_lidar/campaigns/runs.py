@@ -154,6 +154,8 @@ class RunRenderer(Renderer):
             "first_seed": int(random.integers(2**40)),
             "axis": self.axis,
             "describe_sea": False,
+            "light": campaign.light,
+            "merge_unsuited": True,
         }
         return render_shots(self.scene, params, **{**wanted, **options})
 

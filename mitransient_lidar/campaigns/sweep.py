@@ -60,6 +60,7 @@ def campaign(
     ],
     store: str | os.PathLike[str],
     *,
+    light: Annotated[str | None, Option("Computation of the light instead of the campaign's: merging or maps")] = None,
     workers: ProcessCount = None,
     scheduler: Scheduler = None,
     shard_size: Annotated[
@@ -80,6 +81,8 @@ def campaign(
         A TOML file, or a dict with its contents; see docs/guide/campaigns.md.
     store
         Store folder. A store with the same campaign is completed.
+    light
+        As of `rendering.shots.series.render_shots`; rows that maps do not suit are merged.
     scheduler
         Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
         the same versions of this package, Mitsuba, Dr.Jit, NumPy and Python, and the store at the same path.
@@ -105,7 +108,7 @@ def campaign(
         After Ctrl-C; processes write the runs that they have, which stay.
     """
     path, given = checked_path("store", store), (workers, scheduler, retry_failed, progress)
-    return open_campaign(complete(lambda: _prepare(_campaign(campaign), path, shard_size), *given).path)
+    return open_campaign(complete(lambda: _prepare(_campaign(campaign).lit_by(light), path, shard_size), *given).path)
 
 
 def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:

@@ -57,8 +57,8 @@ def _campaign(
 
     store = campaign if campaign.is_dir() else output or campaign.with_suffix(".zarr")
     if campaign.is_dir():
-        fixed = {"--output": output, "--shard-size": call.arguments["shard_size"]}
-        for name in [name for name, value in fixed.items() if value is not None][:1]:
+        given = {f"--{name.replace('_', '-')}": call.arguments[name] for name in ("light", "shard_size")}
+        for name in [name for name, value in {"--output": output, **given}.items() if value is not None][:1]:
             raise UserError(f"{name} is fixed in the store {campaign}: leave it out")
         kept = {name: call.arguments[name] for name in ("workers", "scheduler", "retry_failed")}
         replace(call, function=campaigns.resume, arguments=kept)(store)

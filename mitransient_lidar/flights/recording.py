@@ -30,6 +30,7 @@ def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -
         _receiver(series, plan).with_channel_settings(_stored(inputs)),
         seed=int(np.random.SeedSequence([plan.seed, int(inputs["pulse"][0]), 1]).generate_state(1)[0]),
         background_power=plan.receiver.background_power_w,
+        advice=False,
     )
 
 
@@ -47,7 +48,7 @@ def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str,
     densities: dict[int, float] = {}
     for series in probes:
         receiver = _receiver(series, plan)
-        recorded = detect_waveforms(series, receiver, background_power=plan.receiver.background_power_w)
+        recorded = detect_waveforms(series, receiver, background_power=plan.receiver.background_power_w, advice=False)
         pixels = recorded["pixel"].values
         used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
         for pixel, gain, density in zip(pixels, *used, strict=True):

@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
-#: Most shots that are rendered together, and longest time between them in which waves stand still [s].
-_BATCH, _STILL_S = 64, 0.05
+#: Most pulses that are rendered and measured together, and time in which waves stand still [s].
+_BATCH, _STILL_S = 256, 0.05
 
 #: Inputs of pulses: start of the record of the infrared channel [ns], and its time bins.
 _OF_INFRARED = ("infrared_start_ns", "infrared_bins")
@@ -149,12 +149,10 @@ class FlightRenderer(Renderer):
         return described(name, "flight")
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
-        """Return the rows of pulses that are rendered together: successive ones of a group, over one sea."""
-        group, step = inputs["group"], np.floor(inputs["time_s"] / _STILL_S + _ROUNDING)
-        first = 0
+        """Return the rows of pulses that are rendered together: successive ones of a group."""
+        group, first = inputs["group"], 0
         for row in range(1, group.size + 1):
-            is_last = row == group.size or row - first == _BATCH
-            if is_last or group[row] != group[first] or (step[row] != step[first] and not self.plan.still_sea):
+            if row == group.size or row - first == _BATCH or group[row] != group[first]:
                 yield list(range(first, row))
                 first = row
 
@@ -236,7 +234,7 @@ class FlightRenderer(Renderer):
     def _probes(
         self, columns: Mapping[str, Column], most: int, progress: ProgressCallback | None
     ) -> list[tuple[xr.Dataset, float]]:
-        """Return the waveforms of pulses that are spread over the flight, those of a group together.
+        """Return the waveforms of pulses that are spread over the flight, those of a group together, over one sea.
 
         Each part has the processor time of a pulse with as many passes as its error needs [s].
         """
@@ -245,8 +243,9 @@ class FlightRenderer(Renderer):
         found: list[tuple[xr.Dataset, float]] = []
         for group in np.unique(columns["group"][rows]):
             own = rows[columns["group"][rows] == group]
-            for part in np.array_split(own, -(-own.size // _BATCH)):
+            for part in np.array_split(own, -(-own.size // _SAMPLED)):
                 inputs = {name: column[part] for name, column in columns.items()}
+                inputs["time_s"] = np.full(part.size, inputs["time_s"][0])
                 self._scene_of(inputs)
                 began = time.process_time()
                 series, _, errors = self._render(inputs, self._passes(until_error=False))
@@ -296,9 +295,7 @@ class FlightRenderer(Renderer):
         poses = poses.delayed(further % width)
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
-            time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
-            poses = replace(poses, times_s=np.full(len(poses), time_s))
-            sea = sea if sea is None else sea.at(time_s)
+            poses = replace(poses, times_s=_STILL_S * (np.floor(inputs["time_s"] / _STILL_S + _ROUNDING) + 0.5))
         pulses = inputs["pulse"].astype(np.int64)
         by_maps = suits_maps(scene.lidar, poses) if plan.light == "maps" else np.zeros(len(poses), dtype=bool)
         rendered, rows = [], []

@@ -50,9 +50,11 @@ def tiled(tree: Tree, copies: int) -> Tree:
     return repeated
 
 
-def starts(shots: int, size: int) -> mi.UInt32:
-    """Return the number of the first of `size` entries in each shot."""
-    return mi.UInt32(0) if shots == 1 else aligned(mi.UInt32, np.arange(shots) * size)
+def starts(shots: int, size: int, copies: int = 1) -> mi.UInt32:
+    """Return the number of the first of `size` entries in each shot, of which several copies in turn have the same."""
+    if shots * copies == 1:
+        return mi.UInt32(0)
+    return aligned(mi.UInt32, np.repeat(np.arange(shots) * size, copies))
 
 
 def _each_array(tree: Any, change: Callable[[Any], Any], lanes: Lanes | None = None) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -136,7 +137,7 @@ class ColumnOnset:
         """Return the onset of a column with a focusing, if any, and the depth per time [m/ns]."""
         if focusing is None:
             return cls()
-        return cls(largest_sigma, focusing.depths / depth_per_ns, focusing.factors)
+        return _tabulated(largest_sigma, tuple(focusing.depths / depth_per_ns), tuple(focusing.factors))
 
     @property
     def brightest_ns(self) -> float:
@@ -193,3 +194,9 @@ class ColumnOnset:
             first += bend * sigma * passed
             second += bend * sigma * density
         return [value, first, second]
+
+
+@functools.lru_cache(maxsize=8)
+def _tabulated(largest_sigma: float, times: tuple[float, ...], factors: tuple[float, ...]) -> ColumnOnset:
+    """Return an onset whose tables serve all records of a focusing."""
+    return ColumnOnset(largest_sigma, np.array(times), np.array(factors))

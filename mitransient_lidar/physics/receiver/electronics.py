@@ -70,7 +70,18 @@ class LowPass:
 
         `weights` replace the response's own; N weights less need a record that is N parts shorter.
         """
-        return filtered(record, self.weights if weights is None else weights)[..., self.start :: stride * self.parts]
+        weights = self.weights if weights is None else weights
+        # Bin by bin: the samples between bins are not computed.
+        first, part = divmod(self.start, self.parts)
+        bins = -(-(part + weights.size) // self.parts)
+        of_parts = np.zeros(bins * self.parts)
+        of_parts[part : part + weights.size] = weights[::-1]
+        count = (record.shape[-1] - self.start - weights.size) // self.parts + 1
+        used = record[..., first * self.parts : (first + count + bins - 1) * self.parts]
+        lacking = (count + bins - 1) * self.parts - used.shape[-1]
+        used = np.pad(used, [(0, 0)] * (record.ndim - 1) + [(0, lacking)]) if lacking else used
+        by_lag = used.reshape(*used.shape[:-1], -1, self.parts) @ of_parts.reshape(bins, self.parts).T
+        return np.asarray(sum(by_lag[..., lag : lag + count : stride, lag] for lag in range(bins)))
 
 
 #: Without a low-pass a sample is the mean of its bin.
@@ -332,8 +343,9 @@ class Readout:
     def expected(self, mean: FloatArray, variance: FloatArray) -> Expected:
         """Return the sample moments for normally distributed voltages with a mean [V] and variance [V^2].
 
-        Gauss-Legendre quadrature within the limits; clipped values are included. Samples that an overload may hold at
-        the limit are taken as held with the largest probability of an overload in the time before.
+        Closed forms without a logarithm, Gauss-Legendre quadrature with one; clipped values are included. Samples that
+        an overload may hold at the limit are taken as held with the largest probability of an overload in the time
+        before.
         """
         from scipy.special import ndtr
 
@@ -349,17 +361,29 @@ class Readout:
         # Moments about the mean's sample, against cancellation.
         centre = self._compressed(np.clip(mean, *clip))
         first, second = np.zeros_like(mean), np.zeros_like(mean)
-        for edge, fraction in ((clip[0], below(clip[0])), (clip[1], 1 - below(clip[1]))):
+        ends = below(clip[0]), 1 - below(clip[1])
+        for edge, fraction in zip(clip, ends, strict=True):
             distance = np.where(fraction > 0, self._compressed(np.asarray(edge)) - centre, 0)
             first, second = first + fraction * distance, second + fraction * distance**2
         start, end = (np.clip(edge, mean - 8 * sigma, mean + 8 * sigma) for edge in clip)
         width = np.where(sigma > 0, sigma, 1)
-        for node, weight in zip(*np.polynomial.legendre.leggauss(_NODES), strict=True):
-            volts = (start + end) / 2 + node * (end - start) / 2
-            density = np.exp(-0.5 * ((volts - mean) / width) ** 2) / (width * np.sqrt(2 * np.pi))
-            fraction = weight * (end - start) / 2 * density
-            distance = self._compressed(volts) - centre
-            first, second = first + fraction * distance, second + fraction * distance**2
+
+        def density(volts: FloatArray) -> FloatArray:
+            return np.asarray(np.exp(-0.5 * ((volts - mean) / width) ** 2) / (width * np.sqrt(2 * np.pi)))
+
+        if self.logarithm is None:
+            # Moments of a truncated normal distribution.
+            within, offset = 1 - ends[0] - ends[1], mean - centre
+            low, high = (variance * density(edge) for edge in (start, end))
+            first = first + within * offset + low - high
+            second = second + within * (offset**2 + variance) + 2 * offset * (low - high)
+            second = second + (start - mean) * low - (end - mean) * high
+        else:
+            for node, weight in zip(*np.polynomial.legendre.leggauss(_NODES), strict=True):
+                volts = (start + end) / 2 + node * (end - start) / 2
+                fraction = weight * (end - start) / 2 * density(volts)
+                distance = self._compressed(volts) - centre
+                first, second = first + fraction * distance, second + fraction * distance**2
         saturation = np.clip(below(over[0]) + 1 - below(over[1]), 0, 1)
         rounding = 0.0 if self.digitiser is None else self.digitiser.step_v**2 / 12
         plain = Expected(centre + first, np.maximum(second - first**2, 0) + rounding * (1 - saturation), saturation)

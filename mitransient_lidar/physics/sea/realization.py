@@ -137,9 +137,10 @@ def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> Floa
     cells = cells or count
     if cells > count:
         half = count // 2
-        waves, coefficients = coefficients, np.zeros((cells, cells // 2 + 1), dtype=np.complex128)
-        coefficients[:half, : half + 1], coefficients[-half:, : half + 1] = waves[:half], waves[half:]
-    heights = np.fft.irfft2(coefficients, s=(cells, cells), norm="forward")
+        waves, coefficients = coefficients, np.zeros((cells, half + 1), dtype=np.complex128)
+        coefficients[:half], coefficients[-half:] = waves[:half], waves[half:]
+    # Columns without waves are not transformed.
+    heights = np.fft.irfft(np.fft.ifft(coefficients, axis=0, norm="forward"), cells, axis=1, norm="forward")
     return np.asarray(np.fft.fftshift(heights), dtype=np.float64)
 
 

@@ -72,6 +72,9 @@ _LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
 #: Places on each side of a period by which the highest crests are found.
 _CREST_SAMPLES = 512
 
+#: Most heights of seas at other times that are kept.
+_MOST_HEIGHTS = 2**24
+
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
 
@@ -214,7 +217,20 @@ class SeaSurface:
 
     def at(self, time: float) -> SeaSurface:
         """Return the sea at a time [s]; a wake, a height map and a sea without waves stay."""
-        return self if self.waves_at is None else replace(self, waves=self.waves_at(time))
+        if self.waves_at is None:
+            return self
+        if time not in self._later:
+            waves = self._crested
+            each = waves.cells**2 if isinstance(waves, PeriodicHeights) else _MOST_HEIGHTS
+            if self._later and (len(self._later) + 1) * each > _MOST_HEIGHTS:
+                del self._later[next(iter(self._later))]
+            self._later[time] = replace(self, waves=self.waves_at(time))
+        return self._later[time]
+
+    @cached_property
+    def _later(self) -> dict[float, SeaSurface]:
+        """Seas at the times that were asked for last."""
+        return {}
 
     @property
     def slope_variance(self) -> float:

@@ -26,7 +26,7 @@ _LEVEL = 0.01
 _MOST_EVENTS = 200
 
 #: Ways, and pairs of them, for each path: paths are sorted by displacement, and one stands for its neighbours.
-_WAYS, _PAIRS = 16, 64
+_WAYS, _PAIRS = 16, 8
 
 #: Least scattering coefficient, so that optical depths increase strictly [1/m].
 _LEAST_SCATTERING = 1e-12
@@ -82,7 +82,7 @@ class TwoWaySpread:
         found: list[list[FloatArray]] = []
         layers = column.layer_at(depths)
         for number, (layer, q) in enumerate(zip(layers, ways.unscattered, strict=True)):
-            scattered = np.flatnonzero(ways.events[number] > 0)
+            scattered = np.flatnonzero(ways.values[number, -1] > 0)
             mass = ways.share * scattered.size / (_WAYS * paths)
             shares = np.array([q * mass, q * mass, mass**2])
             if shares.sum() <= 0:
@@ -91,11 +91,15 @@ class TwoWaySpread:
             # The first part has scattered on the way down alone, the second on the way up, the third on both.
             ends = np.round(np.cumsum(shares) / shares.sum() * count).astype(int)
             place = np.arange(count)
-            down, up = (rng.choice(scattered, count) for _ in range(2))
+            slant = 1 / ways.values[number, 6, scattered]
+            down, up = (scattered[_drawn(slant, count, rng)] for _ in range(2))
             down[(place >= ends[0]) & (place < ends[1])] = up[place < ends[0]] = -1
-            (x1, y1, e1, a1, u1, n1), (x2, y2, e2, a2, u2, n2) = ways.at(number, down), ways.at(number, up)
+            (x1, y1, e1, a1, *u1, n1), (x2, y2, e2, a2, *u2, n2) = (ways.values[number][:, one] for one in (down, up))
             absorbed = np.exp(-(a1 + a2)) * shares.sum() / (1 - q**2)
-            s = np.clip(0.5 + 0.5 * np.sum(u1 * u2, axis=0), 1e-6, 1)
+            # More of the ways that end nearly level, of which few have most of the water's light.
+            for one, ends in ((down, u1[2]), (up, u2[2])):
+                absorbed *= np.where(one < 0, 1.0, ends * slant.mean())
+            s = np.clip(0.5 + 0.5 * sum(first * second for first, second in zip(u1, u2, strict=True)), 1e-6, 1)
             phase = phases[layer].eval_s(s) / phases[layer].eval_s(1.0)
             of_water = absorbed * phase * cos_water**2 / (u1[2] * u2[2])
             # Seen at x, light has turned at x + (x2, y2), which that of the way down reaches from x + (x2 - x1, ...).
@@ -120,8 +124,10 @@ class _Ways:
         Share of the light that meets an event above the last depth.
     unscattered
         Share of the light that has met none at each depth, shape (depths,).
-    events
-        Number of events at each depth, 0 for ways that go up before it, shape (depths, ways).
+    values
+        Displacement x, y [m], excess length [m], excess absorption, direction x, y, z and number of events of ways at
+        each depth, shape (depths, 8, ways + 1). The number is 0 for ways that go up before it, and the last way is
+        straight.
     """
 
     def __init__(
@@ -143,11 +149,8 @@ class _Ways:
         self.share = -np.expm1(-whole)
         self.unscattered = np.exp(-np.interp(depths, edges, optical) / cos_water)
         axis = np.array([np.sqrt(1 - cos_water**2), 0.0, cos_water])
-        self._straight = axis
-        shape = depths.size, count
-        self.events = np.zeros(shape, np.int64)
-        self._x, self._y, self._length, self._absorbed = (np.zeros(shape) for _ in range(4))
-        self._direction = np.tile(axis[:, None, None], (1, *shape))
+        self.values = np.zeros((depths.size, 8, count + 1))
+        self.values[:, 4:7] = axis[:, None]
         position, direction = np.zeros((3, count)), np.tile(axis[:, None], (1, count))
         length, depth_a = np.zeros(count), np.zeros(count)
         alive = np.arange(count)
@@ -162,14 +165,13 @@ class _Ways:
                 ways = alive[crosses]
                 run = length[crosses] + step
                 tilt = depths[number] / cos_water
-                self._x[number, ways] = position[0][crosses] + step * direction[0][crosses] - tilt * axis[0]
-                self._y[number, ways] = position[1][crosses] + step * direction[1][crosses]
-                self._length[number, ways] = run - tilt
+                x = position[0][crosses] + step * direction[0][crosses] - tilt * axis[0]
+                y = position[1][crosses] + step * direction[1][crosses]
                 above = np.interp([depths[number]], edges, absorbed) - np.interp(position[2][crosses], edges, absorbed)
                 total = depth_a[crosses] + above / direction[2][crosses]
-                self._absorbed[number, ways] = total - np.interp(depths[number], edges, absorbed) / cos_water
-                self._direction[:, number, ways] = direction[:, crosses]
-                self.events[number, ways] = event
+                more = total - np.interp(depths[number], edges, absorbed) / cos_water
+                events = np.full(ways.shape, event)
+                self.values[number][:, ways] = x, y, run - tilt, more, *direction[:, crosses], events
             goes_on = np.isfinite(z)
             step = (z[goes_on] - position[2][goes_on]) / direction[2][goes_on]
             alive, position, direction = alive[goes_on], position[:, goes_on], direction[:, goes_on]
@@ -199,16 +201,12 @@ class _Ways:
             theta[here] = scattering_angles(phases[layer], u[here])
         return theta
 
-    def at(self, number: int, ways: IntArray) -> tuple[FloatArray, ...]:
-        """Return displacement x, y [m], excess length [m], excess absorption, direction and events of ways at a depth.
 
-        Way -1 is the straight one.
-        """
-        straight = ways < 0
-        fields = (self._x, self._y, self._length, self._absorbed)
-        x, y, length, absorbed = (np.where(straight, 0.0, each[number, ways]) for each in fields)
-        direction = np.where(straight, self._straight[:, None], self._direction[:, number, ways])
-        return x, y, length, absorbed, direction, np.where(straight, 0, self.events[number, ways])
+def _drawn(weights: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
+    """Return numbers in random order, each about as often as its weight says."""
+    sums = np.cumsum(weights)
+    places = (np.arange(count) + rng.random(count)) * (sums[-1] / count)
+    return rng.permutation(np.minimum(np.searchsorted(sums, places, side="right"), sums.size - 1))
 
 
 def _turned(direction: FloatArray, theta: FloatArray, rng: np.random.Generator) -> FloatArray:

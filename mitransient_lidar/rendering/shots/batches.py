@@ -316,8 +316,7 @@ class ShotBatches:
                 receiver_poses=all_shots.receiver,
                 transmitter_poses=all_shots.transmitter,
             )
-            patches, low = (np.repeat(each, copies, axis=0) for each in (heights, corners))
-            fields = HeightFields.of_patches(patches, low, sea.cell_size, sea.wind_direction, waves[0])
+            fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves[0], copies)
             return renderer.over(placed, fields, copies)
 
         return renderer_of

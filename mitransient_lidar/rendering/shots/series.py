@@ -105,6 +105,7 @@ def render_shots(
     infrared: Infrared = False,
     sensor: Sensor = None,
     describe_sea: bool = True,
+    merge_unsuited: bool = False,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random locations on one sea, many at a time.
@@ -152,6 +153,8 @@ def render_shots(
         Whether to render the infrared channel of the instrument at the same places, too, as for `render`.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
+    merge_unsuited
+        Whether to merge the light of a scene that maps do not suit, or with a target in the light of a shot.
     progress
         Called with a `passes.Progress` after every batch of shots.
 
@@ -183,7 +186,9 @@ def render_shots(
         ReceivedShots,
         ShotPoses,
         share_for_error,
+        suits_maps,
     )
+    from mitransient_lidar.transport.light_maps.renderer import UnsuitedError
 
     if infrared:
         (_, own), (channel, other) = with_infrared(instrument, params)
@@ -212,7 +217,15 @@ def render_shots(
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
     channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or (), "light": light}
-    series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
+    try:
+        series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
+        suits = light == "merging" or not merge_unsuited or bool(suits_maps(series.lidar, ShotPoses(places)).all())
+    except UnsuitedError:
+        suits = False
+        if not merge_unsuited:
+            raise
+    if not suits:
+        return render_shots(**options_given | {"light": "merging"})
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
     before = (session or series.session).parameters

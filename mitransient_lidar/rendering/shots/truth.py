@@ -162,8 +162,10 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     if shots.in_scene is not None:
         # The rotation of the shot's frame also turns with the pixels.
         turns = shots.in_scene.azimuth - lidar.receiver.pose.azimuth
-    rows = zip(places, turns, strict=True)
-    along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y, turn) for (x, y), turn in rows]).T
+    seas = [sea] * len(places) if sea is None or shots.times_s is None else map(sea.at, shots.times_s.tolist())
+    rows = zip(seas, places, turns, strict=True)
+    means = [footprint_means(waves, lidar.transmitter, x, y, turn) for waves, (x, y), turn in rows]
+    along, across, height = np.array(means).T
     own = lidar.receiver.pose
     origins, axes = own.origin + np.pad(places - own.in_scene(own.ground_point())[:2], ((0, 0), (0, 1))), own.axis
     if shots.in_scene is not None:

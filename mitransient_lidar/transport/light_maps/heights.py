@@ -57,6 +57,7 @@ class HeightFields:
         cell: float,
         wind_direction: float,
         part: ScenePart,
+        copies: int = 1,
     ) -> Self:
         """Return the fields of patches.
 
@@ -70,14 +71,18 @@ class HeightFields:
             Direction of the first axis of the ripples [rad].
         part
             Displacement and turn of each shot.
+        copies
+            Shots in turn that share a patch.
         """
         shots, lines, _ = heights.shape
-        low = mi.Vector2f(*(aligned(mi.Float, column.astype(np.float32)) for column in corners.T))
+        low = mi.Vector2f(
+            *(aligned(mi.Float, column.astype(np.float32)) for column in np.repeat(corners, copies, axis=0).T)
+        )
         wind = opaque(float(np.cos(wind_direction))), opaque(float(np.sin(wind_direction)))
         values = aligned(mi.Float, heights.astype(np.float32))
         sizes = opaque_index(lines), opaque(1 / cell)
         turn = mi.Vector2f(1, 0) if part.turn is None else part.turn
-        return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines))
+        return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines, copies))
 
     @classmethod
     def about(cls, scene: LidarScene, *, level: bool = False) -> Self:

@@ -29,7 +29,7 @@ from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_
 from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
-from mitransient_lidar.transport.paths.ripple_focusing import Echo, RippleFocusing
+from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
@@ -112,6 +112,10 @@ class _Seen:
     turned: mi.Float
 
 
+class UnsuitedError(UserError):
+    """A scene that light maps are not for."""
+
+
 class LightMapRenderer(PassRenderer):
     """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
@@ -124,19 +128,18 @@ class LightMapRenderer(PassRenderer):
 
     Raises
     ------
-    UserError
+    UnsuitedError
         If the scene is not suited.
     """
 
     def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False) -> None:
         if (reason := unsuited(scene)) is not None:
-            raise UserError(f"light maps do not suit the scene: {reason}")
-        super().__init__(scene, classes, _RAYS)
+            raise UnsuitedError(f"light maps do not suit the scene: {reason}")
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
         self._planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
         # Waves of the mesh enhance what cells average less than what meets at points.
-        self.focusing = RippleFocusing.of_scene(scene, _far_apart if level else self._planes.cell)
+        super().__init__(scene, classes, _RAYS, _far_apart if level else self._planes.cell)
         column = water.column
         phases = [table_of(phase) for phase in water.phases.phases[: column.count]]
         spread = _spread_of(column, phases, self._planes.depths[1:], cos_water)
@@ -278,7 +281,8 @@ class LightMapRenderer(PassRenderer):
         seen = dr.gather(_Seen, seen, lanes.shot * of_shot + lanes.number - part * of_shot)
         u, pick, path = _spaced(shots, lanes, origin, 3)
         rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / _DEPTHS)
-        down = -rays.direction.z
+        # Before all light is received: a new number in memory ends the kernel.
+        down, group_index = -rays.direction.z, opaque(scene.group_index)
         if from_bed:
             along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / _PATHS_AT_BOTTOM
             active, turned = rays.active & (along < _NO_BED), seen.turned
@@ -292,7 +296,7 @@ class LightMapRenderer(PassRenderer):
             for flight in (water.absorption_flight, water.scattering_flight)
         )
         kept = opaque(scene.transmitter.energy) * rays.weight * dr.exp(-absorbed) * turned
-        length, depth = rays.length + opaque(scene.group_index) * along, -place.z
+        length, depth = rays.length + group_index * along, -place.z
         turns, solid = mi.UInt32(0 if from_bed else 1), seen.solid if from_bed else mi.UInt32(0)
 
         def receive(events: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
@@ -317,9 +321,7 @@ class LightMapRenderer(PassRenderer):
             # Half of the displacement lies on the way up.
             excess -= (seen.slope.x * x + seen.slope.y * y) / down
         energy = kept * share * lit
-        receive(
-            dr.gather(mi.UInt32, self._events, entry), length + way + opaque(scene.group_index) * excess, energy, active
-        )
+        receive(dr.gather(mi.UInt32, self._events, entry), length + way + group_index * excess, energy, active)
 
 
 def _spread_of(

@@ -163,7 +163,8 @@ class TransientHistogram:
         """Add energy to time bin or gate `number` of a pixel."""
         index = pixel * self._length + number
         valid = dr.isfinite(energy)
-        dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
+        # Another kind of writing would end the kernel of the energies before.
+        dr.scatter_reduce(dr.ReduceOp.Or, self._invalid, mi.UInt32(1), index, active & ~valid)
         self._add_share(index, energy, active & valid)
         if not sums:
             return

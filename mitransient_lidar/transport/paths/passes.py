@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import changed
 from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.paths.path_classes import PathClasses
@@ -88,10 +89,16 @@ class PassRenderer(ABC):
     A pass may hold several shots, which have these paths each, and pixels of their own.
     """
 
-    def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
+    def __init__(
+        self,
+        scene: LidarScene,
+        classes: PathClasses,
+        paths: int,
+        cells: Callable[[FloatArray], FloatArray] | None = None,
+    ) -> None:
         self.scene, self.paths = scene, paths
-        #: Enhancement by ripples, or None.
-        self.focusing = RippleFocusing.of_scene(scene)
+        #: Enhancement by ripples, or None; `cells` as of `RippleFocusing.of_scene`.
+        self.focusing = RippleFocusing.of_scene(scene, cells)
         self.classes = replace(classes, counted=self.focusing is not None)
         self.probe = Probe(scene)
         self.sampler = self.probe.sampler

@@ -303,6 +303,18 @@ def test_automatic_gain_is_the_largest_without_saturation():
     assert (behind.attrs["fitting_gain"] > gain, behind.attrs["fitting_optical_density"]) == (True, 0.0)
 
 
+def test_records_without_advice_are_the_same():
+    strong = make()
+    strong["waveform"] *= 1e3
+    with_advice, without = (detect_waveforms(strong, CHAIN, seed=2, gain=0.5, advice=one) for one in (True, False))
+    xr.testing.assert_equal(without, with_advice)
+    told = {name for name in with_advice.attrs if name not in without.attrs}
+    assert told == {"fitting_gain", "fitting_optical_density"}
+    chosen = [detect_waveforms(strong, CHAIN, seed=2, gain="auto", advice=one) for one in (True, False)]
+    xr.testing.assert_equal(*chosen)
+    assert chosen[0].attrs["gain"] == chosen[1].attrs["gain"] == chosen[1].attrs["fitting_gain"] < 1
+
+
 def test_filter_attenuates_signal_and_background():
     plain = detect_waveforms(make(), CHAIN, background_power=1e-8)
     dimmed = detect_waveforms(make() * 10, CHAIN, background_power=1e-7, optical_density=1.0)

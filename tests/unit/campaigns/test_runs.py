@@ -49,6 +49,23 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
 
 
 @pytest.mark.slow
+def test_rows_that_maps_do_not_suit_are_merged():
+    """Over foam, and with a cube in the beam; over a bottom alone maps give other light."""
+    for scene, fixed, is_merged in (
+        ("table1", {**FLAT, "foam": 0.1}, True),
+        ("flight", {"cube_x": 0, "cube_y": 0, "aim_x": 0, "aim_y": 0}, True),
+        ("table1", FLAT, False),
+    ):
+        rows = []
+        for light in ("merging", "maps"):
+            given = {"scene": scene, "light": light, "fixed": fixed, "parameters": {"altitude": [200, 220]}}
+            campaign = Campaign.of_file({**given, "target_error": 0.2, "design": {"kind": "grid"}})
+            runs = RunRenderer.of(campaign, campaign.table())
+            rows.append(runs.stacked(np.array([0]), {"altitude": np.array([200])})["waveform"].values)
+        assert np.array_equal(*rows) == is_merged
+
+
+@pytest.mark.slow
 def test_random_seas_are_of_the_run():
     runs = renderer({"bottom_depth": [3.0, 4.0]})
     seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]

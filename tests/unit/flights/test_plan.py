@@ -53,16 +53,16 @@ def test_pulses_of_one_group_have_similar_poses():
         assert np.all(np.diff(columns["pulse"][columns["group"] == group]) > 0)
 
 
-@each_row(("still", "longest"), [(False, 0.05), (True, 0.64)])
-def test_batches_are_of_one_group_and_one_sea(still, longest):
-    plan = FlightPlan.of_file({**FLIGHT, "still_sea": still})
+def test_batches_are_of_one_group():
+    plan = FlightPlan.of_file({**FLIGHT, "pulses": {**FLIGHT["pulses"], "rate_hz": 10 * FLIGHT["pulses"]["rate_hz"]}})
     columns = input_columns(plan.poses())
     batches = list(FlightRenderer(plan, None, None).batches(columns))
     assert [row for batch in batches for row in batch] == list(range(len(columns["pulse"])))
     for batch in batches:
         assert len(np.unique(columns["group"][batch])) == 1
-        assert np.ptp(columns["time_s"][batch]) < longest
-    assert max(len(batch) for batch in batches) == (64 if still else 5)
+    assert max(len(batch) for batch in batches) == 256
+    ends = columns["group"][[batch[-1] for batch in batches]]
+    assert all(len(batch) == 256 for batch, own, other in zip(batches, ends, ends[1:], strict=False) if own == other)
 
 
 def test_paths_are_those_of_the_folder(tmp_path):

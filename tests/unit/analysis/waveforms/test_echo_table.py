@@ -62,6 +62,19 @@ def test_surface_column_target_and_bottom_of_every_pixel():
     np.testing.assert_allclose(table["amplitude"].sel(echo="column"), 3e-5, rtol=0.03)
 
 
+def test_shots_together_have_the_echoes_of_each_alone():
+    random = np.random.default_rng(3)
+    shots = [result(np.stack([waveform(SURFACE + shift) for shift in SHIFTS + late])) for late in (0.0, 0.4, 1.1)]
+    for shot in shots:
+        shot["waveform_stderr"] = 1e-6 + 0 * shot["waveform"]
+        shot["waveform"] = shot["waveform"] + 1e-6 * np.abs(random.standard_normal(shot["waveform"].shape))
+    together = echo_table.extract(xr.concat(shots, "shot").assign_coords(shot=range(3)), targets=1)
+    for number, shot in enumerate(shots):
+        alone = echo_table.extract(shot, targets=1)
+        for name, values in alone.data_vars.items():
+            np.testing.assert_allclose(together[name].isel(shot=number), values, rtol=1e-9, err_msg=name)
+
+
 def test_attenuation_is_along_the_path_without_the_loss_by_distance():
     """K of exp(-2 K s), s the way in the water, behind 1/(n H + s)^2 at nadir."""
     way = np.maximum(TIME - SURFACE, 0) * PER_NS

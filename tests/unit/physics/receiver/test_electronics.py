@@ -44,6 +44,12 @@ def test_samples_see_each_charge_once_and_in_its_time(response, width):
     assert np.abs(others).max() < 1e-12
     every = low_pass.parts * low_pass.sampled(low_pass.divided(record), 3)
     np.testing.assert_array_equal(every, matrix[:, ::3])
+    # Records together are convolved as one of them alone, and shorter weights need fewer parts.
+    drawn = np.random.default_rng(1).random((3, record.shape[1] * low_pass.parts))
+    for lacking, weights in ((0, low_pass.weights), (1, low_pass.weights[1:])):
+        alone = [np.convolve(one[: one.size - lacking], weights, "valid") for one in drawn]
+        found = low_pass.sampled(drawn[:, : drawn.shape[1] - lacking], 2, weights)
+        np.testing.assert_allclose(found, np.array(alone)[:, low_pass.start :: 2 * low_pass.parts], rtol=1e-12)
 
 
 @each_row("width", [0.1, 1.0, 4.0])
@@ -126,10 +132,11 @@ def test_limits_of_the_amplifier(mean):
     assert found.saturation[0] == pytest.approx(norm.cdf(low) + norm.sf(high), abs=1e-12)
 
 
-@each_row("mean", [-2e-3, 0.0, 2e-3, 2e-2, 0.5])
-def test_logarithm_of_noise(mean):
-    # The quadrature against quantiles of the normal distribution.
-    stage = Readout(0.8, LogAmplifier(0.3, 1e-3), Digitiser(16, 1.2, -0.4))
+@each_row("mean", [-0.401, -2e-3, 0.0, 2e-3, 2e-2, 0.5, 0.798])
+@each_row("logarithm", [None, LogAmplifier(0.3, 1e-3)])
+def test_samples_of_noise(logarithm, mean):
+    # Closed forms, or the quadrature, against quantiles of the normal distribution.
+    stage = Readout(0.8, logarithm, Digitiser(16, 1.2, -0.4))
     sigma = 4e-3
     volts = mean + sigma * norm.ppf((np.arange(400_000) + 0.5) / 400_000)
     samples, saturated = stage.read(volts)
