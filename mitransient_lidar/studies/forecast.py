@@ -30,13 +30,12 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
     summarize_depths,
 )
 from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
-from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
+from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import readable_suffix
 from mitransient_lidar.core.maps.grids import read_geotiff, write_geotiff
 from mitransient_lidar.core.options import Option, checked
-from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.loading.exclusive import alone
@@ -52,30 +51,25 @@ from mitransient_lidar.results.files import Given
 from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.depth_bias import InstrumentName, OwnReceiver, Places, Records, SeaScene, SeaSeed
-from mitransient_lidar.studies.tpu import Estimator, HeightError, Pointing, PositionError
+from mitransient_lidar.studies.tpu import HeightError, Pointing, PositionError
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
 _COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
 
-#: Shallowest bottom of a table, and the deepest of its first part [m]; each further part is twice as deep.
-_SHALLOWEST, _FIRST = 0.5, 15.0
+#: Shallowest bottom of a table, and the deepest of its first part [m]; ratio of the deepest of further parts.
+_SHALLOWEST, _FIRST, _FURTHER = 0.5, 15.0, 1.6
 
 #: Largest error of a bottom that is found [m]; shares of found bottoms that count as none and as all.
-_RIGHT, _NONE, _ALL = 1.0, 0.02, 0.98
+_RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
 
-#: Farthest place on the sea from its origin along x and y [m].
-_FARTHEST = 200.0
+#: Farthest place on the sea from its origin along x and y [m]; estimator of depths, as that of flights.
+_FARTHEST, _ESTIMATOR = 200.0, "gaussian"
 
-#: Passes of light maps, as in flights, and relative standard error of renders below the reach of maps.
-_PASSES, _ERROR = 2, 0.05
-
-#: Depths of a range.
-_IN_RANGE = 200
+#: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
+_PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200
 
 #: Bands of the maps, and the order that stands for land.
 _BANDS, _LAND = ("found", "tvu", "thu", "order", "deepest"), -2
-
-_Water = Annotated[Any, Option("", form="NUMBER|FILE")]
 
 
 @dataclass(frozen=True)
@@ -140,13 +134,12 @@ def forecast(
     params: Mapping[str, Any] | None = None,
     *,
     secchi: Annotated[
-        _Water, Option("Secchi depth of the water, or a GeoTIFF of it", unit="m", form="NUMBER|FILE")
+        Any, Option("Secchi depth of the water, or a GeoTIFF of it", unit="m", form="NUMBER|FILE")
     ] = None,
-    kd: Annotated[_Water, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
+    kd: Annotated[Any, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
     values: Annotated[str | None, Option("Whether the map has heights or depths, by default as it states")] = None,
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
-    estimator: Estimator = "gaussian",
     corrections: Annotated[
         Given | None, Option("Table from depth-bias that corrects the depths, auto for the shipped one", form="FILE")
     ] = None,
@@ -201,7 +194,6 @@ def forecast(
     ratio of depth to Secchi depth.
     """
     read_instrument(instrument)
-    one_of("estimator", estimator, ESTIMATORS)
     if secchi is not None and kd is not None:
         raise UserError(f"secchi = {secchi} and kd = {kd} are alternatives: give one of them")
     given, name = (kd, "kd") if secchi is None else (secchi, "secchi")
@@ -216,15 +208,15 @@ def forecast(
     deep &= np.isfinite(water)
     if not deep.any():
         raise UserError(f"{name} = {given!r} must cover cells of the site that are deeper than {_SHALLOWEST} m")
-    waters = _nodes(*_ends(water[deep]), _WATERS)
-    low, high = _ends(place.depth[deep])
+    (low, high), ends = ((float(one.min()), float(one.max())) for one in (place.depth[deep], water[deep]))
+    waters = _nodes(*ends, _WATERS)
     table = None if corrections is None else corrections_for(instrument, corrections)
     tables: list[xr.Dataset] = []
     cases = Cases(waters.tolist(), "waters", unit="water", progress=progress)
     for one in cases:
-        given_water = {} if given is None else {name: one}
-        bottoms = _Bottoms(instrument, scene, {**(params or {}), **given_water}, receiver, shots, records, seed)
-        found = bottoms.table(low, high * (_WATERS if len(waters) > 1 else 1), estimator, table)
+        own = {**(params or {}), **({} if given is None else {name: one})}
+        bottoms = _Bottoms(instrument, scene, own, receiver, shots, records, seed)
+        found = bottoms.table(low, high * (_WATERS if len(waters) > 1 else 1), table)
         tables.append(cases.keep(sounding_uncertainty(found, TrajectoryErrors(pointing_mrad, position_m, height_m))))
         cases.step()
     dims = tuple(place.coords)
@@ -333,37 +325,35 @@ class _Bottoms:
         self._attributes: dict[str, Any] = {}
         self._pixels: list[str] = []
 
-    def table(self, low: float, high: float, estimator: str, corrections: xr.Dataset | None) -> xr.Dataset:
+    def table(self, low: float, high: float, corrections: xr.Dataset | None) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias` with the depths that a range needs [m]."""
         cells: dict[float, dict[str, Any]] = {}
-        top, deepest = low, min(high, _FIRST)
+        top, deepest = low, min(high, _FIRST, max(self._reach, low))
 
         def measure(depths: Sequence[float], sea: float) -> None:
             for depth, recorded in self._recorded(depths, sea):
-                cells[depth] = _measured(recorded, estimator, corrections)
+                cells[depth] = _measured(recorded, corrections)
 
         while True:
             measure([one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells], deepest)
-            if deepest >= high or _found(cells[max(cells)]) < _NONE:
+            if deepest >= high or (cells and _found(cells[max(cells)]) < _NONE):
                 break
-            top, deepest = deepest, min(high, 2 * deepest)
+            top, deepest = deepest, min(high, _FURTHER * deepest)
+        if not cells:
+            raise UserError(f"site must be deeper than its waves, which uncover the bottom at {high:.3g} m")
         depths = sorted(cells)
         for above, below in itertools.pairwise(depths):
             first, last = _found(cells[above]), _found(cells[below])
             if first > _NONE and last < min(_ALL, first):
                 between = _nodes(above, below, _FINE)[1:-1].tolist()
                 measure(between, next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below))
-        return self._labelled(dict(sorted(cells.items())), estimator)
+        return self._labelled(dict(sorted(cells.items())))
 
     def _recorded(self, depths: Sequence[float], deepest: float) -> list[tuple[float, xr.Dataset]]:
         """Return the records of bottoms at depths, in the sea of the deepest one of them [m]."""
-        found = []
-        for some in ([one for one in depths if one <= self._reach], *([one] for one in depths if one > self._reach)):
-            if not some:
-                continue
-            series = (
-                self._by_maps(some, min(deepest, self._reach)) if some[-1] <= self._reach else self._merged(some[0])
-            )
+        found, near = [], [one for one in depths if one <= self._reach]
+        for some in ([near] if near else []) + [[one] for one in depths if one > self._reach]:
+            series = self._by_maps(near, min(deepest, self._reach)) if some is near else self._merged(*some)
             series = series.isel(shot=np.isfinite(series["true_bottom_depth_below_surface"].values))
             recorded = detect_waveforms(series, self._receiver, self._records, self._seed)
             self._keep_settings(recorded)
@@ -376,10 +366,8 @@ class _Bottoms:
         """Keep gains and filters that were chosen for the first depths, among them the shallowest."""
         pixels = recorded["pixel"].values
         used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
-        rows = zip(pixels, *used, strict=True)
-        settings = {
-            self._receiver.number_of(str(pixel)): (float(gain), float(filter_)) for pixel, gain, filter_ in rows
-        }
+        numbers = [self._receiver.number_of(str(pixel)) for pixel in pixels]
+        settings = {number: (float(gain), float(other)) for number, gain, other in zip(numbers, *used, strict=True)}
         self._receiver = self._receiver.with_channel_settings(settings)
 
     def _by_maps(self, depths: Sequence[float], deepest: float) -> xr.Dataset:
@@ -419,7 +407,7 @@ class _Bottoms:
             describe_sea=False,
         )
 
-    def _labelled(self, cells: Mapping[float, Mapping[str, Any]], estimator: str) -> xr.Dataset:
+    def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias`."""
         first = next(iter(cells.values()))
         data: dict[str, Any] = {}
@@ -429,14 +417,14 @@ class _Bottoms:
         wind = float(self._attributes.get("scene.wind_speed") or 0)
         numbers = {"off_nadir_deg": float(self._attributes["off_nadir_deg"]), "wind_speed": wind}
         coords: dict[str, Any] = {key: [value] for key, value in numbers.items()}
-        coords |= {"water": [0], "depth": list(cells), "estimator": [estimator], "pixel": self._pixels}
+        coords |= {"water": [0], "depth": list(cells), "estimator": [_ESTIMATOR], "pixel": self._pixels}
         return xr.Dataset(data, coords, {**self._attributes, **numbers, "instrument": self._instrument})
 
 
-def _measured(recorded: xr.Dataset, estimator: str, corrections: xr.Dataset | None) -> dict[str, Any]:
+def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return numbers as of `depth_bias.depth_bias`, with bottoms alone that are right as found."""
     truth = recorded["true_bottom_depth_below_surface"].values
-    echoes = extract(recorded, [estimator], targets=1)
+    echoes = extract(recorded, [_ESTIMATOR], targets=1)
     if corrections is not None:
         echoes = correct_depths(echoes, corrections)
     numbers: dict[str, Any] = dict(summarize_depths(echoes, truth))
@@ -451,11 +439,6 @@ def _measured(recorded: xr.Dataset, estimator: str, corrections: xr.Dataset | No
 def _found(cell: Mapping[str, Any]) -> float:
     """Return the share of found bottoms in the best channel."""
     return float(np.max(cell["found"]))
-
-
-def _ends(values: FloatArray) -> tuple[float, float]:
-    """Return the least and the largest value."""
-    return float(values.min()), float(values.max())
 
 
 def _nodes(low: float, high: float, ratio: float) -> FloatArray:

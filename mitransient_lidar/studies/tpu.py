@@ -36,7 +36,6 @@ from mitransient_lidar.studies.depth_bias import (
 )
 
 #: Parameters of uncertainties.
-Estimator = Annotated[str, Option("Depth estimator, as for echoes")]
 Pointing = Annotated[float, Option("Standard deviation of the beam direction, each axis", 0)]
 PositionError = Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)]
 HeightError = Annotated[float, Option("Standard deviation of the sea surface height", 0)]
@@ -65,7 +64,7 @@ def tpu(
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
     infrared: Infrared = False,
-    estimator: Estimator = "gaussian",
+    estimator: Annotated[str, Option("Depth estimator, as for echoes")] = "gaussian",
     shots: Places = 12,
     records: Records = 4,
     corrections: Annotated[

@@ -26,7 +26,7 @@ def tables(monkeypatch):
             self.kd = {"kd": params.get("kd"), "secchi": params and 1.6 / params.get("secchi", 8.0)}
             self.kd = self.kd["kd"] or self.kd["secchi"]
 
-        def table(self, low, high, estimator, corrections):
+        def table(self, low, high, corrections):
             depth = np.append(np.arange(low, high, 0.1), high)
             dims = ("off_nadir_deg", "wind_speed", "water", "depth", "estimator", "pixel")
             errors = {"bias": 0.01 * depth, "spread": 0 * depth, "error": 0.01 * depth, "found": chance(depth, self.kd)}
@@ -34,7 +34,7 @@ def tables(monkeypatch):
             data |= {name: (dims[:4], np.zeros((1, 1, 1, depth.size))) for name in ("slope_along", "slope_across")}
             attributes = {"instrument": "it", "altitude": 150.0, "refractive_index": 1.34, "divergence_mrad": 2.0}
             coords = {"off_nadir_deg": [20.0], "wind_speed": [5.0], "water": [0], "depth": depth}
-            coords |= {"estimator": [estimator], "pixel": ["single"]}
+            coords |= {"estimator": ["gaussian"], "pixel": ["single"]}
             return xr.Dataset(data, coords, {**attributes, "off_nadir_deg": 20.0, "wind_speed": 5.0})
 
     monkeypatch.setattr(study, "_Bottoms", Bottoms)
@@ -114,7 +114,6 @@ def test_sentences_of_the_extremes(site, options, sentence, tables):
         ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
         ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
         ("1:3", {"kd": -1}, "kd"),
-        ("1:3", {"estimator": "best"}, "estimator"),
     ],
 )
 def test_refusals(site, options, message, tables):
