@@ -141,17 +141,14 @@ def _plot_range(found: xr.Dataset, path: drawing.FilePath | None) -> Figure:
     second.plot(found["depth"], found["tvu"], color="0.1")
     largest = float(np.nanmax(found["tvu"].values, initial=0.0))
     finish(second, xlabel="depth (m)", ylabel="TVU at 95 % (m)", ylim=(0, max(1.2 * largest, 0.6)))
-    for ax in (first, second):
-        ax.set_xlim(0, deepest)
+    first.set_xlim(*second.get_xlim())
     figure.suptitle(_forecast_title(found))
     return drawing.save(figure, path)
 
 
 def _forecast_title(found: xr.Dataset) -> str:
-    place = f"{found.attrs['altitude']:g} m, {found.attrs['off_nadir_deg']:g}° off nadir"
-    return (
-        f"{found.attrs['instrument']}, {place}, wind {found.attrs['wind_speed']:g} m/s {found.attrs['water']}".strip()
-    )
+    place = "{altitude:g} m, {off_nadir_deg:g}° off nadir, wind {wind_speed:g} m/s".format(**found.attrs)
+    return ", ".join(filter(None, (found.attrs["instrument"], place, found.attrs["water"])))
 
 
 def _draw_orders(ax: Axes, deepest: float) -> None:
