@@ -194,6 +194,8 @@ def forecast(
     ratio of depth to Secchi depth.
     """
     read_instrument(instrument)
+    if "bottom_depth" in (params or {}):
+        raise UserError("parameter bottom_depth follows from the site: leave it out")
     if secchi is not None and kd is not None:
         raise UserError(f"secchi = {secchi} and kd = {kd} are alternatives: give one of them")
     given, name = (kd, "kd") if secchi is None else (secchi, "secchi")

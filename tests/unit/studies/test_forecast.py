@@ -114,6 +114,7 @@ def test_sentences_of_the_extremes(site, options, sentence, tables):
         ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
         ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
         ("1:3", {"kd": -1}, "kd"),
+        ("1:3", {"params": {"bottom_depth": 2}}, "parameter bottom_depth follows from the site: leave it out"),
     ],
 )
 def test_refusals(site, options, message, tables):
