@@ -36,6 +36,7 @@ from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import readable_suffix
 from mitransient_lidar.core.maps.grids import read_geotiff, write_geotiff
 from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.loading.exclusive import alone
@@ -64,6 +65,9 @@ _RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
 
 #: Farthest place on the sea from its origin along x and y [m]; estimator of depths, as that of flights.
 _FARTHEST, _ESTIMATOR = 200.0, "gaussian"
+
+#: Wavelength of waters by name, which is that of the table of any green instrument [nm].
+_WAVELENGTH = 532.0
 
 #: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
 _PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200
@@ -193,7 +197,9 @@ def forecast(
     found, or to the deepest cell. Between waters, numbers are interpolated at the same product of depth and Kd, or
     ratio of depth to Secchi depth.
     """
-    read_instrument(instrument)
+    laser = next(float(one.value) for one in read_instrument(instrument).parameters if one.name == "wavelength_nm")
+    if not is_green(laser):
+        raise UserError(f"instrument = {instrument!r} has wavelength_nm = {laser:g}: forecasts are of green light")
     if "bottom_depth" in (params or {}):
         raise UserError("parameter bottom_depth follows from the site: leave it out")
     if secchi is not None and kd is not None:
@@ -216,7 +222,7 @@ def forecast(
     tables: list[xr.Dataset] = []
     cases = Cases(waters.tolist(), "waters", unit="water", progress=progress)
     for one in cases:
-        own = {**(params or {}), **({} if given is None else {name: one})}
+        own = {"wavelength_nm": _WAVELENGTH, **(params or {}), **({} if given is None else {name: one})}
         bottoms = _Bottoms(instrument, scene, own, receiver, shots, records, seed)
         found = bottoms.table(low, high * (_WATERS if len(waters) > 1 else 1), table)
         tables.append(cases.keep(sounding_uncertainty(found, TrajectoryErrors(pointing_mrad, position_m, height_m))))

@@ -122,6 +122,11 @@ def test_refusals(site, options, message, tables):
         forecast("riegl_vq840g", site, **options)
 
 
+def test_other_light_is_refused(tables):
+    with pytest.raises(UserError, match="has wavelength_nm = 1064: forecasts are of green light"):
+        forecast("riegl_vq880g2_infrared", "1:3")
+
+
 def test_maps_elsewhere_are_refused(tables, site, tmp_path):
     far = geotiff(tmp_path / "far.tif", [[0.1, 0.1], [0.1, 0.1]], corner=(600000.0, 6500000.0))
     with pytest.raises(UserError, match="must cover cells of the site that are deeper than"):
