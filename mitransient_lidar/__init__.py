@@ -84,6 +84,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
     from mitransient_lidar.studies.fit import fit
+    from mitransient_lidar.studies.forecast import forecast
     from mitransient_lidar.studies.fov_sweep import fov_sweep
     from mitransient_lidar.studies.scattering_orders import scattering_orders
     from mitransient_lidar.studies.tpu import tpu
@@ -104,6 +105,7 @@ _FUNCTIONS = {
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
+    "forecast": ("studies.forecast", "forecast"),
     "fov_sweep": ("studies.fov_sweep", "fov_sweep"),
     "instrument_names": ("loading.instruments", "instrument_names"),
     "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
@@ -144,6 +146,7 @@ __all__ = [
     "figures",
     "fit",
     "fly",
+    "forecast",
     "fov_sweep",
     "instrument_names",
     "kelvin_wake",

@@ -21,7 +21,7 @@ from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
 from mitransient_lidar.plots.passive import plot_passive
-from mitransient_lidar.plots.studies.depths import plot_depth_bias, plot_orders, plot_uncertainty
+from mitransient_lidar.plots.studies.depths import plot_depth_bias, plot_forecast, plot_orders, plot_uncertainty
 from mitransient_lidar.plots.studies.light import plot_fov_sweep, plot_scattering_orders
 from mitransient_lidar.plots.studies.parameters import plot_fit
 from mitransient_lidar.plots.studies.shots import plot_found_shots, plot_shot_statistics
@@ -163,6 +163,25 @@ def fitted():
     return WaveformFit(measured(data), lambda values: closed_form(values, pixels=("a", "b")), TRUTH).run()
 
 
+def forecast(is_map):
+    """Return a forecast of a slope with a strip of land and a hole, or of a range of depths."""
+    dims, depth = ("y", "x"), np.tile(np.linspace(-1.0, 8.0, 10), (4, 1))
+    coords = {"y": np.arange(4.0), "x": np.arange(10.0)}
+    depth[0, 5] = np.nan
+    if not is_map:
+        dims, depth = ("depth",), np.linspace(1.0, 8.0, 20)
+        coords = {"depth": depth}
+    found = np.where(depth >= 0.5, np.clip(3 - depth / 2.5, 0, 1), np.nan)
+    tvu = np.where(found >= 0.5, 0.15 + 0.02 * depth, np.nan)
+    order = np.where(np.isfinite(found), np.where(np.isfinite(tvu), 1.0, -1.0), np.nan)
+    maps = {"found": found, "tvu": tvu, "order": order, "deepest": np.where(np.isfinite(found), 6.25, np.nan)}
+    data = {name: (dims, values) for name, values in maps.items()}
+    data |= {"table_depth": (("water", "node"), [[1.0, 6.0]]), "table_found": (("water", "node"), [[1.0, 0.6]])}
+    data |= {"depth": (dims, depth)} if is_map else {}
+    attributes = {"instrument": "made", "altitude": 200.0, "off_nadir_deg": 20.0, "wind_speed": 5.0, "water": "kd 0.2"}
+    return xr.Dataset(data, coords, attributes)
+
+
 def fov_sweep():
     """Return attenuations in three fields of view, 200 m from the surface."""
     fields = np.array([2.0, 10.0, 50.0])
@@ -300,6 +319,8 @@ FIGURES = {
     "uncertainty": lambda: plot_uncertainty(uncertainty()),
     "uncertainty without echoes": lambda: plot_uncertainty(uncertainty().assign(tvu=lambda one: np.nan * one["tvu"])),
     "orders of surveys": lambda: plot_orders(uncertainty()),
+    "forecast of a map": lambda: plot_forecast(forecast(True)),
+    "forecast of a range": lambda: plot_forecast(forecast(False)),
     "depth bias": lambda: plot_depth_bias(depth_bias()),
     "found shots": lambda: plot_found_shots(found_shots()),
     "shots without waveforms": lambda: plot_found_shots(found_shots(waveforms=False)),

@@ -58,6 +58,7 @@ EXAMPLES = {
     "water": "jerlov 3C",
     "depth-bias": "riegl_vq840g --winds 0,3 --depths 3,6",
     "tpu": "riegl_vq840g --altitudes 100,150",
+    "forecast": "riegl_vq840g 1:12 --secchi 6 -D wind_speed=5",
     "figures": "fig09 fig13",
     "view": "output/table1.nc -o waveforms.png",
     "compare": "one/table1.nc other/table1.nc",

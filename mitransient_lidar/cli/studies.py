@@ -17,14 +17,22 @@ Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG fi
 
 
 def _study(
-    name: str, plot: str, describe: str, text: str, *, function: str = "", table: str = "", has_data: bool = True
+    name: str,
+    plot: str,
+    describe: str,
+    text: str,
+    *,
+    function: str = "",
+    table: str = "",
+    table_suffix: str = ".csv",
+    has_data: bool = True,
 ) -> Command:
     """Return the command for a study module and its function, which by default share their name.
 
     `plot` is the function in ``plots`` that draws the result, as ``module:name``; `describe` returns its lines; `table`
-    writes a CSV file.
+    writes another file, with the suffix `table_suffix`.
     """
-    suffixes = (".nc",) * has_data + (".csv",) * bool(table)
+    suffixes = (".nc",) * has_data + (table_suffix,) * bool(table)
 
     def body(call: Call, output: Figure = OUTPUT / f"{name}.png", quiet: Quiet = False) -> None:
         check_figure(output, *suffixes)
@@ -34,7 +42,7 @@ def _study(
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
-                function_at(f"studies.{name}:{table}")(found, output.with_suffix(".csv"))
+                function_at(f"studies.{name}:{table}")(found, output.with_suffix(table_suffix))
         typer.echo("\n".join(function_at(f"studies.{name}:{describe}")(found)))
         for one in getattr(found, "results", [found])[:1]:
             exit_if_interrupted(one)
@@ -184,6 +192,19 @@ STUDIES = {
 
         Each order is also separated by its vertical reversals: one, or several.
         """,
+    ),
+    "forecast": _study(
+        "forecast",
+        "studies.depths:plot_forecast",
+        "describe_forecast",
+        """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
+
+        Computes a table of bottoms under waves, recorded with the receiver's noise, and maps of the site: probability
+        that the bottom is found, TVU and THU at 95 %, IHO S-44 order, and deepest depth. Of a map it also writes a
+        GeoTIFF with these bands.
+        """,
+        table="write_maps",
+        table_suffix=".tif",
     ),
     "water": Command(
         "Study",

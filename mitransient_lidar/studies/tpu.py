@@ -35,6 +35,11 @@ from mitransient_lidar.studies.depth_bias import (
     rising,
 )
 
+#: Parameters of uncertainties.
+Pointing = Annotated[float, Option("Standard deviation of the beam direction, each axis", 0)]
+PositionError = Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)]
+HeightError = Annotated[float, Option("Standard deviation of the sea surface height", 0)]
+
 #: Wind whose ripples a level sea has [m/s].
 RIPPLES = 5.0
 
@@ -66,9 +71,9 @@ def tpu(
         Given | None,
         Option("Table from depth-bias that also corrects the depths, auto for the shipped one, or none", form="FILE"),
     ] = "auto",
-    pointing_mrad: Annotated[float, Option("Standard deviation of the beam direction, each axis", 0)] = 0.1,
-    position_m: Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)] = 0.05,
-    height_m: Annotated[float, Option("Standard deviation of the sea surface height", 0)] = 0.05,
+    pointing_mrad: Pointing = 0.1,
+    position_m: PositionError = 0.05,
+    height_m: HeightError = 0.05,
     max_time: SeaTime = None,
     seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,

@@ -26,7 +26,7 @@ OF_FILES = ("save", "view_points")
 GIVEN = {*DATASETS, "scene", "campaign", "flight", "instrument", "path", "name"}
 
 #: Values of parameters without a default.
-NEEDED = {"free": ["attenuation"], "fov_mrad": [5]}
+NEEDED = {"site": "1:3", "free": ["attenuation"], "fov_mrad": [5]}
 
 #: Those that take what the test gives by mistake, or need other things first.
 TAKEN = {("save", "dataset"), ("save", "path"), ("view", "gates"), ("depth_image", "gates"), ("fit", "instrument")}

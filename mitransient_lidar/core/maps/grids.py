@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import check_regular, read_text
+from mitransient_lidar.core.files import check_regular, read_text, replacing
 from mitransient_lidar.core.formats.array_files import LARGEST_ARRAY, Array, check_hdf5, check_size, damaged_file
 from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system, read_prj
 from mitransient_lidar.core.validation import FloatArray, integer, positive
@@ -196,6 +198,38 @@ def _raster(path: Path, file: Any, is_bag: bool) -> Grid:
         shift = _corner_shift(path, file.tags(ns="xml:BAG"), (columns, rows), cell)
         x, y = x + shift[0] * cell[0], y + shift[1] * cell[1]
     return Grid.of_cells(values, (x, y), cell, stated)
+
+
+def write_geotiff(
+    path: str | os.PathLike[str], bands: Mapping[str, FloatArray], x: FloatArray, y: FloatArray, wkt: str = ""
+) -> None:
+    """Write maps as the named bands of a GeoTIFF, in single precision with NaN for no data.
+
+    Parameters
+    ----------
+    path
+        The file.
+    bands
+        Values by name, shape (rows, columns) with increasing y and x.
+    x, y
+        Evenly spaced column and row positions in map coordinates, at least 2 each.
+    wkt
+        Coordinate system, empty if it is unknown.
+    """
+    import rasterio
+
+    cell = [(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (x, y)]
+    place = rasterio.Affine(cell[0], 0, x[0] - cell[0] / 2, 0, -cell[1], y[-1] + cell[1] / 2)
+    shape = {"width": len(x), "height": len(y), "count": len(bands)}
+    about = {"dtype": "float32", "nodata": np.nan, "transform": place, "crs": wkt or None, "compress": "deflate"}
+    with (
+        warnings.catch_warnings(action="ignore", category=rasterio.errors.NotGeoreferencedWarning),
+        replacing(path) as temporary,
+        rasterio.open(temporary, "w", driver="GTiff", **shape, **about) as file,
+    ):
+        for number, (name, values) in enumerate(bands.items(), 1):
+            file.write(np.asarray(values[::-1], np.float32), number)
+            file.set_band_description(number, name)
 
 
 def _corner_shift(

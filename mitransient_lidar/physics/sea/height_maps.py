@@ -118,9 +118,9 @@ def read_height_map(
         .asc, .tif or .bag file and for points; other positions are kept.
     values : {'heights', 'depths'}, optional
         Whether the values are positive up or down. Default: as the file states, or heights.
-    holes : {'refuse', 'fill'}
-        Whether cells without a finite value are refused, or filled with the value of the nearest cell that has one,
-        with a warning in the log.
+    holes : {'refuse', 'fill', 'keep'}
+        Whether cells without a finite value are refused, filled with the value of the nearest cell that has one, with a
+        warning in the log, or kept as NaN.
     cell : float, optional
         Cell of the grid on which scattered points are interpolated [m], positive. Default: the square root of the area
         of their convex hull divided by their number. Only for points; points on an even grid keep its cell by default.
@@ -145,7 +145,7 @@ def read_height_map(
     are holes. Points on an even grid, at a quarter of its places or more, are its cells, and other cells are holes.
     """
     path = Path(path)
-    if holes not in ("refuse", "fill"):
+    if holes not in ("refuse", "fill", "keep"):
         raise UserError(f"map_holes = {holes!r} must be refuse or fill")
     kind = readable_suffix(path, (*_READERS, *_POINTS), "height map")
     if cell is not None and kind not in _POINTS:
@@ -165,7 +165,7 @@ def read_height_map(
     place = "" if terrain.origin is None else "; x = y = 0 is its point ({:.10g}, {:.10g})".format(*terrain.origin)
     logger.info(
         "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m%s%s; %s",
-        *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), place),
+        *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], np.nanmin(heights), np.nanmax(heights), place),
         ", the centre" if place and origin is None else "",
         described(grid.stated, values, unit, 0 if filled is None else int(filled.sum())),
     )
@@ -224,6 +224,8 @@ def _without_holes(
             f"{path} has holes, {count} of {heights.size} heights, the first in row {row} and column {column} counted "
             "from 0 at the smallest y and x: every height must be finite, unless map_holes of a seabed is fill"
         )
+    if treatment == "keep":
+        return heights, empty
     from scipy.ndimage import distance_transform_edt
 
     nearest = distance_transform_edt(empty, sampling=spacing, return_distances=False, return_indices=True)

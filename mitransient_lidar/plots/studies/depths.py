@@ -100,6 +100,63 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     return drawing.save(figure, path)
 
 
+def plot_forecast(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw a result of `studies.forecast.forecast`: its maps, or of a range of depths the table against depth."""
+    if "y" not in found.dims:
+        return _plot_range(found, path)
+    names = {"found": "probability that the bottom is found", "tvu": "TVU at 95 % (m)", "order": "order of S-44"}
+    names["deepest"] = "deepest depth reached (m)"
+    x, y = (found[axis].values for axis in "xy")
+    tall = min(max(float(np.ptp(y) / np.ptp(x)), 0.4), 2.0)
+    figure = drawing.new_figure(path, 12.0, 10.0 * tall + 1.2)
+    for ax, (name, text) in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, names.items(), strict=True):
+        values, style = found[name].values, {"vmin": 0.0, "vmax": 1.0} if name == "found" else {}
+        wet = np.isfinite(found["found"].values)
+        if name == "order":
+            _draw_order_map(figure, ax, x, y, np.where(wet, values, np.nan))
+        elif np.isfinite(values).any():
+            figure.colorbar(ax.pcolormesh(x, y, values, cmap=palette.SEQUENCE, rasterized=True, **style), ax=ax)
+        land = np.where(found["depth"].values <= 0, 1.0, np.nan)
+        ax.pcolormesh(x, y, land, cmap=ListedColormap([palette.SAND[2][1]]), rasterized=True)
+        finish(ax, text, aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    figure.suptitle(_forecast_title(found))
+    return drawing.save(figure, path)
+
+
+def _draw_order_map(figure: Figure, ax: Axes, x: Any, y: Any, orders: Any) -> None:
+    """Draw the orders that cells meet, with their names."""
+    lost = len(_ORDER_COLOURS) - 1
+    norm = BoundaryNorm(np.arange(lost + 2) - 0.5, lost + 1)
+    shown = np.where(orders < 0, lost, orders)
+    bar = figure.colorbar(
+        ax.pcolormesh(x, y, shown, cmap=ListedColormap(_ORDER_COLOURS), norm=norm, rasterized=True),
+        ax=ax,
+        ticks=range(lost + 1),
+    )
+    bar.ax.set_yticklabels(_NAMES)
+
+
+def _plot_range(found: xr.Dataset, path: drawing.FilePath | None) -> Figure:
+    """Draw the probability that the bottom is found, and TVU, against depth."""
+    figure, (first, second), _, _ = new_panels(path, 2, (4.6, 3.6), (0.3, 0.4))
+    first.plot(found["depth"], found["found"], color="0.1")
+    first.plot(found["table_depth"].T, found["table_found"].T, "o", color="0.1", markersize=3)
+    finish(first, xlabel="depth (m)", ylabel="probability that the bottom is found", ylim=(0, 1.02))
+    deepest = float(found["depth"].max())
+    _draw_orders(second, deepest, named=True)
+    second.plot(found["depth"], found["tvu"], color="0.1")
+    largest = float(np.nanmax(found["tvu"].values, initial=0.0))
+    finish(second, xlabel="depth (m)", ylabel="TVU at 95 % (m)", ylim=(0, max(1.2 * largest, 0.6)))
+    first.set_xlim(*second.get_xlim())
+    figure.suptitle(_forecast_title(found))
+    return drawing.save(figure, path)
+
+
+def _forecast_title(found: xr.Dataset) -> str:
+    place = "{altitude:g} m, {off_nadir_deg:g}° off nadir, wind {wind_speed:g} m/s".format(**found.attrs)
+    return ", ".join(filter(None, (found.attrs["instrument"], place, found.attrs["water"])))
+
+
 def _draw_orders(ax: Axes, deepest: float, *, named: bool) -> None:
     """Draw the largest vertical uncertainty of each order, with its name on the right."""
     depth = np.linspace(0, 1.05 * deepest, 50)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -70,6 +69,8 @@ class ShotPoses:
     in_scene: Pose | None = None  #: Receiver poses in the scene; None where they follow from the locations.
     #: Times at which shots meet the waves [s], shape (shots,); None for the scene's time.
     times_s: FloatArray | None = None
+    #: Heights by which shots meet the solids raised [m], shape (shots,), over light maps; None for no height.
+    raised: FloatArray | None = None
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
@@ -102,7 +103,8 @@ class ShotPoses:
         transmitter = None if self.transmitter is None else self.transmitter.part(rows)
         in_scene = None if self.in_scene is None else self.in_scene.part(rows)
         times_s = None if self.times_s is None else self.times_s[rows]
-        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene, times_s)
+        raised = None if self.raised is None else self.raised[rows]
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene, times_s, raised)
 
     def repeated(self, copies: int) -> ShotPoses:
         """Return each shot several times in turn."""
@@ -127,7 +129,7 @@ class ShotPoses:
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))
         if self.turns is None:
-            return ScenePart(shapes, _vectors(positions - aim))
+            return ScenePart(shapes, _vectors(positions - aim, self.raised))
         turned = (self.turns[:, 0] + 1j * self.turns[:, 1]) * complex(*aim)
         by = positions - np.stack([turned.real, turned.imag], axis=-1)
         cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
@@ -161,10 +163,10 @@ def _rotations(turns: npt.NDArray[np.complex128]) -> FloatArray:
     return found
 
 
-def _vectors(horizontal: FloatArray) -> mi.Vector3f:
-    """Return horizontal vectors, shape (n, 2)."""
-    x, y = (aligned(mi.Float, column.astype(np.float32)) for column in horizontal.T)
-    return mi.Vector3f(x, y, dr.zeros(mi.Float, len(horizontal)))
+def _vectors(horizontal: FloatArray, down: FloatArray | None = None) -> mi.Vector3f:
+    """Return vectors with horizontal components, shape (n, 2), and a component down, shape (n,), by default 0."""
+    rows = *horizontal.T, np.zeros(len(horizontal)) if down is None else -down
+    return mi.Vector3f(*(aligned(mi.Float, row.astype(np.float32)) for row in rows))
 
 
 @dataclass(frozen=True)
@@ -253,6 +255,7 @@ class ShotBatches:
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
         self._seas = [SeaPatches(shape) for shape in waves]
+        self._known: dict[tuple[float, ...], tuple[FloatArray, FloatArray]] = {}
         self._going, self._fixed = (
             scene_of_shapes(shapes, lidar.groups) if shapes else None for shapes in (going, fixed)
         )
@@ -297,7 +300,7 @@ class ShotBatches:
     def _over_maps(self, renderer: LightMapRenderer, shots: ShotPoses) -> Callable[[int], PassRenderer]:
         """Return as `at` a renderer of light maps, which has heights of the sea instead of a mesh."""
         lidar, sea = renderer.scene, self._seas[0]
-        heights, corners = sea.heights(shots.places, shots.times_s)
+        heights, corners = self._heights(sea, shots)
         places = shots.places - self._frame_origin
         parts = [(scene, at) for scene, at in ((self._going, None), (self._fixed, places)) if scene is not None]
 
@@ -320,6 +323,17 @@ class ShotBatches:
             return renderer.over(placed, fields, copies)
 
         return renderer_of
+
+    def _heights(self, sea: SeaPatches, shots: ShotPoses) -> tuple[FloatArray, FloatArray]:
+        """Return the heights of the sea about shots, as of `SeaPatches.heights`, once where only solids differ."""
+        if shots.raised is None:
+            whole: tuple[FloatArray, FloatArray] = sea.heights(shots.places, shots.times_s)
+            return whole
+        wanted = [tuple(place) for place in shots.places.tolist()]
+        for place in {*wanted} - self._known.keys():
+            self._known[place] = sea.heights(np.array([place]))
+        heights, corners = zip(*(self._known[place] for place in wanted), strict=True)
+        return np.concatenate(heights), np.concatenate(corners)
 
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].

@@ -377,6 +377,14 @@ def reach_of_maps(scene: LidarScene, depth: float) -> float:
     return half - depth * float(np.hypot(below[0], below[1]) / below[2])
 
 
+def reach_of_scattering(scene: LidarScene) -> float:
+    """Return the depth to which light of a scene scatters rarely enough for light maps [m], at most 1 km."""
+    down = -float(refract_level(scene.receiver.pose.axis, scene.refractive_index)[2])
+    depths = np.linspace(0, 1e3, 10_001)
+    events = scene.required_water.column.optical_depth_of_scattering(depths) / down
+    return float(depths[np.searchsorted(events, _MOST_EVENTS) - 1])
+
+
 def _far_apart(depths: FloatArray) -> FloatArray:
     """Return a distance at which waves enhance no light [m]."""
     return np.full(depths.shape, _FAR)

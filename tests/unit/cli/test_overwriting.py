@@ -62,6 +62,11 @@ CASES = {
         ["d/riegl_vq840g_tpu.nc", "d/riegl_vq840g_150m_20deg_tvu.csv", "d/riegl_vq840g_150m_20deg_orders.png"],
         {"instrument": "other"},
     ),
+    "forecast": (
+        ["riegl_vq840g", "1:3", *WRONG, "-o", "d/f.png"],
+        ["d/f.png", "d/f.nc", "d/f.tif"],
+        {"instrument": "other"},
+    ),
     "bounds": (["table1", "--free", "bottom_depth", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc", "d/f.csv"], OTHER),
     "beam-spread": (["table1", "--depths", "2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
     "fov-sweep": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),

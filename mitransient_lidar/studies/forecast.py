@@ -1,0 +1,498 @@
+"""Forecast of a survey: where the bottom of a site is found, how well, and down to which depth."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.analysis.depth_uncertainty import (
+    LEAST_FOUND,
+    SURVEY_ORDERS,
+    TrajectoryErrors,
+    order_met,
+    sounding_uncertainty,
+)
+from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
+from mitransient_lidar.analysis.waveforms.depth_correction import (
+    AXES,
+    correct_depths,
+    corrections_for,
+    summarize_depths,
+)
+from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
+from mitransient_lidar.analysis.waveforms.echo_table import extract
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import checked_path
+from mitransient_lidar.core.formats.array_files import readable_suffix
+from mitransient_lidar.core.maps.grids import read_geotiff, write_geotiff
+from mitransient_lidar.core.options import Option, checked
+from mitransient_lidar.core.parameters.fields import is_green
+from mitransient_lidar.core.tables.written import table_lines
+from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
+from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
+from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.rendering.shots.scene import ShotScene
+from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
+from mitransient_lidar.results.files import Given
+from mitransient_lidar.results.variables import label
+from mitransient_lidar.studies.cases import Cases
+from mitransient_lidar.studies.depth_bias import InstrumentName, OwnReceiver, Places, Records, SeaScene, SeaSeed
+from mitransient_lidar.studies.tpu import HeightError, Pointing, PositionError
+
+#: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
+_COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
+
+#: Shallowest bottom of a table, and the deepest of its first part [m]; ratio of the deepest of further parts.
+_SHALLOWEST, _FIRST, _FURTHER = 0.5, 15.0, 1.6
+
+#: Largest error of a bottom that is found [m]; shares of found bottoms that count as none and as all.
+_RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
+
+#: Farthest place on the sea from its origin along x and y [m]; estimator of depths, as that of flights.
+_FARTHEST, _ESTIMATOR = 200.0, "gaussian"
+
+#: Wavelength of waters by name, which is that of the table of any green instrument [nm].
+_WAVELENGTH = 532.0
+
+#: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
+_PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200
+
+#: Bands of the maps, and the order that stands for land.
+_BANDS, _LAND = ("found", "tvu", "thu", "order", "deepest"), -2
+
+
+@dataclass(frozen=True)
+class _Site:
+    """Depths of a site [m], 0 or less on land, NaN without data, over dimensions with coordinates [m].
+
+    `terrain` is its map; None for a range of depths.
+    """
+
+    depth: FloatArray
+    coords: Mapping[str, FloatArray]
+    terrain: HeightMap | None = None
+
+    @classmethod
+    def of(cls, given: str | os.PathLike[str], values: str | None) -> _Site:
+        """Read a map, or a range of depths such as ``1:20``."""
+        low, colon, high = str(given).partition(":")
+        if colon and not Path(given).exists():
+            try:
+                first, last = positive("site", float(low)), positive("site", float(high))
+            except ValueError:
+                raise UserError(f"site = {given!r} must be a map, or a range of depths such as 1:20") from None
+            depths = np.linspace(min(first, last), max(first, last), _IN_RANGE)
+            return cls(depths, {"depth": depths})
+        terrain = read_height_map(checked_path("site", given), values=values, holes="keep")
+        return cls(-terrain.heights, {"y": terrain.y, "x": terrain.x}, terrain)
+
+    def water(self, name: str, given: Any) -> FloatArray:
+        """Return a number, or a GeoTIFF of it by its path, in the cells of the site; NaN outside that map."""
+        with contextlib.suppress(TypeError, ValueError):
+            given = float(given)
+        if isinstance(given, float):
+            return np.where(np.isfinite(self.depth), positive(name, given), np.nan)
+        terrain = self.terrain
+        if terrain is None or terrain.origin is None:
+            raise UserError(f"{name} = {given!r} must be a number, unless the site is a map in map coordinates")
+        path = checked_path(name, given)
+        readable_suffix(path, (".tif", ".tiff"), f"map of {name}")
+        grid = read_geotiff(path)
+        assert grid.centre is not None
+        system, other = terrain.system, grid.stated.system
+        if system is not None and other is not None and not system.distance_from(other, *terrain.origin) < 1:
+            raise UserError(f"{name} = {given!r} has coordinates in {other.name}, but the site in {system.name}")
+        from scipy.interpolate import RegularGridInterpolator
+
+        lines = [grid.positions[axis] + grid.centre[number] for number, axis in ((1, "y"), (0, "x"))]
+        of_map = RegularGridInterpolator(lines, grid.values, "nearest", bounds_error=False, fill_value=np.nan)
+        y, x = np.meshgrid(terrain.y + terrain.origin[1], terrain.x + terrain.origin[0], indexing="ij")
+        return np.where(np.isfinite(self.depth), of_map((y, x)), np.nan)
+
+
+@checked
+@alone
+def forecast(
+    instrument: InstrumentName,
+    site: Annotated[
+        str | os.PathLike[str],
+        Option(
+            "Map of heights or depths, such as a GeoTIFF, or a range of depths LOW:HIGH", form="SITE", is_argument=True
+        ),
+    ],
+    params: Mapping[str, Any] | None = None,
+    *,
+    secchi: Annotated[
+        Any, Option("Secchi depth of the water, or a GeoTIFF of it", unit="m", form="NUMBER|FILE")
+    ] = None,
+    kd: Annotated[Any, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
+    values: Annotated[str | None, Option("Whether the map has heights or depths, by default as it states")] = None,
+    scene: SeaScene = "table1",
+    receiver: OwnReceiver = None,
+    corrections: Annotated[
+        Given | None, Option("Table from depth-bias that corrects the depths, auto for the shipped one", form="FILE")
+    ] = None,
+    shots: Places = 24,
+    records: Records = 2,
+    pointing_mrad: Pointing = 0.1,
+    position_m: PositionError = 0.05,
+    height_m: HeightError = 0.05,
+    seed: SeaSeed = 1,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
+
+    Parameters
+    ----------
+    site
+        A map as of `physics.sea.height_maps.read_height_map`, whose cells without data stay so; or a range of depths.
+    params, scene
+        A scene with a flat bottom and the parameters ``bottom_depth`` and, unless the sea is level, ``wind_speed``;
+        waters are all of ``layered_water``. Altitude and angle from nadir are the instrument's unless they are given.
+    secchi, kd
+        Secchi depth [m] or Kd [1/m] instead of the water of `params`, at most one of them. Of a map, the table has
+        waters at ratios of at most 1.4.
+    corrections
+        As of `depth_correction.correct_depths`.
+    pointing_mrad, position_m, height_m
+        As for `tpu.tpu`.
+    progress
+        Called with a `passes.Progress` after every water.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``y`` and ``x`` of the map [m], or ``depth`` of the range: ``depth`` [m], negative on land; ``found``, the
+        probability that a pulse's best channel finds the bottom to within 1 m; ``tvu`` and ``thu`` [m] at 95 % with the
+        ``order`` that they meet, where at least half of the bottoms are found; and ``deepest``, the depth to which
+        these are found in the water of the cell [m], NaN if it lies below the table. All are NaN without data, above
+        0.5 m, and on land, where the order is -2; it is -1 where the bottom is lost. The table is in ``table_depth``,
+        ``table_found`` and ``table_tvu``, over ``water`` and ``node``.
+
+    Raises
+    ------
+    UserError
+        If the instrument, site, water or a parameter is invalid, both waters are given, or no cell is deep enough.
+
+    Notes
+    -----
+    Bottoms at depths of at most 1.25 times each other, 1.07 times where they get lost, lie under the same places of one
+    sea. Their light is looked up in maps (`transport.light_maps.renderer`), or below the reach of these merged, and
+    recorded and searched for echoes as in flights, whose gain is one for all depths. Depths go on until no bottom is
+    found, or to the deepest cell. Between waters, numbers are interpolated at the same product of depth and Kd, or
+    ratio of depth to Secchi depth.
+    """
+    laser = next(float(one.value) for one in read_instrument(instrument).parameters if one.name == "wavelength_nm")
+    if not is_green(laser):
+        raise UserError(f"instrument = {instrument!r} has wavelength_nm = {laser:g}: forecasts are of green light")
+    if "bottom_depth" in (params or {}):
+        raise UserError("parameter bottom_depth follows from the site: leave it out")
+    if secchi is not None and kd is not None:
+        raise UserError(f"secchi = {secchi} and kd = {kd} are alternatives: give one of them")
+    given, name = (kd, "kd") if secchi is None else (secchi, "secchi")
+    place = _Site.of(site, values)
+    deep = place.depth >= _SHALLOWEST
+    if not deep.any():
+        highest = float(np.nanmax(place.depth, initial=-np.inf))
+        raise UserError(
+            f"site = {str(site)!r} must be deeper than {_SHALLOWEST} m somewhere, but is {highest:.3g} m deep"
+        )
+    water = np.where(deep, 1.0, np.nan) if given is None else place.water(name, given)
+    deep &= np.isfinite(water)
+    if not deep.any():
+        raise UserError(f"{name} = {given!r} must cover cells of the site that are deeper than {_SHALLOWEST} m")
+    (low, high), ends = ((float(one.min()), float(one.max())) for one in (place.depth[deep], water[deep]))
+    waters = _nodes(*ends, _WATERS)
+    table = None if corrections is None else corrections_for(instrument, corrections)
+    tables: list[xr.Dataset] = []
+    cases = Cases(waters.tolist(), "waters", unit="water", progress=progress)
+    for one in cases:
+        own = {"wavelength_nm": _WAVELENGTH, **(params or {}), **({} if given is None else {name: one})}
+        bottoms = _Bottoms(instrument, scene, own, receiver, shots, records, seed)
+        found = bottoms.table(low, high * (_WATERS if len(waters) > 1 else 1), table)
+        tables.append(cases.keep(sounding_uncertainty(found, TrajectoryErrors(pointing_mrad, position_m, height_m))))
+        cases.step()
+    dims = tuple(place.coords)
+    maps = {key: (dims, values) for key, values in _maps(place.depth, water, deep, waters, tables, name).items()}
+    count = max(one.sizes["depth"] for one in tables)
+    for key in ("depth", "found", "tvu"):
+        rows = [np.pad(_row(one, key), (0, count - one.sizes["depth"]), constant_values=np.nan) for one in tables]
+        maps[f"table_{key}"] = ("water", "node"), np.array(rows)
+    if "depth" not in place.coords:
+        maps["depth"] = dims, place.depth
+    attributes = {
+        **{key: tables[0].attrs[key] for key in ("instrument", "altitude", "off_nadir_deg", "wind_speed")},
+        **{"pointing_mrad": pointing_mrad, "position_m": position_m, "height_m": height_m, "seed": seed},
+        **{"title": f"Forecast of {instrument}", "source": f"mitransient-lidar {__version__}", "site": str(site)},
+        **{"shots": shots, "records": records, "water": "" if given is None else f"{name} {given}"},
+    }
+    if place.terrain is not None and place.terrain.origin is not None:
+        attributes["map_origin"] = place.terrain.origin
+        attributes["map_system"] = getattr(place.terrain.system, "wkt", None) or ""
+    result = label(xr.Dataset(maps, {**place.coords, "water": waters}, attributes), "forecast")
+    flags = [_LAND, -1, *range(len(SURVEY_ORDERS) + 1)]
+    meanings = " ".join(["land", "lost", *(one.name for one in SURVEY_ORDERS), "none"])
+    result["order"].attrs |= {"flag_values": np.array(flags, float), "flag_meanings": meanings}
+    return result
+
+
+def write_maps(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write the maps of a result of `forecast` as bands of a GeoTIFF; none of a range of depths."""
+    if "map_origin" in found.attrs:
+        bands = {name: found[name].values for name in _BANDS}
+        x, y = (found[axis].values + start for axis, start in zip("xy", found.attrs["map_origin"], strict=True))
+        write_geotiff(path, bands, x, y, found.attrs["map_system"])
+
+
+def describe_forecast(found: xr.Dataset) -> list[str]:
+    """Return table lines for a result of `forecast`: shares of cells by the order that they meet, and a sentence.
+
+    Shares are of cells with data and water that are deeper than 0.5 m.
+    """
+    order, chance = found["order"].values, found["found"].values
+    depth, wet = found["depth"].values, np.isfinite(chance)
+    names = [*(one.name for one in SURVEY_ORDERS), "none"]
+    rows = [(f"order {name}", np.mean(order[wet] == number)) for number, name in enumerate(names)]
+    rows.append(("bottom lost", np.mean(order[wet] < 0)))
+    lines = table_lines([("cells", "<18"), ("share", ">7.1%")], rows)
+    dry, shallow = depth <= 0, (depth > 0) & (depth < _SHALLOWEST)
+    unknown = ~wet & ~dry & ~shallow
+    for text, cells in (("are land", dry), (f"are shallower than {_SHALLOWEST} m", shallow), ("have no data", unknown)):
+        if cells.any():
+            lines.append(f"{np.count_nonzero(cells)} of {depth.size} cells {text}")
+    return [*lines, _sentence(found)]
+
+
+def _sentence(found: xr.Dataset) -> str:
+    """Return what a forecast says in one sentence."""
+    order, chance, depth = (found[name].values for name in ("order", "found", "depth"))
+    wet = np.isfinite(chance)
+    what = "site" if "y" in found.dims else "range of depths"
+    seen = wet & (chance >= LEAST_FOUND)
+    if not seen.any():
+        return f"the bottom is found nowhere in the {what}"
+    lost = found["deepest"].values[wet & np.isfinite(found["deepest"].values)]
+    names = [one.name for one in SURVEY_ORDERS]
+    known = [np.mean((order[wet] >= 0) & (order[wet] <= number)) for number in range(len(names))]
+    usual = names.index("1a/1b")
+    if known[usual]:
+        text = f"{100 * known[usual]:.0f} % of the {what} meets order {names[usual]}"
+    elif known[-1]:
+        text = f"no part of the {what} meets order {names[usual]}, and {100 * known[-1]:.0f} % order {names[-1]}"
+    else:
+        text = f"no part of the {what} meets any order"
+    deepest = float(depth[seen].max())
+    if not (wet & ~seen).any():
+        return f"{text}; the bottom is found down to the deepest place, {deepest:.1f} m"
+    if not lost.size:
+        return f"{text}; the bottom is lost at some places, the deepest that is found is {deepest:.1f} m"
+    low, high = float(lost.min()), float(lost.max())
+    return f"{text}; beyond {low:.1f}{f' to {high:.1f}' if high - low > 0.1 else ''} m the bottom is lost"
+
+
+class _Bottoms:
+    """Bottoms under the same places of a sea, recorded and measured; parameters as of `forecast`."""
+
+    def __init__(
+        self,
+        instrument: str,
+        scene: str,
+        params: Mapping[str, Any],
+        receiver: str | None,
+        shots: int,
+        records: int,
+        seed: int,
+    ) -> None:
+        from mitransient_lidar.transport.light_maps.renderer import reach_of_scattering
+        from mitransient_lidar.transport.scene_parts import find_lidar_scene
+
+        self._instrument, self._scene, self._params = instrument, scene, params
+        self._records, self._seed = records, seed
+        self._places = np.random.default_rng(seed).uniform(-_FARTHEST, _FARTHEST, (shots, 2))
+        session = open_scene(scene, params, instrument)
+        lidar = find_lidar_scene(session.scene, session.sensor)
+        self._reach = reach_of_scattering(lidar)
+        receiver_of = xr.Dataset(attrs={"instrument": instrument})
+        self._receiver: ReceiverChannels = receiver_of_result(receiver_of, receiver)
+        self._sea: dict[float, Any] = {}
+        self._attributes: dict[str, Any] = {}
+        self._pixels: list[str] = []
+
+    def table(self, low: float, high: float, corrections: xr.Dataset | None) -> xr.Dataset:
+        """Return a table as of `depth_bias.depth_bias` with the depths that a range needs [m]."""
+        cells: dict[float, dict[str, Any]] = {}
+        top, deepest = low, min(high, _FIRST, max(self._reach, low))
+
+        def measure(depths: Sequence[float], sea: float) -> None:
+            for depth, recorded in self._recorded(depths, sea):
+                cells[depth] = _measured(recorded, corrections)
+
+        while True:
+            measure([one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells], deepest)
+            if deepest >= high or (cells and _found(cells[max(cells)]) < _NONE):
+                break
+            top, deepest = deepest, min(high, _FURTHER * deepest)
+        if not cells:
+            raise UserError(f"site must be deeper than its waves, which uncover the bottom at {high:.3g} m")
+        depths = sorted(cells)
+        for above, below in itertools.pairwise(depths):
+            first, last = _found(cells[above]), _found(cells[below])
+            if first > _NONE and last < min(_ALL, first):
+                between = _nodes(above, below, _FINE)[1:-1].tolist()
+                measure(between, next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below))
+        return self._labelled(dict(sorted(cells.items())))
+
+    def _recorded(self, depths: Sequence[float], deepest: float) -> list[tuple[float, xr.Dataset]]:
+        """Return the records of bottoms at depths, in the sea of the deepest one of them [m]."""
+        found, near = [], [one for one in depths if one <= self._reach]
+        for some in ([near] if near else []) + [[one] for one in depths if one > self._reach]:
+            series = self._by_maps(near, min(deepest, self._reach)) if some is near else self._merged(*some)
+            series = series.isel(shot=np.isfinite(series["true_bottom_depth_below_surface"].values))
+            recorded = detect_waveforms(series, self._receiver, self._records, self._seed)
+            self._keep_settings(recorded)
+            self._attributes, self._pixels = dict(recorded.attrs), [str(one) for one in recorded["pixel"].values]
+            of_depth = recorded["true_bottom_depth"].values
+            found += [(one, recorded.isel(shot=np.flatnonzero(np.isclose(of_depth, one)))) for one in some]
+        return [(depth, recorded) for depth, recorded in found if recorded.sizes["shot"]]
+
+    def _keep_settings(self, recorded: xr.Dataset) -> None:
+        """Keep gains and filters that were chosen for the first depths, among them the shallowest."""
+        pixels = recorded["pixel"].values
+        used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
+        numbers = [self._receiver.number_of(str(pixel)) for pixel in pixels]
+        settings = {number: (float(gain), float(other)) for number, gain, other in zip(numbers, *used, strict=True)}
+        self._receiver = self._receiver.with_channel_settings(settings)
+
+    def _by_maps(self, depths: Sequence[float], deepest: float) -> xr.Dataset:
+        """Return the light of bottoms at depths up to that of their scene [m], by light maps."""
+        from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotPoses
+
+        places = self._places
+        if deepest not in self._sea:
+            params = {**self._params, "bottom_depth": deepest}
+            loaded = ShotScene(
+                *(self._scene, params, places), instrument=self._instrument, light="maps", check=not self._sea
+            )
+            truth = truth_coordinates(sea_of(loaded.session.scene), loaded.lidar, ShotPoses(places))
+            self._sea[deepest] = loaded, loaded.batches(_PASSES, 1.0, None), truth
+        loaded, batches, truth = self._sea[deepest]
+        count = len(depths)
+        lying = np.tile(depths, len(places))
+        poses = ShotPoses(np.repeat(places, count, axis=0), raised=deepest - lying)
+        numbers = self._seed * 2**20 + np.arange(len(poses))
+        parts = [batches.render(poses.part(part), numbers[part].tolist()) for part in batches.parts(len(poses))]
+        attributes = loaded.attributes(used=batches.used_values, passes=_PASSES)
+        known = {name: np.repeat(values, count) for name, (_, values, _) in truth.items()}
+        below = lying + known["true_surface_height"]
+        known |= {"true_bottom_depth": lying, "true_bottom_depth_below_surface": np.where(below > 0, below, np.nan)}
+        series: xr.Dataset = loaded.dataset(ReceivedShots.joined(parts), attributes)
+        return series.assign_coords({name: ("shot", values) for name, values in known.items()})
+
+    def _merged(self, depth: float) -> xr.Dataset:
+        """Return the light of a bottom at a depth [m], merged."""
+        return render_shots(
+            self._scene,
+            {**self._params, "bottom_depth": depth},
+            positions=self._places,
+            instrument=self._instrument,
+            target_error=_ERROR,
+            first_seed=self._seed * 2**20,
+            describe_sea=False,
+        )
+
+    def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
+        """Return a table as of `depth_bias.depth_bias`."""
+        first = next(iter(cells.values()))
+        data: dict[str, Any] = {}
+        for name, value in first.items():
+            dims = (*AXES, "estimator", "pixel") if np.ndim(value) else AXES
+            data[name] = dims, np.array([cell[name] for cell in cells.values()])[np.newaxis, np.newaxis, np.newaxis]
+        wind = float(self._attributes.get("scene.wind_speed") or 0)
+        numbers = {"off_nadir_deg": float(self._attributes["off_nadir_deg"]), "wind_speed": wind}
+        coords: dict[str, Any] = {key: [value] for key, value in numbers.items()}
+        coords |= {"water": [0], "depth": list(cells), "estimator": [_ESTIMATOR], "pixel": self._pixels}
+        return xr.Dataset(data, coords, {**self._attributes, **numbers, "instrument": self._instrument})
+
+
+def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
+    """Return numbers as of `depth_bias.depth_bias`, with bottoms alone that are right as found."""
+    truth = recorded["true_bottom_depth_below_surface"].values
+    echoes = extract(recorded, [_ESTIMATOR], targets=1)
+    if corrections is not None:
+        echoes = correct_depths(echoes, corrections)
+    numbers: dict[str, Any] = dict(summarize_depths(echoes, truth))
+    bottom = echoes.sel(echo="bottom").transpose("shot", "pixel", "estimator")
+    right = np.abs(bottom["depth_m"].values - truth[:, np.newaxis, np.newaxis]) < _RIGHT
+    numbers["found"] = np.mean(right & has_echo(bottom["flags"].values), axis=0).T
+    for name in ("slope_along", "slope_across"):
+        numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
+    return numbers
+
+
+def _found(cell: Mapping[str, Any]) -> float:
+    """Return the share of found bottoms in the best channel."""
+    return float(np.max(cell["found"]))
+
+
+def _nodes(low: float, high: float, ratio: float) -> FloatArray:
+    """Return numbers from a low to a high one, at equal ratios of at most `ratio`."""
+    count = math.ceil(math.log(high / low) / math.log(ratio) - 1e-9) if high > low else 0
+    return np.geomspace(low, high, count + 1) if count else np.array([low])
+
+
+def _row(table: xr.Dataset, name: str) -> FloatArray:
+    """Return the numbers of a table over depth, corrected if they are."""
+    one = table[name].isel({dim: -1 for dim in table[name].dims if dim != "depth"})
+    return np.asarray(one.values, np.float64)
+
+
+def _deepest(depth: FloatArray, found: FloatArray) -> float:
+    """Return the depth [m] where the share of found bottoms falls for good below the least, NaN if it never does."""
+    seen = np.flatnonzero(found >= LEAST_FOUND)
+    if not seen.size or seen[-1] == depth.size - 1:
+        return math.nan
+    last = seen[-1]
+    return float(np.interp(-LEAST_FOUND, -found[last : last + 2], depth[last : last + 2]))
+
+
+def _maps(
+    depth: FloatArray, water: FloatArray, deep: Any, waters: FloatArray, tables: Sequence[xr.Dataset], name: str
+) -> dict[str, FloatArray]:
+    """Return the numbers of tables in the cells of a site that are deep enough, and the deepest depths."""
+    maps = {key: np.full(depth.shape, np.nan) for key in ("found", "tvu", "thu", "deepest")}
+    d, w = depth[deep], water[deep]
+    place = np.interp(np.log(w), np.log(waters), np.arange(len(waters))) if len(waters) > 1 else np.zeros(w.shape)
+    totals = {key: np.zeros(d.shape) for key in maps}
+    for number, (one, table) in enumerate(zip(waters, tables, strict=True)):
+        share = np.maximum(1 - np.abs(place - number), 0)
+        used = share > 0
+        ratio = {"kd": w / one, "secchi": one / w}.get(name, np.ones(w.shape))
+        nodes, found = table["depth"].values, _row(table, "found")
+        for key in ("found", "tvu", "thu"):
+            row = _row(table, key)
+            known = np.isfinite(row)
+            values = np.interp(d * ratio, nodes[known], row[known]) if known.any() else np.full(d.shape, np.nan)
+            totals[key][used] += (share * values)[used]
+        totals["deepest"][used] += (share * _deepest(nodes, found) / ratio)[used]
+    for key, values in totals.items():
+        maps[key][deep] = values
+    lost = ~(maps["found"] >= LEAST_FOUND)
+    maps["tvu"][lost] = maps["thu"][lost] = np.nan
+    order = order_met(depth, maps["tvu"], maps["thu"])
+    maps["order"] = np.where(deep, order, np.where(depth <= 0, _LAND, np.nan))
+    return maps
