@@ -117,7 +117,7 @@ def plot_forecast(found: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
         elif np.isfinite(values).any():
             figure.colorbar(ax.pcolormesh(x, y, values, cmap=palette.SEQUENCE, rasterized=True, **style), ax=ax)
         land = np.where(found["depth"].values <= 0, 1.0, np.nan)
-        ax.pcolormesh(x, y, land, cmap=ListedColormap([palette.SAND[2][1]]), rasterized=True)
+        ax.pcolormesh(x, y, land, cmap=ListedColormap([palette.ORANGE]), rasterized=True)
         finish(ax, text, aspect="equal", xlabel="x (m)", ylabel="y (m)")
     figure.suptitle(_forecast_title(found))
     return drawing.save(figure, path)
