@@ -64,7 +64,8 @@ def make_legible(figure: Figure, renderer: Any) -> None:
                 axis.set_tick_params(which="both", labelsize=least)
     for text in figure.findobj(Text):
         text.set_fontsize(max(float(text.get_fontsize()), least))
-    if layout := figure.get_layout_engine():
+    layout = figure.get_layout_engine()
+    if figure.axes and layout:
         layout.execute(figure)
     for ax in figure.axes:
         if (legend := ax.get_legend()) and _hides_data(ax, legend.get_window_extent(renderer)):
