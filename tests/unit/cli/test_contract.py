@@ -27,6 +27,7 @@ NEEDED = {
     "figures": [],
     "fit": ["RESULT", "--scene", "table1", "--free", "attenuation"],
     "fly": ["palmer"],
+    "forecast": ["riegl_vq840g", "3:10"],
     "gates": ["RESULT", "--start-ns", 1400, "--width-ns", 5],
     "passive": ["passive_sea"],
     "record": ["RESULT", "--receiver", "apd"],
@@ -43,6 +44,8 @@ OTHERS = {
     ("detect", "pd"): [1, 0.001],
     ("detect", "clutter"): [3],
     ("echoes", "contrast"): [-0.1, 1],
+    ("forecast", "secchi"): [0, -1],
+    ("forecast", "kd"): [0, "nan"],
     ("record", "background_power"): [-1],
 }
 #: Samples of texts by their forms, and what functions get.
@@ -51,6 +54,7 @@ FORMS = {
     "NAME,NAME,...": ("IB,1C", ["IB", "1C"]),
     "ALONG,ACROSS": ("0.1,0.2", (0.1, 0.2)),
     "NUMBER|auto": ("0.5", 0.5),
+    "NUMBER|FILE": ("a.tif", "a.tif"),
     "X,Y": ("3,-4", [(3.0, -4.0)]),
     "NAME": ("peak", ["peak"]),
     "NAME=VALUE": ("attenuation=2", {"attenuation": 2.0}),

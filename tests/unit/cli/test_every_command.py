@@ -18,7 +18,7 @@ WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots",)
 #: Those that take most time.
 SLOW = {"detect", "target-signal", "beam-spread", "fov-sweep", "passive"}
-SLOW |= {"echoes", "frames", "scattering-orders", "bounds", "figures"}
+SLOW |= {"echoes", "frames", "scattering-orders", "bounds", "figures", "forecast"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -43,6 +43,7 @@ OTHER_COMMANDS = {
     "info": [],
     "scenes": ["instruments", "teledyne_czmil"],
     "figures": ["fig06", "fig08"],
+    "forecast": ["riegl_vq840g", "2:3", "--shots", 2],
     "frames": ["gated_waves", "-D", "layout=2x2", "-D", "wind_speed=0", "--passes", 2, "--pass-share", 0.01],
     "passive": ["passive_sea", "-D", "layout=4x4", "-D", "surface_cell_size=2", "--passes", 2],
 }
@@ -158,7 +159,7 @@ def test_comparison_of_a_result_with_itself(result):
 @pytest.mark.parametrize("command", commands(OTHER_COMMANDS))
 def test_command_without_a_result(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    check(run(command, *OTHER_COMMANDS[command]), writes=command in ("figures", "frames", "passive"))
+    check(run(command, *OTHER_COMMANDS[command]), writes=command in ("figures", "forecast", "frames", "passive"))
 
 
 def test_every_command_is_run():
