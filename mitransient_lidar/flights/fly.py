@@ -61,7 +61,7 @@ def fly(
     light
         As of `rendering.shots.series.render_shots`; pulses near targets are merged.
     workers, scheduler
-        As for `campaigns.sweep.sweep`.
+        As for `campaigns.sweep.campaign`.
     shard_size
         Pulses of a shard, which one process renders and writes, 1 to 10^6; by default an eighth of them, but 512 to
         1024. The bits depend on it.
