@@ -27,16 +27,15 @@ _BOTH = 0.3  # delay from which the peak may be that of the surface or of the bo
 # Prior distributions: heights of land and depths of bottoms that are as likely as each other [m], and shares.
 _HIGHEST, _DEEPEST, _OF_LAND, _WITHOUT_BOTTOM = 20.0, 10.0, 0.5, 0.3
 _LEAST_COLUMN = 1e-5  # of a column of unknown water, relative to the peak
+_FASTEST, _WITH_DECAY = 10.0, 5  # largest decay of a column, over the typical one; parameters of a surface
 _LEVELS, _CLEAR = 64, 3.0  # tried levels of a column, and standard errors from which on its fit alone counts
 _SIGNIFICANT = 5.0  # standard errors of the height of a surface that is told apart
 _LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
 # Light that a bottom sends back to itself by total reflection at the surface: times between which it counts, over those
 # of the depth, and their steps; and the prior of the bottom's reflectance: mean, error, largest.
 _AGAIN, _STEPS, _REFLECTANCE = (1.34, 12.0), 12, (0.2, 0.15, 0.6)
-_OF_FOCUSING, _FAINT = (
-    0.3,
-    0.05,
-)  # error of a column by waves, relative to it, and where it counts, relative to the peak
+# Errors of samples over waves, and of those of a column, which are below a share of the peak.
+_OF_WAVES, _OF_FOCUSING, _FAINT = 0.1, 0.3, 0.05
 _FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the largest
 
 
@@ -96,15 +95,15 @@ class Priors:
     onset: ColumnOnset
     opaque: bool
 
-    def column(self, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def column(self, delay_ns: FloatArray, decay: FloatArray | float) -> tuple[FloatArray, FloatArray]:
         """Return the signal of a column at delays from the surface, over that at the surface, and its derivative."""
         times, factors = self.onset.times, self.onset.factors
         slopes = np.append(np.diff(factors) / np.diff(times), 0.0)
         behind = np.maximum(delay_ns, 0)
-        fall = np.exp(-self.decay * behind)
+        fall = np.exp(-decay * behind)
         factor = np.interp(behind, times, factors)
         slope = slopes[np.clip(np.searchsorted(times, behind, side="right") - 1, 0, len(slopes) - 1)]
-        return fall * factor, np.where(delay_ns > 0, fall * (slope - self.decay * factor), 0.0)
+        return fall * factor, np.where(delay_ns > 0, fall * (slope - decay * factor), 0.0)
 
 
 def first_echoes(
@@ -133,10 +132,11 @@ def first_echoes(
     -----
     All possibilities consist of the known pulse P, blurred by a Gaussian of free width for what slopes do, and of its
     integral for a column of constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
-    on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and the echo A' P(t - t1) of
-    its surface; heights are not negative. It is followed by its light that is totally reflected at the surface and
-    meets the bottom again: of a Lambertian bottom of the reflectance rho, 2 rho d^2/u^3 per time at u > 1.34 d behind
-    it (below a level surface, later passages left out). Samples have their noise and the error of the pulse's shape.
+    on, which decays at a rate of up to ten times the typical one. A bottom at t1 + d is A P(t - t1 - d), a column from
+    t1 to t1 + d, and the echo A' P(t - t1) of its surface; heights are not negative. It is followed by its light
+    that is totally reflected at the surface and meets the bottom again: of a Lambertian bottom of the reflectance rho,
+    2 rho d^2/u^3 per time at u > 1.34 d behind it (below a level surface, later passages left out). Samples have their
+    noise and the error of the pulse's shape; over waves of 10 %.
 
     The probabilities are those of Bayes' theorem with these prior distributions: land and water are as likely; heights
     of land are uniform up to 20 m above the surface, depths of bottoms up to 10 m; the surface has the normal
@@ -170,6 +170,8 @@ def first_echoes(
     log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
     log_sea += _log_normal(arrival + sea.values[:, 0], level.time_ns, spread)
     log_sea += _log_column(sea, priors.least_column, fits.peak)
+    decay_error = np.where(_error(sea, 4) > 0, _error(sea, 4), np.inf)
+    log_sea += np.log(np.minimum(np.sqrt(2 * np.pi) * decay_error / (_FASTEST * priors.decay), 1.0))
 
     tried: list[WindowFits] = []
     for delay in delays:
@@ -220,8 +222,8 @@ class _Fits:
     """Fits of the possibilities to samples; times count from the arrival of an ideal echo with its peak at the bin.
 
     Parameters are the time [ns] and the variance of the blur [ns^2] of bottom or land, its height, and the heights of
-    the surface's echo and of the column, and perhaps the delay [ns]; or of a surface, its height, and the height of the
-    column.
+    the surface's echo and of the column, and perhaps the delay [ns]; or of a surface, its height, the height of the
+    column and its decay [1/ns].
     """
 
     data: Windows
@@ -246,8 +248,8 @@ class _Fits:
         data = Windows.of(records, bins, width, 0.0, span, shape)
         peak = data.peak()
         # Focusing of a single shot differs from the mean.
-        faint = (data.power < _FAINT * peak[:, np.newaxis]) & (priors.onset.times.size > 1)
-        share = np.where(faint, _OF_FOCUSING, _OF_SAMPLE)
+        faint, waves = data.power < _FAINT * peak[:, np.newaxis], priors.onset.times.size > 1
+        share = np.where(faint, _OF_FOCUSING, _OF_WAVES) if waves else _OF_SAMPLE
         error = np.hypot(share * np.maximum(data.power, 0), _OF_PEAK * peak[:, np.newaxis])
         return cls(replace(data, noise=np.hypot(data.noise, error)), peak, pulse, longest, priors)
 
@@ -273,7 +275,7 @@ class _Fits:
                 none = np.zeros_like(echo)
                 return height * echo, np.stack([-height * slope, height * by_blur, echo, none, none, none], axis=1)
             begins, ends = pulse.plain(u - time + apart), pulse.plain(u - time)
-            fall, falls = self.priors.column(u - time + apart)
+            fall, falls = self.priors.column(u - time + apart, self.priors.decay)
             inside = (begins[2] - ends[2]) / area
             lit = fall * inside
             by_delay = top * begins[1] + column * (fall * begins[0] / area + falls * inside)
@@ -301,16 +303,17 @@ class _Fits:
         blur = np.full(self.peak.shape, _FIRST_BLUR * self.pulse.variances[-1])
 
         def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-            time, blur, height, column = (p[:, i : i + 1] for i in range(4))
+            time, blur, height, column, decay = (p[:, i : i + 1] for i in range(5))
             echo, slope, by_blur = pulse.blurred(u - time, blur)
             power, _, inside = pulse.plain(u - time)
-            fall, falls = self.priors.column(u - time)
+            fall, falls = self.priors.column(u - time, decay)
             lit = fall * inside / area
             by_time = -height * slope - column * (fall * power + falls * inside) / area
-            return height * echo + column * lit, np.stack([by_time, height * by_blur, echo, lit], axis=1)
+            by_decay = -column * np.maximum(u - time, 0) * lit
+            return height * echo + column * lit, np.stack([by_time, height * by_blur, echo, lit, by_decay], axis=1)
 
-        first = np.stack([none, blur, self.peak, 0.01 * self.peak], axis=1)
-        return self._fit(model, first, none, np.full(4, np.inf))
+        first = np.stack([none, blur, self.peak, 0.01 * self.peak, self.priors.decay + none], axis=1)
+        return self._fit(model, first, none, np.array([np.inf] * 4 + [_FASTEST * self.priors.decay]))
 
     def _fit(
         self,
@@ -331,6 +334,8 @@ class _Fits:
         unit[:, 1] = highest[:, 1]
         unit[:, 5:6] = 1.0
         unit[:, 2:5] = np.where(self.peak > 0, self.peak, 1.0)[:, np.newaxis]
+        if size == _WITH_DECAY:
+            unit[:, 4] = self.priors.decay
         every = np.ones(len(start), dtype=bool)
         data = replace(self.data, rate=rate[:, np.newaxis], known=known)
         return fit_windows(model, start, data, self.peak, every, limits=Limits(lowest, highest, unit))

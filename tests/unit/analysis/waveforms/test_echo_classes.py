@@ -41,21 +41,21 @@ def land(height, reflectance=0.2, blur=0.0):
     return pulse(SURFACE - 2 / C * height, UNIT * reflectance, np.hypot(SIGMA, blur))
 
 
-def water(depth, glint=0.0, reflectance=0.2, level=0.0):
+def water(depth, glint=0.0, reflectance=0.2, level=0.0, attenuation=K, backscattering=BB):
     """Power of a surface with a height [m], a column and a bottom at a depth below it [m].
 
     The glint is relative to a bottom of no depth. Light of the bottom that the surface reflects totally meets it again:
     cos^2 of its angle is uniform up to 1 - 1/n^2.
     """
-    surface, rate = SURFACE - 2 / C * level, C / N * K
+    surface, rate = SURFACE - 2 / C * level, C / N * attenuation
     delay = 2 * N * depth / C
 
     def onset(at):
         return exponnorm.pdf(TIME, 1 / (rate * SIGMA), loc=at, scale=SIGMA) / rate
 
-    column = UNIT * np.pi * BB / (2 * np.pi) * C0 / (2 * N) * 0.96
+    column = UNIT * np.pi * backscattering / (2 * np.pi) * C0 / (2 * N) * 0.96
     column = column * np.maximum(onset(surface) - np.exp(-rate * delay) * onset(surface + delay), 0)
-    first = UNIT * reflectance * 0.96 / N**2 * np.exp(-2 * K * depth)
+    first = UNIT * reflectance * 0.96 / N**2 * np.exp(-2 * attenuation * depth)
     total = 1 - 1 / N**2
     cosines = np.sqrt(total * (np.arange(400) + 0.5) / 400)
     again = sum(pulse(surface + delay * (1 + 1 / one), first * reflectance * total / 400) for one in cosines)
@@ -101,6 +101,14 @@ def test_land_and_shallow_water_are_what_they_are():
     assert np.isin(bottom[4:], [EchoClass.BOTTOM, EchoClass.MERGED]).all()
     np.testing.assert_allclose(depth[:4], -heights, atol=0.01)
     assert (np.abs(depth[4:] - depths) < 3 * error[4:]).all()
+
+
+def test_turbid_water_without_a_visible_bottom_has_none():
+    """Its column, which decays within a few echo widths, was a bottom 1 m deep with a probability of 1."""
+    kinds = [(k, b, glint) for k, b in ((0.4, 0.02), (0.7, 0.04), (1.2, 0.06)) for glint in (0.0, 0.02, 0.2)]
+    powers = [water(20, glint, attenuation=k, backscattering=b) for k, b, glint in kinds]
+    (_, bottom), _, _ = found(recorded(powers, 7))
+    assert (bottom == EchoClass.NONE).all()
 
 
 @pytest.mark.slow
