@@ -170,7 +170,8 @@ class TransientHistogram:
             return
         perturbed = self.perturbations.channels(energy, sums)
         finite = valid & dr.isfinite(sum(perturbed, mi.Float(0)))
-        dr.scatter(self._invalid, mi.UInt32(1), index + opaque_index(self._each), active & ~finite)
+        marked = index + opaque_index(self._each)
+        dr.scatter_reduce(dr.ReduceOp.Or, self._invalid, mi.UInt32(1), marked, active & ~finite)
         for channel, change in enumerate(perturbed, 1):
             self._add_share(index + channel * opaque_index(self._each), change, active & finite)
 

@@ -21,6 +21,7 @@ UNITLESS = {
     *("runs", "pixel", "confidence", "Jerlov type", "shot", "petzold", "% per %", "relative"),
     *("waveform, relative to its peak", "difference\n(standard errors)", "difference\n(standard deviations)"),
     *("scattering angle", "run", "share of records with a bottom echo", "relative error of the median bin"),
+    "probability that the bottom is found",
 }
 
 
