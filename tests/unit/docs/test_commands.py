@@ -13,7 +13,8 @@ from rows import each_row
 from mitransient_lidar.loading import catalogue
 
 ROOT = Path(__file__).parents[3]
-PAGES = [ROOT / "README.md", ROOT / "docs" / "start.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "docs" / "start.md", *sorted((ROOT / "docs").glob("guide/*.md"))]
+PAGES += sorted((ROOT / "docs").glob("accuracy/*.md"))
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -45,7 +46,7 @@ def parameters(scene: str) -> set[str]:
     return set(catalogue.scene_parameters(catalogue.example_files().get(scene, scene), by_id=True))
 
 
-@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: f"{page.parent.name}/{page.stem}")
 def test_commands_options_and_parameters_exist(page: Path) -> None:
     for arguments in commands(page):
         text = " ".join(arguments)
@@ -59,7 +60,7 @@ def test_commands_options_and_parameters_exist(page: Path) -> None:
             assert not unknown, f"{text}: {unknown}"
 
 
-@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: f"{page.parent.name}/{page.stem}")
 def test_files_that_commands_read_are_shipped_or_written(page: Path) -> None:
     made: set[str] = set()
     for arguments in commands(page):
