@@ -217,11 +217,16 @@ class BlurredPulse:
         """Integral of the shape [ns]."""
         return float(self.integral[0, -1])
 
-    def plain(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return shape, derivative and integral of the template at times [ns]."""
+    def plain(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return shape and integral of the template at times [ns]."""
         at = self.start_ns + self.step_ns * np.arange(self.power.shape[1])
-        power, slope = (np.interp(time_ns, at, one[0], left=0, right=0) for one in (self.power, self.slope))
-        return power, slope, np.interp(time_ns, at + 0.5 * self.step_ns, self.integral[0], left=0)
+        power = np.interp(time_ns, at, self.power[0], left=0, right=0)
+        return power, np.interp(time_ns, at + 0.5 * self.step_ns, self.integral[0], left=0)
+
+    def plain_slope(self, time_ns: FloatArray) -> FloatArray:
+        """Return the derivative of the template at times [1/ns]."""
+        at = self.start_ns + self.step_ns * np.arange(self.power.shape[1])
+        return np.asarray(np.interp(time_ns, at, self.slope[0], left=0, right=0))
 
     def blurred(self, time_ns: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return shape, its derivative by time [1/ns] and by the variance [1/ns^2], at variances, shape (n, 1)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ _FARTHEST = 4.0  # standard deviations of the surface from its level to the long
 _BEFORE, _BEHIND = 2.0, 3.0  # samples before the earliest surface and behind the peak, in echo widths
 _COLUMN_NS = 10.0  # of the column behind a surface that count [ns]
 _OF_SAMPLE, _OF_PEAK = 0.01, 1e-3  # errors of the pulse's shape, relative to the sample and to the peak
+_AT_ONCE = 2**17  # samples that are fitted at once, for speed
 _BOTH = 0.3  # delay from which the peak may be that of the surface or of the bottom, in echo widths
 # Prior distributions: heights of land and depths of bottoms that are as likely as each other [m], and shares.
 _HIGHEST, _DEEPEST, _OF_LAND, _WITHOUT_BOTTOM = 20.0, 10.0, 0.5, 0.3
@@ -173,13 +175,7 @@ def first_echoes(
     decay_error = np.where(_error(sea, 4) > 0, _error(sea, 4), np.inf)
     log_sea += np.log(np.minimum(np.sqrt(2 * np.pi) * decay_error / (_FASTEST * priors.decay), 1.0))
 
-    tried: list[WindowFits] = []
-    for delay in delays:
-        found = fits.bottom(zero, delay)
-        if (delay > _BOTH * width).any():
-            other = fits.bottom(delay, delay)
-            found = found.replaced(other.cost < found.cost, other)
-        tried.append(found)
+    tried = fits.bottoms(delays)
     bottom_ns = arrival + np.stack([one.values[:, 0] for one in tried])
     surface_ns = bottom_ns - delays
     prior = np.log((1 - _OF_LAND) * (1 - _WITHOUT_BOTTOM) * priors.depth_per_ns / _DEEPEST)
@@ -253,6 +249,27 @@ class _Fits:
         error = np.hypot(share * np.maximum(data.power, 0), _OF_PEAK * peak[:, np.newaxis])
         return cls(replace(data, noise=np.hypot(data.noise, error)), peak, pulse, longest, priors)
 
+    def _part(self, rows: IntArray) -> _Fits:
+        """Return the fits of some of the records, with repetitions."""
+        data = self.data
+        of_rows = {name: getattr(data, name)[rows] for name in ("power", "noise", "usable", "rate")}
+        return replace(self, data=replace(data, **of_rows), peak=self.peak[rows], longest=self.longest[rows])
+
+    def bottoms(self, delays: FloatArray) -> list[WindowFits]:
+        """Fit bottoms that follow a surface by delays, shape (m, n), with the peak as that of one or of the other."""
+        found: list[WindowFits] = []
+        for some in np.array_split(delays, min(math.ceil(delays.size * self.data.u.size / _AT_ONCE), len(delays))):
+            delay = some.ravel()
+            rows = np.tile(np.arange(len(self.peak)), len(some))
+            fits = self._part(rows).bottom(0 * delay, delay)
+            both = np.flatnonzero(delay > _BOTH * self.data.width)
+            other = self._part(rows[both]).bottom(delay[both], delay[both])
+            better = other.cost < fits.cost[both]
+            for name, values in vars(fits).items():
+                values[both[better]] = getattr(other, name)[better]
+            found += map(WindowFits, *(np.split(values, len(some)) for values in vars(fits).values()))
+        return found
+
     def bottom(
         self, time: FloatArray, delay: FloatArray, *, surface: bool = True, start: FloatArray | None = None
     ) -> WindowFits:
@@ -276,14 +293,14 @@ class _Fits:
                 return height * echo, np.stack([-height * slope, height * by_blur, echo, none, none, none], axis=1)
             begins, ends = pulse.plain(u - time + apart), pulse.plain(u - time)
             fall, falls = self.priors.column(u - time + apart, self.priors.decay)
-            inside = (begins[2] - ends[2]) / area
+            inside = (begins[1] - ends[1]) / area
             lit = fall * inside
-            by_delay = top * begins[1] + column * (fall * begins[0] / area + falls * inside)
+            by_delay = top * pulse.plain_slope(u - time + apart) + column * (fall * begins[0] / area + falls * inside)
             by_time = -height * slope - by_delay + column * fall * ends[0] / area
             second, falling, stretched = (np.zeros_like(echo) for _ in range(3))
             per_delay = 1 / np.maximum(apart, _SHORTEST_NS)
             for edge, rise in zip(edges, rises, strict=True):
-                power, _, passed = pulse.plain(u - time - edge * apart)
+                power, passed = pulse.plain(u - time - edge * apart)
                 second += rise * per_delay * passed
                 falling += rise * per_delay * power
                 stretched += rise * per_delay * (edge * power + passed * per_delay)
@@ -305,7 +322,7 @@ class _Fits:
         def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
             time, blur, height, column, decay = (p[:, i : i + 1] for i in range(5))
             echo, slope, by_blur = pulse.blurred(u - time, blur)
-            power, _, inside = pulse.plain(u - time)
+            power, inside = pulse.plain(u - time)
             fall, falls = self.priors.column(u - time, decay)
             lit = fall * inside / area
             by_time = -height * slope - column * (fall * power + falls * inside) / area
