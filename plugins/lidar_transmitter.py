@@ -16,6 +16,7 @@ from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 
+@register("emitter", LIDAR_TRANSMITTER)
 class LidarTransmitter(EmitterWithoutExtent):
     r"""Pulsed laser transmitter (``lidar_transmitter``).
 
@@ -135,6 +136,3 @@ def _profile(props: DeclaredProperties, kind: str) -> BeamProfile:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
     rotation = float(np.deg2rad(read("ellipse_deg")))
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
-
-
-register("emitter", LIDAR_TRANSMITTER, LidarTransmitter)

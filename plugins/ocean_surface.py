@@ -27,6 +27,7 @@ WAITS = "_waits"
 _BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
 
 
+@register("shape", OCEAN_SURFACE)
 class OceanSurface(mi.Mesh):
     r"""Sea surface with waves of wind and swell, or from a height map (``ocean_surface``).
 
@@ -309,6 +310,3 @@ class SeaPatches:
         else:
             self.shapes.parameters_changed([])
         return positions
-
-
-register("shape", OCEAN_SURFACE, OceanSurface)
