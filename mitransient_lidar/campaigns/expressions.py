@@ -45,6 +45,8 @@ class Expression:
     It may contain numbers, names, ``+ - * / **``, parentheses, and the functions ``sqrt``, ``exp``, ``log``, ``sin``,
     ``cos``, ``tan`` (of radians), ``min`` and ``max`` (of two arguments).
 
+    Raises UserError if it contains anything else.
+
     Parameters
     ----------
     name
@@ -56,11 +58,6 @@ class Expression:
     ----------
     names
         Names of the quantities that it needs.
-
-    Raises
-    ------
-    UserError
-        If it contains anything else.
     """
 
     def __init__(self, name: str, text: str) -> None:

@@ -113,10 +113,7 @@ class RunRenderer(Renderer):
     def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
         """Return the renderer for a new campaign with its run columns, with a record that contains all runs.
 
-        Raises
-        ------
-        UserError
-            If the scene cannot be loaded, or lacks a parameter that the campaign sets.
+        Raises UserError if the scene cannot be loaded, or lacks a parameter that the campaign sets.
         """
         source = source_of(campaign)
         _check_parameters(campaign, columns, source.document())

@@ -139,6 +139,8 @@ def render_in_process(
     A run in which the process ends twice has failed. Runs that meet an error of the program or hang stay planned, and
     so do all where the process ends three times before the first run.
 
+    Raises UserError if the store cannot be read or written, or the process has other versions than it must have.
+
     Parameters
     ----------
     path
@@ -151,11 +153,6 @@ def render_in_process(
         Called with the numbers of runs done and failed after each run.
     processes
         Processes that the new one belongs to.
-
-    Raises
-    ------
-    UserError
-        If the store cannot be read or written, or the process has other versions than it must have.
     """
     processes = processes or Processes()
     reasons: dict[int, str] = {}

@@ -168,15 +168,11 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
 def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     """Return the points of all echoes, in coordinates of the scene.
 
-    Returns
-    -------
-    xarray.Dataset
-        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
-        ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
-        ``class_probability``; and the truth: ``true_z`` [m], the mean
-        height of the surface in the beam or, for points below it, that of the highest solid at x and y;
-        ``true_target``, whether that solid is a target; and of the pulse ``true_surface_height``,
-        ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
+    Returns points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
+    ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
+    ``class_probability``; and the truth: ``true_z`` [m], the mean height of the surface in the beam or, for points
+    below it, that of the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
+    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
     """
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
@@ -209,10 +205,7 @@ def read_points(path: Path) -> xr.Dataset:
     Those of a store are as of `points_of`. Those of a file have ``x``, ``y``, ``z`` [m], ``kind`` and, if the file has
     it, ``vertical_uncertainty`` [m].
 
-    Raises
-    ------
-    UserError
-        If nothing of these is there, or it has no points.
+    Raises UserError if nothing of these is there, or it has no points.
     """
     if path.is_dir():
         flown = Flown.of(Store(path / "flight.zarr" if (path / "flight.zarr").is_dir() else path))

@@ -33,10 +33,8 @@ class PoseErrors(Plan):
         Roll turns about the horizontal part of `forward`, shape (3,) or (shots, 3), pitch about the horizontal
         direction across it, heading about the vertical. With equal errors of roll and pitch any direction will do.
 
-        Raises
-        ------
-        UserError
-            If `forward` is vertical, of another shape, or missing where roll and pitch have different errors.
+        Raises UserError if `forward` is vertical, of another shape, or missing where roll and pitch have different
+        errors.
         """
         if forward is None:
             if self.roll_deg != self.pitch_deg:

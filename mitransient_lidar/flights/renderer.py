@@ -89,11 +89,8 @@ class FlightRenderer(Renderer):
         That is what poses are beyond the corrections, and by a sample of pulses the time that the flight takes and how
         many pulses saturate. `progress` is called with a `Progress` of the groups, and of the sample.
 
-        Raises
-        ------
-        UserError
-            If the flight, its scene or its corrections are invalid, the bottom does not cover it, or its echo is
-            outside the record.
+        Raises UserError if the flight, its scene or its corrections are invalid, the bottom does not cover it, or its
+        echo is outside the record.
         """
         poses = plan.poses()
         tell_time_system(plan.time_system(poses.time_s), poses.time_s)
@@ -321,10 +318,7 @@ class FlightRenderer(Renderer):
 def scene_of(plan: FlightPlan) -> SceneSource:
     """Return the source of the scene of a flight, with its instrument.
 
-    Raises
-    ------
-    UserError
-        If it cannot be read, or lacks a parameter.
+    Raises UserError if it cannot be read, or lacks a parameter.
     """
     source = read_source(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
     for name in POSE_PARAMETERS:

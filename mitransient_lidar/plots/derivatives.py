@@ -27,17 +27,14 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the band
     over several pixels is an upper bound, the sum of their errors.
 
+    Raises UserError if the result has no derivatives.
+
     Parameters
     ----------
     dataset : xarray.Dataset
         A result of `rendering.render.render` with derivatives, for one shot.
     path : path, optional
         File to write.
-
-    Raises
-    ------
-    UserError
-        If the result has no derivatives.
     """
     name = "waveform_derivative"
     if name not in dataset or "shot" in dataset[name].dims:

@@ -18,10 +18,7 @@ def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series from
     `rendering.shots.series.render_shots`.
 
-    Raises
-    ------
-    UserError
-        If the shots have no truth.
+    Raises UserError if the shots have no truth.
     """
     figure = drawing.new_figure(path, 9.6, 9.0)
     shown = [(one, one.truth) for one in estimates(found) if one.truth is not None]

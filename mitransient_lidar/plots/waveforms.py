@@ -71,17 +71,14 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
 
     For a shot series, it is their mean.
 
+    Raises UserError if the result's light was not separated.
+
     Parameters
     ----------
     dataset : xarray.Dataset
         A result of `rendering.render.render`, or a shot series, with components.
     path : path, optional
         File to write.
-
-    Raises
-    ------
-    UserError
-        If the result's light was not separated.
     """
     name = "waveform_by_origin"
     if name not in dataset:

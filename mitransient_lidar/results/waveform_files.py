@@ -135,11 +135,8 @@ def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any
     Several channels are pixels of the shots that each of them has, whose number is that of the first channel. They are
     drawn side by side (``angle_x``, ``angle_y``), since files do not have their angles. Shorter waveforms end in NaN.
 
-    Raises
-    ------
-    UserError
-        As in `waveform_chunks`, and if the waveforms take too much memory, their spacing differs, or channels do not
-        have the same pulses.
+    Raises UserError as in `waveform_chunks`, and if the waveforms take too much memory, their spacing differs, or
+    channels do not have the same pulses.
     """
     parts: dict[str, list[xr.Dataset]] = {}
     size, widths = 0, set[float]()

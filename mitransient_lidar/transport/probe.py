@@ -316,17 +316,14 @@ def _quantiles(
 def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> FloatArray:
     """Return where axes, refracted by a level sea, first meet a bottom (`WaterScene.bottoms`).
 
+    Returns points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
+
     Parameters
     ----------
     scene
         The scene.
     origins, axes
         Points in its frame from which the axes start [m], and their directions, shape (n, 3), or (3,) of all axes.
-
-    Returns
-    -------
-    ndarray
-        Points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
     """
     sea, bottoms = scene.level_sea, scene.bottoms
     if not bottoms or np.any(axes[..., 2] >= 0):

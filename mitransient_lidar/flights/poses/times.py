@@ -37,6 +37,8 @@ def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = 
     Times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times. Smaller ones are of a week in
     an SBET file, up to a day after its end, and of the flight in a text file. Other platforms begin with their flight.
 
+    Raises UserError if the times may be Unix times.
+
     Parameters
     ----------
     time_s
@@ -45,11 +47,6 @@ def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = 
         File of the trajectory, None for other platforms.
     is_sbet
         Whether that is an SBET file.
-
-    Raises
-    ------
-    UserError
-        If the times may be Unix times.
     """
     latest = float(np.max(time_s))
     if file is None:

@@ -49,11 +49,8 @@ def read_text_records(path: str | os.PathLike[str]) -> PlatformPoses:
     ``#HEADER: "t", "x", ...`` or in a first line without numbers; ``#TIME_COLUMN: 0`` names the column of the time by
     its index from 0. Unlike HELIOS++, which sorts records, this function refuses times that go back.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, a column or its unit is unknown, a column is missing, or a line does not hold one
-        finite number for each column at a time later than the time of the line before.
+    Raises UserError if the file cannot be read, a column or its unit is unknown, a column is missing, or a line does
+    not hold one finite number for each column at a time later than the time of the line before.
     """
     path = Path(path)
     head = {}
@@ -96,6 +93,10 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
     angular rates. The true heading is the platform heading less the wander angle; yaw is counted from grid north, from
     which true north differs by the meridian convergence.
 
+    Raises UserError if the file cannot be read or has more than 1 GiB; its size is no multiple of 136 bytes; a record
+    is not finite, not on the Earth, or not later than the one before; or the coordinate system is unknown, has no
+    metres, or has another scale there.
+
     Parameters
     ----------
     path
@@ -104,13 +105,6 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
         EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east and y north on the
         grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM 0.9996 to
         1.001, which may differ from 1 by 1 %.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read or has more than 1 GiB; its size is no multiple of 136 bytes; a record is not finite,
-        not on the Earth, or not later than the one before; or the coordinate system is unknown, has no metres, or has
-        another scale there.
     """
     import pyproj
 

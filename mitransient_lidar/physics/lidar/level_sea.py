@@ -46,6 +46,8 @@ class LevelSea:
     def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
         """Return where rays from points in the air meet a height, in the air or in the water.
 
+        Returns x, y [m], shape (..., 2); NaN for rays that do not go down.
+
         Parameters
         ----------
         origin
@@ -54,11 +56,6 @@ class LevelSea:
             Ray directions in the air, of any length, shape (..., 3).
         z
             Heights [m], below the origin, shape (...).
-
-        Returns
-        -------
-        ndarray
-            x, y [m], shape (..., 2); NaN for rays that do not go down.
         """
         rays = finite_array("directions", directions)
         level = np.broadcast_to(finite_array("z", z), rays.shape[:-1])
@@ -73,17 +70,14 @@ class LevelSea:
 
         Lines to points in the air are prolonged straight to the sea level.
 
+        Returns x, y [m], shape (..., 2); NaN for points in the air that are not below the origin.
+
         Parameters
         ----------
         origin
             Point in the air, x, y, z [m].
         points
             Points x, y, z [m], shape (..., 3).
-
-        Returns
-        -------
-        ndarray
-            x, y [m], shape (..., 2); NaN for points in the air that are not below the origin.
         """
         points = finite_array("points", points)
         offset, height = points[..., :2] - origin[:2], float(origin[2])
@@ -186,18 +180,15 @@ def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
 def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt.ArrayLike, n: float) -> FloatArray:
     """Solid angle in water per receiver area, at a point on the refracted ray.
 
+    Returns d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential
+    distances S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
+
     Parameters
     ----------
     height, depth : array_like
         Receiver height and point depth [m].
     theta, n
         Ray angle in air [rad], and water refractive index.
-
-    Returns
-    -------
-    ndarray
-        d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential distances
-        S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
     """
     h, d = np.asarray(height, dtype=np.float64), np.asarray(depth, dtype=np.float64)
     air, water = np.cos(finite_array("theta", theta)), np.cos(snell(theta, n))

@@ -141,23 +141,17 @@ WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": math.sqrt(2 * math.log
 def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     """Read a beam's divergence from one of its three parameters.
 
+    Returns the full angle [rad] between the points where the irradiance has fallen to e^-1/2 of its peak; None if no
+    parameter is given.
+
+    Raises UserError if the value is out of range.
+
     Parameters
     ----------
     read
         Reader of the plugin parameters.
     is_top_hat
         Whether the irradiance is even up to the beam's edge instead of Gaussian.
-
-    Returns
-    -------
-    float or None
-        Full angle [rad] between the points where the irradiance has fallen to e^-1/2 of its peak; None if no parameter
-        is given.
-
-    Raises
-    ------
-    UserError
-        If the value is out of range.
 
     Notes
     -----

@@ -79,17 +79,14 @@ class Pulse:
     def from_file(cls, path: str | PathLike[str]) -> Pulse:
         """Read a sampled pulse from a text file.
 
+        Raises UserError if the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
+
         Parameters
         ----------
         path : path-like
             File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may be
             called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
             to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
-
-        Raises
-        ------
-        UserError
-            If the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
         """
         times, power = read_time_samples(path, _POWER)
         lowest = power.min(initial=0.0)
@@ -128,6 +125,8 @@ class Pulse:
     def kernel(self, bin_width_ns: float, response_time_ns: float = 0.0) -> tuple[int, FloatArray]:
         """Discrete impulse response of pulse and receiver for ideal echo histograms.
 
+        Raises UserError if a number is out of range, or pulse and response have more than 10 million bins.
+
         Parameters
         ----------
         bin_width_ns : float
@@ -142,11 +141,6 @@ class Pulse:
         weights : ndarray, shape (M,)
             weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are
             exact integrals over the bins with the sum 1, truncated where less than 1e-10 lies outside.
-
-        Raises
-        ------
-        UserError
-            If a number is out of range, or pulse and response have more than 10 million bins.
         """
         dt = positive("bin_width_ns", bin_width_ns)
         tau = non_negative("response_time_ns", response_time_ns)

@@ -159,10 +159,7 @@ class LinearDetector(SignalTail):
     def with_gain(self, factor: float) -> LinearDetector:
         """Return a photomultiplier at another voltage: its gain times a factor, the same for each dynode.
 
-        Raises
-        ------
-        UserError
-            If a dynode's gain would not be above 1.
+        Raises UserError if a dynode's gain would not be above 1.
         """
         each = positive("gain", factor) ** (1 / len(self.dynode_gains))
         gains = [each * gain for gain in self.dynode_gains]

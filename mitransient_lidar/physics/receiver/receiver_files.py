@@ -104,6 +104,9 @@ class Channel:
 class ReceiverChannels:
     """Receivers for all channels.
 
+    Raises UserError if the channels differ in the amplifier response, the logarithm, the converter or the jitter, which
+    the record has in common.
+
     Attributes
     ----------
     default
@@ -114,12 +117,6 @@ class ReceiverChannels:
         Pulse repetition rate [kHz], or None.
     name
         Name of the preset, instrument, or file.
-
-    Raises
-    ------
-    UserError
-        If the channels differ in the amplifier response, the logarithm, the converter or the jitter, which the record
-        has in common.
     """
 
     default: Channel
@@ -251,10 +248,7 @@ def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
 
     Files that it names are in `folder`.
 
-    Raises
-    ------
-    UserError
-        If a key is unknown, a parameter is out of range, or the stages do not fit together.
+    Raises UserError if a key is unknown, a parameter is out of range, or the stages do not fit together.
     """
     return waveform_receiver(_parsed(text, name, folder))
 

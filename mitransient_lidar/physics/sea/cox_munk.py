@@ -65,15 +65,12 @@ class GramCharlierSeries:
     def of_clean_sea(cls, wind_speed: float) -> GramCharlierSeries:
         """Return the series for a clean sea.
 
+        Raises UserError if the wind speed is out of range.
+
         Parameters
         ----------
         wind_speed
             Wind speed [m/s], 1 to 14.
-
-        Raises
-        ------
-        UserError
-            If the wind speed is out of range.
 
         Notes
         -----

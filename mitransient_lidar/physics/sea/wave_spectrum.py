@@ -64,17 +64,14 @@ class WaveSpectrum(ABC):
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances of the waves in a periodic patch.
 
+        Returns psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
+
         Parameters
         ----------
         ix, iy : ndarray of int, shapes (I,) and (J,)
             Numbers of wave periods along x and y over the patch.
         dk : float
             Wavenumber spacing [rad/m]: 2 pi divided by the patch side.
-
-        Returns
-        -------
-        ndarray, shape (J, I)
-            Psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
         """
 
     @property
@@ -154,15 +151,12 @@ class CosineSpectrum(WaveSpectrum):
 class SeaState:
     """Sum of independent wave systems, each with its own travel direction.
 
+    Raises UserError if there is no component, or one is not a spectrum.
+
     Parameters
     ----------
     components : tuple of WaveSpectrum
         At least one. The first determines `direction` and thus the axes of the slope variances.
-
-    Raises
-    ------
-    UserError
-        If there is no component, or one is not a spectrum.
     """
 
     components: tuple[WaveSpectrum, ...]

@@ -26,22 +26,16 @@ _PIERSON_MOSKOWITZ_BETA = 0.74
 def inverse_wave_age(wind_speed: float, fetch: float) -> float:
     """Inverse wave age of a fetch-limited sea.
 
+    Returns omega = U/c_p: 0.84 for a long fetch, 5 at most.
+
+    Raises UserError if the fetch is so short that Omega exceeds 5.
+
     Parameters
     ----------
     wind_speed : float
         Wind speed at 10 m [m/s], 0 to 30.
     fetch : float
         Distance from the upwind shore [m], positive.
-
-    Returns
-    -------
-    float
-        Omega = U/c_p: 0.84 for a long fetch, 5 at most.
-
-    Raises
-    ------
-    UserError
-        If the fetch is so short that Omega exceeds 5.
 
     Notes
     -----

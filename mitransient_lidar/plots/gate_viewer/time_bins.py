@@ -22,16 +22,13 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
     and its ``long_name`` belongs to the variable shown.
 
+    Raises UserError if it has another shape, no angles of the pixels, or attributes or times that are invalid.
+
     Parameters
     ----------
     dataset : xarray.Dataset
         A result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
         ``shot`` if it has shots.
-
-    Raises
-    ------
-    UserError
-        If it has another shape, no angles of the pixels, or attributes or times that are invalid.
     """
     name = next(name for name in RECORDS if name in dataset)
     dims = record_dims(dataset, name, shots=True)
