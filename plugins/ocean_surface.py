@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
+from mitransient_lidar.physics.sea.sea_mesh import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
 from mitransient_lidar.plugins.bases import FOAM, DeclaredProperties, fill_mesh, register

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
-from mitransient_lidar.core.formats.toml_files import parse_toml, table
+from mitransient_lidar.core.formats.documents import parse_toml, table
 from mitransient_lidar.core.options import BackgroundPower, Option, positive_option
 from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown

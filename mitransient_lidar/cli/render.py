@@ -66,7 +66,7 @@ def _render(
 #: Functions that draw a result, by their file name endings.
 _DRAWINGS = {
     "_components": "plots.waveforms:plot_components",
-    "_derivatives": "plots.derivatives:plot_derivatives",
+    "_derivatives": "plots.waveforms:plot_derivatives",
     "_layout": "plots.layout:plot_layout",
     "": "plots.waveforms:plot_waveforms",
 }
@@ -171,7 +171,7 @@ def _shots(
     from mitransient_lidar.plots.studies.shots import plot_shot_statistics
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.shots import series as study
-    from mitransient_lidar.studies import shot_statistics as statistics
+    from mitransient_lidar.studies import shots as statistics
 
     if places is not None:
         given = {**given, "positions": study.read_places(places)}

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.formats.toml_files import check_keys, required, table
+from mitransient_lidar.core.formats.documents import check_keys, required, table
 from mitransient_lidar.core.options import Option, declared, documented_parameters, parts
 from mitransient_lidar.core.validation import finite_array, shown
 

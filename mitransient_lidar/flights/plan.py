@@ -16,7 +16,7 @@ import numpy as np
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.formats.toml_files import parse_toml
+from mitransient_lidar.core.formats.documents import parse_toml
 from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system
 from mitransient_lidar.core.options import Option, positive_option
 from mitransient_lidar.core.plans import Plan, one_of
@@ -188,7 +188,7 @@ class FlightPlan(Plan):
         return pulse_poses(trajectory, self.mounting, Scanner.of_table(self.scanner), times)
 
     def time_system(self, times: FloatArray) -> str:
-        """Return the system of the times [s] of the pulses, as of `times.time_system`."""
+        """Return the system of the times [s] of the pulses, as of `records.time_system`."""
         return self._platform.time_system(times)
 
     @cached_property

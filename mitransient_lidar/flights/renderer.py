@@ -24,7 +24,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.poses.times import tell_time_system
+from mitransient_lidar.flights.poses.records import tell_time_system
 from mitransient_lidar.flights.preparation import (
     axis_of,
     input_columns,

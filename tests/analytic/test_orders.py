@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar.studies.scattering_orders import scattering_orders
+from mitransient_lidar.studies.light_classes import scattering_orders
 from mitransient_lidar.transport.paths.path_classes import PathClasses
 
 PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}

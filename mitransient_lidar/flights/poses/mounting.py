@@ -12,7 +12,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.options import Option
 from mitransient_lidar.core.plans import Plan
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.poses.attitude import rotation_matrices
+from mitransient_lidar.flights.poses.records import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -26,7 +26,7 @@ class Mounting(Plan):
     """Position and attitude of a scanner on its platform.
 
     Angles are those from the axes of the platform, with the signs and the order ``aerospace`` of
-    `attitude.rotation_matrices`.
+    `records.rotation_matrices`.
     """
 
     roll_deg: Annotated[float, Option("Roll, which turns the nadir of the scanner to the left", unit="deg")] = 0.0

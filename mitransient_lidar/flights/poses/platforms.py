@@ -14,9 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, positive_option
 from mitransient_lidar.core.plans import Plan, of_kind
 from mitransient_lidar.core.validation import FloatArray, finite_array
-from mitransient_lidar.flights.poses.attitude import RotationSpec
-from mitransient_lidar.flights.poses.records import PlatformPoses
-from mitransient_lidar.flights.poses.times import TimeSystem, time_system
+from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, TimeSystem, time_system
 from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory
 from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
 

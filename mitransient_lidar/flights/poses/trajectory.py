@@ -12,8 +12,7 @@ from scipy.interpolate import CubicSpline
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
-from mitransient_lidar.flights.poses.attitude import RotationSpec, rotation_matrices
-from mitransient_lidar.flights.poses.records import PlatformPoses, check_records
+from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, check_records, rotation_matrices
 
 #: Interpolation between records.
 Interpolation = Literal["linear", "cubic"]
@@ -57,7 +56,7 @@ class Trajectory(PlatformPoses):
     time_s, position, roll_deg, pitch_deg, yaw_deg
         The records, 2 or more at strictly increasing times.
     rotation_spec
-        Order of the rotations, as in `attitude.rotation_matrices`.
+        Order of the rotations, as in `records.rotation_matrices`.
     interpolation
         ``linear``, or ``cubic`` for records of a motion that is smooth.
     lines

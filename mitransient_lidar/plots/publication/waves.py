@@ -14,9 +14,9 @@ from mitransient_lidar.physics.lidar.level_sea import refract
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
 from mitransient_lidar.plots.studies.shots import draw_sea
-from mitransient_lidar.studies.find_shots import render_found_shots
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.scenes import SHOTS, System, shot_places, three_shots
+from mitransient_lidar.studies.shots import render_found_shots
 
 _STYLES = ("-", "--", ":")
 

@@ -16,8 +16,7 @@ from matplotlib.patheffects import withStroke
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish
 from mitransient_lidar.rendering.shots.truth import Shot
-from mitransient_lidar.studies.find_shots import RenderedShots
-from mitransient_lidar.studies.shot_statistics import depth_bias, slope_correlations, slope_effects
+from mitransient_lidar.studies.shots import RenderedShots, depth_bias, slope_correlations, slope_effects
 
 #: Share of a pixel's peak that counts as an echo.
 _FAINT = 5e-3
@@ -26,7 +25,7 @@ _FAINT = 5e-3
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
     """Draw the sea with the footprints of beam and pixels at each shot, and the shots' waveforms.
 
-    `rendered` is a result of `studies.find_shots.render_found_shots`.
+    `rendered` is a result of `studies.shots.render_found_shots`.
     """
     columns = min(2, len(rendered.results))
     rows = -(-len(rendered.results) // columns) if columns else 1
@@ -124,7 +123,7 @@ _LABELS = {
 def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the strength, the times and the depths of echoes against the slopes that the beam meets.
 
-    `shots` is a result of `studies.shot_statistics.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
+    `shots` is a result of `studies.shots.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
     """
     figure = drawing.new_figure(path, 9.6, 7.0)
     effects, correlations = slope_effects(shots), slope_correlations(shots)

@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.studies.shot_statistics import highest_of
+from mitransient_lidar.studies.shots import highest_of
 
 #: Shares of an echo's height between which its rise is measured.
 _FIRST, _LAST = 0.1, 0.9

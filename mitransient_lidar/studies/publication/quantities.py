@@ -35,7 +35,7 @@ from mitransient_lidar.studies.publication.renders import (
     geometry_of,
 )
 from mitransient_lidar.studies.publication.statements import Measured
-from mitransient_lidar.studies.shot_statistics import depth_bias
+from mitransient_lidar.studies.shots import depth_bias
 from mitransient_lidar.transport.sensor.outlines import enclosed_area
 
 #: Quantities by their names.

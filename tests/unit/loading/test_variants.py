@@ -13,7 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.studies.find_shots import find_shots
+from mitransient_lidar.studies.shots import find_shots
 
 
 def test_the_wheels_llvm_is_found_through_its_metadata():

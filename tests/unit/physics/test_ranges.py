@@ -19,12 +19,12 @@ from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import angular_frequency, wave_numbers
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
+    SwellSpectrum,
     inverse_wave_age,
 )
 from mitransient_lidar.physics.water.bubbles import WindBubbles
