@@ -29,7 +29,6 @@ if importlib.util.find_spec("mitransient_lidar.plugins") is None:
     __path__.append(str(Path(__file__).resolve().parent.parent))
 
 from mitransient_lidar.core.errors import UserError as _UserError
-from mitransient_lidar.core.renamed import FUNCTIONS as _FORMER
 from mitransient_lidar.loading import variants as _variants
 
 _variants.prepare_llvm()
@@ -126,6 +125,9 @@ _FUNCTIONS = {
     "water_of": ("physics.water.water_types", "water_of"),
     "waveform_chunks": ("results.waveform_files", "waveform_chunks"),
 }
+
+#: Former names of functions, and those that have taken their place.
+_FORMER = {"depth_uncertainty": "tpu", "sweep": "campaign", "waveforms": "echoes"}
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [

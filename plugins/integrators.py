@@ -18,8 +18,7 @@ from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, Rece
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
-from mitransient_lidar.transport.paths.passes import PassRenderer
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

@@ -8,7 +8,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
-from mitransient_lidar.physics.lidar.lidar_geometry import WIDTHS, read_divergence
+from mitransient_lidar.physics.lidar.level_sea import WIDTHS, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, read_pose, register
 from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam

@@ -30,8 +30,7 @@ from mitransient_lidar.physics.receiver.receiver_files import (
 )
 from mitransient_lidar.physics.receiver.receiver_files import camera as camera_of
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
-from mitransient_lidar.results.attributes import made_from
-from mitransient_lidar.results.companions import join, split
+from mitransient_lidar.results.attributes import join, made_from, split
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.variables import label
 

@@ -19,11 +19,10 @@ from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.formats.documents import parse_toml, table
-from mitransient_lidar.core.options import BackgroundPower, Option, positive_option
-from mitransient_lidar.core.plans import Plan, one_of
+from mitransient_lidar.core.options import BackgroundPower, Option, Plan, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
 from mitransient_lidar.physics.receiver.receiver_files import Setting
-from mitransient_lidar.rendering.options import LIGHT, LightOption
+from mitransient_lidar.rendering.passes import LIGHT, LightOption
 
 #: Design kinds: every combination; points of a sequence, of a Latin hypercube, or random ones; file rows.
 DesignKind = Literal["grid", "sobol", "latin_hypercube", "random", "table"]

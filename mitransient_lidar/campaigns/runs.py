@@ -22,7 +22,7 @@ from mitransient_lidar.loading.parameters import check_known, values_of
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene, read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.variables import described
 

@@ -17,9 +17,8 @@ from mitransient_lidar.cli.files import (
     scene_of,
     write_netcdf,
 )
-from mitransient_lidar.cli.generator import Call, Command, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Command, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
-from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -75,7 +74,7 @@ _DRAWINGS = {
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or its figure, but no EXR file beyond the memory, and no layout of pixels that miss the sea."""
     from mitransient_lidar import results
-    from mitransient_lidar.results.companions import split
+    from mitransient_lidar.results.attributes import split
 
     if target.suffix != ".nc":
         dataset, _ = split(dataset)

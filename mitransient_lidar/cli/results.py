@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix, write_page
-from mitransient_lidar.cli.generator import Command
-from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import (
+from mitransient_lidar.cli.generator import (
     Channel,
+    Command,
     Define,
     DrawingOnly,
     Lidar,
     Quiet,
     Waveforms,
-    parameters,
     waveform_selection,
 )
-from mitransient_lidar.cli.overwriting import draws_again
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.overwriting import draws_again, parameters
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:

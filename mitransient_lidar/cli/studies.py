@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Command, DrawingOnly, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
-from mitransient_lidar.cli.options import OUTPUT, DrawingOnly, Quiet
 
 Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
 

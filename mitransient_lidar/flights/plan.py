@@ -18,8 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.formats.documents import parse_toml
 from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan, one_of
+from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
@@ -28,7 +27,7 @@ from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
-from mitransient_lidar.rendering.options import LIGHT, LightOption
+from mitransient_lidar.rendering.passes import LIGHT, LightOption
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")

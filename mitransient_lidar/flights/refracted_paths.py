@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_array
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract

@@ -49,7 +49,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.results.companions import join
+from mitransient_lidar.results.attributes import join
 from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.results.variables import described
 

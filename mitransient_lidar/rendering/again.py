@@ -18,7 +18,7 @@ from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_source import SceneSource, json_attribute
-from mitransient_lidar.rendering.options import KEPT, LIGHT
+from mitransient_lidar.rendering.passes import KEPT, LIGHT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
 
 logger = logging.getLogger(__name__)

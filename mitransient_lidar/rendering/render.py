@@ -16,23 +16,27 @@ from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, ope
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.options import (
+from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
+    TOLERATED_LOSS,
     Batches,
     Components,
     Derivatives,
+    Goal,
     MaxMemory,
     MaxTime,
     Passes,
+    ProgressCallback,
     RenderOptions,
     SignedSeed,
     Smooth,
     TargetError,
     TargetQuantile,
     Variant,
+    run_passes,
+    warn_of_edge_loss,
 )
-from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.companions import join, split
+from mitransient_lidar.results.attributes import join, split
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -86,7 +90,7 @@ def render(
         Name of the instrument whose laser and receiver replace an XML scene's, as `loading.instruments` lists them.
     infrared
         Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
-        `loading.instruments.with_infrared` for the parameters, and `results.companions`.
+        `loading.instruments.with_infrared` for the parameters, and `results.attributes`.
     sensor
         Id of a receiver in the scene, by default the first one.
     integrator
@@ -229,7 +233,7 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or DEFAULT_MAX_MEMORY_GB
-    from mitransient_lidar.transport.paths.path_classes import check_solids
+    from mitransient_lidar.transport.paths.passes import check_solids
 
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))

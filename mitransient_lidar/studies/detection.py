@@ -33,7 +33,7 @@ from mitransient_lidar.core.options import (
 from mitransient_lidar.core.validation import in_range, require_memory, shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import CAMERAS

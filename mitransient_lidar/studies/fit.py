@@ -33,8 +33,7 @@ from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.rendering.options import MOST_PASSES
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.passes import MOST_PASSES, Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.waveform_files import FILE
 

@@ -17,7 +17,7 @@ from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.variables import label
-from mitransient_lidar.transport.paths.path_classes import MOST_ORDERS, PathClasses
+from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
 
 #: Independent passes, for standard errors.
 _PASSES = 8
@@ -64,7 +64,7 @@ def estimate(
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-    from mitransient_lidar.transport.paths.path_classes import PathClasses
+    from mitransient_lidar.transport.paths.passes import PathClasses
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     lidar = find_lidar_scene(session.scene, session.sensor)

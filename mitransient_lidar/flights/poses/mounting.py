@@ -9,8 +9,7 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.poses.records import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan, of_kind
+from mitransient_lidar.core.options import Option, Plan, of_kind, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, TimeSystem, time_system
 from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory

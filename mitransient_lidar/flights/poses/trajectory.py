@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.plans import one_of
+from mitransient_lidar.core.options import one_of
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
 from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, check_records, rotation_matrices
 

@@ -21,8 +21,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0, ELEMENTARY_CHARGE, PLANCK
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan, positive_option
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, positive
 from mitransient_lidar.physics.receiver import dead_time
 

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import BOLTZMANN
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.physics.piecewise_linear import integral
 

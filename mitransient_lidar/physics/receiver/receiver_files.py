@@ -15,9 +15,8 @@ from typing import Annotated, Any, Literal
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required
-from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
-from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import shown

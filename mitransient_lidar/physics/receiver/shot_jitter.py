@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import FloatArray
 
 

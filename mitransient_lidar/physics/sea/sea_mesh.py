@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
-from mitransient_lidar.physics.lidar.lidar_geometry import read_divergence
+from mitransient_lidar.physics.lidar.level_sea import read_divergence
 
 #: Ratio between the lengths of neighbouring cells outside the fine patch.
 _GROWTH = 1.3

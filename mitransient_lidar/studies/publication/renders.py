@@ -17,7 +17,7 @@ from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.exclusive import alone, alone_with_scene
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import random_places, render_shots
 from mitransient_lidar.rendering.shots.truth import SeaMap

@@ -10,7 +10,7 @@ import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_parameters
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines
