@@ -216,11 +216,13 @@ def _documented(text: str, options: Mapping[str, Option], names: Iterable[str]) 
     known = {name for line in described.splitlines() if line[4:5].strip() for name in re.findall(r"\w+", line)}
     listed = {**options, **{name: _COMMON[name] for name in names if name in _COMMON}}
     added = [f"\n    {name}\n{_indented(option.help())}" for name, option in listed.items() if name not in known]
-    return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}" if heading else text
+    if not heading:
+        return documented_parameters(text, listed)
+    return f"{beginning}{heading}{described}{''.join(added)}{blank}{end}"
 
 
 def documented_parameters(text: str, options: Mapping[str, Option]) -> str:
-    """Return a class documentation with a parameter section, after its first paragraphs."""
+    """Return a documentation with a parameter section, after its first paragraphs."""
     if not options:
         return text
     beginning, *sections = re.split(r"\n\n(?=    \w+\n    -{4,}\n)", text.rstrip())

@@ -86,21 +86,15 @@ def render(
         unless others are given. See `render_again`.
     params
         Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
-    instrument
-        Name of the instrument whose laser and receiver replace an XML scene's, as `loading.instruments` lists them.
     infrared
         Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
         `loading.instruments.with_infrared` for the parameters, and `results.attributes`.
-    sensor
-        Id of a receiver in the scene, by default the first one.
     integrator
         Name or dict of an integrator plugin, or an integrator; by default the scene's.
     target_error
         Relative standard error, greater than 0, at most 1, that ends the render after at least 8 passes. 95 % of the
         bins of lit pixels must have reached it, from the surface echo to the end of the bottom echo. With gates, 95 %
         of the gates must have reached it, in the median over their lit pixels.
-    target_quantile
-        Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time
         Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
         longer, with fewer paths (the attribute ``pass_share``).

@@ -68,11 +68,6 @@ def beam_spread(
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
 
-    Parameters
-    ----------
-    depths
-        Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
-
     Returns
     -------
     xarray.Dataset

@@ -38,11 +38,6 @@ def estimate(
 ) -> xr.Dataset:
     """Estimate the waveforms of a scene in about a second, as a first look and a second opinion.
 
-    Parameters
-    ----------
-    scene, params
-        As for `rendering.render.render`.
-
     Returns
     -------
     xarray.Dataset
@@ -115,11 +110,6 @@ def scattering_orders(
     Light reflected only by the sea, the bottom or a target is of order 0. The vertical direction of every echo is
     reversed at least once, and three times or more by scattering, a second reflection, or reflection inside the
     surface.
-
-    Parameters
-    ----------
-    orders
-        Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum over all higher ones.
 
     Returns
     -------
