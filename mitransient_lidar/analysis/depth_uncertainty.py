@@ -104,13 +104,8 @@ def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: flo
 def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None = None) -> xr.Dataset:
     """Return the sounding uncertainties for one estimator at one altitude, and their fits.
 
-    Parameters
-    ----------
-    table : xarray.Dataset
-        From `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
-        ``refractive_index`` and ``divergence_mrad``.
-    trajectory : TrajectoryErrors, optional
-        Trajectory errors of the survey.
+    `table`: from `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
+    ``refractive_index`` and ``divergence_mrad``. `trajectory`: trajectory errors of the survey.
 
     Returns
     -------

@@ -47,12 +47,7 @@ class Expression:
 
     Raises UserError if it contains anything else.
 
-    Parameters
-    ----------
-    name
-        Name of the quantity that it defines, for messages.
-    text
-        The expression.
+    `name`: name of the quantity that it defines, for messages.
 
     Attributes
     ----------

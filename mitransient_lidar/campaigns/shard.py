@@ -85,12 +85,8 @@ class _End(NamedTuple):
 class Processes:
     """Processes of a campaign's shards, which `end` ends together.
 
-    Parameters
-    ----------
-    versions
-        Required versions, as from `versions.own_versions`; by default any.
-    place
-        Their machine, for messages.
+    `versions`: required versions, as from `versions.own_versions`; by default any. `place`: their machine, for
+    messages.
     """
 
     def __init__(self, versions: Mapping[str, str] | None = None, place: str = "this machine") -> None:

@@ -79,12 +79,7 @@ class Store:
     Run arrays have the dimension ``run`` first, in chunks of one shard. One process writes a shard: its arrays, and
     last the ``status`` of its runs. Files replace former ones as a whole.
 
-    Raises UserError if there is no such store, or a link is in it.
-
-    Parameters
-    ----------
-    path
-        Store folder.
+    Raises UserError if there is no such store in the folder `path`, or a link is in it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

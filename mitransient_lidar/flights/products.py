@@ -113,13 +113,8 @@ class Flown:
 def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     """Return the echoes of all pulses, with times after their pulse, and depths for the angle of each.
 
-    Parameters
-    ----------
-    flown
-        The pulses.
-    corrections
-        ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With them there is ``beyond_table``:
-        whether the angle of the pulse or the depth is outside the table.
+    `flown`: the pulses. `corrections`: ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With
+    them there is ``beyond_table``: whether the angle of the pulse or the depth is outside the table.
     """
     attributes, store = flown.attributes, flown.store
     later = flown.values("time_offset_ns")

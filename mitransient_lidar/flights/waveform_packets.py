@@ -28,12 +28,8 @@ class PacketWriter:
     Raises UserError if `gain` or `sampling_ns` is not positive, `offset` is not finite, there is no sample, or rounding
     the spacing to whole picoseconds, as LAS stores it, shifts the last sample by more than 10 ps.
 
-    Parameters
-    ----------
-    file : IO[bytes]
-        File, empty and open for writing, that can seek.
-    first : xr.Dataset
-        First waveforms, see `append`; they give samples per packet, gain, offset and spacing for the file.
+    `file`: file, empty and open for writing, that can seek. `first`: first waveforms, see `append`; they give samples
+    per packet, gain, offset and spacing for the file.
     """
 
     def __init__(self, file: IO[bytes], first: xr.Dataset):

@@ -77,12 +77,7 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
 
     Raises UserError if the result's light was not separated.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result of `rendering.render.render`, or a shot series, with components.
-    path : path, optional
-        File to write.
+    `dataset`: a result of `rendering.render.render`, or a shot series, with components. `path`: file to write.
     """
     name = "waveform_by_origin"
     if name not in dataset:
@@ -283,12 +278,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
 
     Raises UserError if the result has no derivatives.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result of `rendering.render.render` with derivatives, for one shot.
-    path : path, optional
-        File to write.
+    `dataset`: a result of `rendering.render.render` with derivatives, for one shot. `path`: file to write.
     """
     name = "waveform_derivative"
     if name not in dataset or "shot" in dataset[name].dims:

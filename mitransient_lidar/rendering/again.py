@@ -69,13 +69,9 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
 
     Raises UserError if the result does not contain its scene or an option, or contains only some shots of a series.
 
-    Parameters
-    ----------
-    result
-        Dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
-    options
-        Options of that function which replace the result's, unless they are None; its parameters are added to the
-        scene's.
+    `result`: dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
+    `options`: options of that function which replace the result's, unless they are None; its parameters are added to
+    the scene's.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)

@@ -184,15 +184,10 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     Raises UserError if the result does not contain its scene, a file of the scene has changed, shots were selected or
     reordered, or an option is invalid.
 
-    Parameters
-    ----------
-    result
-        Dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset that was
-        computed from a result, such as gates or receiver signals, gives a render of that result. A series gives all
-        shots, or the shots that were completed before Ctrl-C.
-    options
-        Options of the function that rendered the result, by default the values in its attributes. `params` are added to
-        its scene's parameters.
+    `result`: dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset
+    that was computed from a result, such as gates or receiver signals, gives a render of that result. A series gives
+    all shots, or the shots that were completed before Ctrl-C. `options`: options of the function that rendered the
+    result, by default the values in its attributes. `params` are added to its scene's parameters.
 
     Returns
     -------

@@ -162,10 +162,7 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
 
     Raises `UserError` if the scene has no bottom, or the record lacks an echo.
 
-    Parameters
-    ----------
-    series
-        A result of `rendering.shots.series.render_shots` for a scene with the parameter ``bottom_depth``.
+    `series`: a result of `rendering.shots.series.render_shots` for a scene with the parameter ``bottom_depth``.
 
     Returns
     -------

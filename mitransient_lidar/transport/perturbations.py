@@ -128,11 +128,6 @@ class _Tables:
 
 class Perturbations:
     """Perturbation sums along paths; without perturbations all are empty.
-
-    Parameters
-    ----------
-    perturbations
-        The perturbations.
     """
 
     def __init__(self, perturbations: Sequence[Perturbation] = ()) -> None:

@@ -318,12 +318,8 @@ def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> 
 
     Returns points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
 
-    Parameters
-    ----------
-    scene
-        The scene.
-    origins, axes
-        Points in its frame from which the axes start [m], and their directions, shape (n, 3), or (3,) of all axes.
+    `origins`, `axes`: points in the scene's frame from which the axes start [m], and their directions, shape (n, 3), or
+    (3,) of all axes.
     """
     sea, bottoms = scene.level_sea, scene.bottoms
     if not bottoms or np.any(axes[..., 2] >= 0):

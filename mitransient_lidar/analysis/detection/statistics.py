@@ -148,13 +148,9 @@ def _normal(value: npt.ArrayLike, skewness: float) -> FloatArray:
 class Cases:
     """Moments of the samples without and with a target, for one sea or several.
 
-    Parameters
-    ----------
-    null_mean, target_mean, null_covariance, target_covariance : ndarray
-        Mean over each case's shots, shape (cases, samples), and covariance of the receiver's noise, shape (cases,
-        samples, samples).
-    detectors : int
-        Number of detectors, each with an equal, contiguous part of the samples.
+    `null_mean`, `target_mean`, `null_covariance`, `target_covariance`: mean over each case's shots, shape (cases,
+    samples), and covariance of the receiver's noise, shape (cases, samples, samples). `detectors`: number of detectors,
+    each with an equal, contiguous part of the samples.
     """
 
     null_mean: FloatArray

@@ -64,12 +64,8 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
     With the rotations R of the platform and M of the mounting, a direction d of the scanner is R M d in the scene, and
     the scanner is at the position of the trajectory plus R times the lever arm.
 
-    Parameters
-    ----------
-    trajectory, mounting, scanner
-        Motion of the platform, place of the scanner on it, and scan.
-    times
-        Times of the pulses [s], on the flight lines, shape (shots,).
+    `trajectory`, `mounting`, `scanner`: motion of the platform, place of the scanner on it, and scan. `times`: times of
+    the pulses [s], on the flight lines, shape (shots,).
 
     Raises
     ------

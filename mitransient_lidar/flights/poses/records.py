@@ -37,12 +37,7 @@ def rotation_matrices(
     the same signs but yaw . roll . pitch: pitch acts first. ``CANONICAL`` of HELIOS++ is roll about x, pitch about y
     and yaw about z, all counterclockwise seen against the axis, with yaw acting first.
 
-    Parameters
-    ----------
-    roll_deg, pitch_deg, yaw_deg
-        Angles [deg], shape (n,).
-    rotation_spec
-        Order of the rotations.
+    `roll_deg`, `pitch_deg`, `yaw_deg`: angles [deg], shape (n,). `rotation_spec`: order of the rotations.
 
     Returns
     -------

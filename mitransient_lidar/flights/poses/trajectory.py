@@ -31,12 +31,8 @@ _LAST_PULSE = 1e-6
 class InterpolatedPoses(PlatformPoses):
     """Poses of a platform at any times, roll and pitch -180 to 180 and yaw 0 to 360 degrees.
 
-    Parameters
-    ----------
-    rotation
-        Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
-    line
-        Number of the flight line, from 0, shape (n,).
+    `rotation`: matrices from the axes of the platform to those of the scene, shape (n, 3, 3). `line`: number of the
+    flight line, from 0, shape (n,).
     """
 
     rotation: FloatArray

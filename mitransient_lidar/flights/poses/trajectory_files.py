@@ -97,14 +97,9 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
     is not finite, not on the Earth, or not later than the one before; or the coordinate system is unknown, has no
     metres, or has another scale there.
 
-    Parameters
-    ----------
-    path
-        SBET file.
-    epsg
-        EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east and y north on the
-        grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM 0.9996 to
-        1.001, which may differ from 1 by 1 %.
+    `path`: SBET file. `epsg`: EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east
+    and y north on the grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM
+    0.9996 to 1.001, which may differ from 1 by 1 %.
     """
     import pyproj
 

@@ -82,13 +82,8 @@ class GateShape:
     def edges(cls, width_ns: float, rise_ns: float = 0.0, fall_ns: float = 0.0) -> GateShape:
         """Gate with raised-cosine edges.
 
-        Parameters
-        ----------
-        width_ns : float
-            Time between half heights [ns], greater than 0.
-        rise_ns, fall_ns : float
-            10-90 % times of the edges [ns], at least 0; the gate must reach 1 between them:
-            rise_ns + fall_ns at most 1.18 width_ns.
+        `width_ns`: time between half heights [ns], greater than 0. `rise_ns`, `fall_ns`: 10-90 % times of the edges
+        [ns], at least 0; the gate must reach 1 between them: rise_ns + fall_ns at most 1.18 width_ns.
         """
         longest = 2 * width_ns / _EDGE_PER_RISE
         if rise_ns + fall_ns > longest * (1 + _ROUNDING):
@@ -102,13 +97,8 @@ class GateShape:
     def sampled(cls, times_ns: npt.ArrayLike, transmission: npt.ArrayLike) -> GateShape:
         """Measured gate; its width and edge times follow from the samples.
 
-        Parameters
-        ----------
-        times_ns : array_like, shape (S,)
-            Strictly increasing times [ns], at least 2. They are shifted so that the transmission first reaches half its
-            maximum at 0.
-        transmission : array_like, shape (S,)
-            Transmission, 0 to 1, not all 0.
+        `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the transmission
+        first reaches half its maximum at 0. `transmission`: transmission, 0 to 1, not all 0, shape (S,).
         """
         t, g = time_samples(times_ns, "transmission", transmission)
         for extreme in (g.min(), g.max()):
@@ -136,10 +126,7 @@ class GateShape:
 
         Its width and edges remain those for one pulse, and its time 0 is the mean opening time.
 
-        Parameters
-        ----------
-        jitter_ns : float
-            Standard deviation of the opening time [ns], at least 0.
+        `jitter_ns`: standard deviation of the opening time [ns], at least 0.
         """
         if non_negative("jitter_ns", jitter_ns) == 0:
             return self
@@ -276,12 +263,8 @@ class GateTrain(Checked):
         the shortest of pulse, edges and width apart, with which linear interpolation is accurate to 1e-5. They are
         farther apart where there would be more than 2^17.
 
-        Parameters
-        ----------
-        pulse : Pulse
-            Transmitted pulse.
-        response_time_ns : float
-            Time constant of the receiver's single-pole response [ns], at least 0.
+        `pulse`: transmitted pulse. `response_time_ns`: time constant of the receiver's single-pole response [ns], at
+        least 0.
         """
         from scipy.signal import fftconvolve
 

@@ -76,12 +76,7 @@ class LevelSea:
 
         Returns x, y [m], shape (..., 2); NaN for points in the air that are not below the origin.
 
-        Parameters
-        ----------
-        origin
-            Point in the air, x, y, z [m].
-        points
-            Points x, y, z [m], shape (..., 3).
+        `origin`: point in the air, x, y, z [m]. `points`: points x, y, z [m], shape (..., 3).
         """
         points = finite_array("points", points)
         offset, height = points[..., :2] - origin[:2], float(origin[2])
@@ -158,12 +153,8 @@ def refract_level(direction: FloatArray, n: float) -> FloatArray:
 def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     """Power reflectance and transmittance of a smooth interface for unpolarised light.
 
-    Parameters
-    ----------
-    theta : array_like
-        Incidence angle [rad], 0 to pi/2.
-    n : float
-        Index behind the interface relative to that before it; below 1 from water to air.
+    `theta`: incidence angle [rad], 0 to pi/2. `n`: index behind the interface relative to that before it; below 1 from
+    water to air.
 
     Returns
     -------
@@ -187,12 +178,8 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
     Returns d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential
     distances S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
 
-    Parameters
-    ----------
-    height, depth : array_like
-        Receiver height and point depth [m].
-    theta, n
-        Ray angle in air [rad], and water refractive index.
+    `height`, `depth`: receiver height and point depth [m]. `theta`, `n`: ray angle in air [rad], and water refractive
+    index.
     """
     h, d = np.asarray(height, dtype=np.float64), np.asarray(depth, dtype=np.float64)
     air, water = np.cos(finite_array("theta", theta)), np.cos(snell(theta, n))
@@ -309,10 +296,7 @@ class LidarSystem(LidarGeometry):
     def water_gain(self, depth: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
         """Received energy per unit of backscatter [J sr], without attenuation in the water.
 
-        Parameters
-        ----------
-        depth, theta : array_like
-            Depth [m], at least 0, and angle of the ray in air [rad], which broadcast.
+        `depth`, `theta`: depth [m], at least 0, and angle of the ray in air [rad], which broadcast.
         """
         _, transmittance = fresnel(theta, self.refractive_index)
         solid_angle = solid_angle_per_area(self.height, depth, theta, self.refractive_index)
@@ -336,12 +320,8 @@ def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
 
     Raises UserError if the value is out of range.
 
-    Parameters
-    ----------
-    read
-        Reader of the plugin parameters.
-    is_top_hat
-        Whether the irradiance is even up to the beam's edge instead of Gaussian.
+    `read`: reader of the plugin parameters. `is_top_hat`: whether the irradiance is even up to the beam's edge instead
+    of Gaussian.
 
     Notes
     -----

@@ -59,12 +59,8 @@ class Pulse:
     def sampled(cls, times_ns: npt.ArrayLike, power: npt.ArrayLike) -> Pulse:
         """Pulse given by samples.
 
-        Parameters
-        ----------
-        times_ns : array_like, shape (S,)
-            Strictly increasing times [ns], at least 2. They are shifted so that the (first) largest sample is at 0.
-        power : array_like, shape (S,)
-            Power in any unit, not negative, not all 0. It is scaled to unit area.
+        `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the (first) largest
+        sample is at 0. `power`: power in any unit, not negative, not all 0, shape (S,). It is scaled to unit area.
         """
         t, p = time_samples(times_ns, "power", power)
         non_negative("power", p.min())
@@ -81,12 +77,9 @@ class Pulse:
 
         Raises UserError if the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
 
-        Parameters
-        ----------
-        path : path-like
-            File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may be
-            called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
-            to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
+        `path`: file for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
+        be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
+        to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
         """
         times, power = read_time_samples(path, _POWER)
         lowest = power.min(initial=0.0)
@@ -127,12 +120,8 @@ class Pulse:
 
         Raises UserError if a number is out of range, or pulse and response have more than 10 million bins.
 
-        Parameters
-        ----------
-        bin_width_ns : float
-            Bin width [ns], positive.
-        response_time_ns : float
-            Time constant tau of a causal single-pole response exp(-t/tau)/tau [ns]; 0 for none.
+        `bin_width_ns`: bin width [ns], positive. `response_time_ns`: time constant tau of a causal single-pole response
+        exp(-t/tau)/tau [ns]; 0 for none.
 
         Returns
         -------

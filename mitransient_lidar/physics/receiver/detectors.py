@@ -104,13 +104,8 @@ def photons_per_joule(wavelength_nm: float) -> float:
 def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
     """Excess noise factor of an avalanche photodiode, F = k M + (1 - k) (2 - 1/M).
 
-    Parameters
-    ----------
-    gain : float
-        Mean multiplication M, at least 1.
-    ionisation_ratio : float
-        Effective ratio k of the ionisation coefficients, holes over electrons where electrons begin the avalanche, 0 to
-        1.
+    `gain`: mean multiplication M, at least 1. `ionisation_ratio`: effective ratio k of the ionisation coefficients,
+    holes over electrons where electrons begin the avalanche, 0 to 1.
 
     Notes
     -----
@@ -123,10 +118,7 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
 def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
     """Excess noise factor for a chain of dynodes with Poisson-distributed secondary electrons.
 
-    Parameters
-    ----------
-    dynode_gains : sequence of float
-        Mean secondary electrons d per electron of each dynode, above 1; at least one dynode.
+    `dynode_gains`: mean secondary electrons d per electron of each dynode, above 1; at least one dynode.
 
     Notes
     -----

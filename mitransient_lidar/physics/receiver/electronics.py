@@ -164,12 +164,8 @@ class Amplifier(Plan):
     def coupled(self, volts: FloatArray, sample_ns: float) -> FloatArray:
         """Return voltages behind the coupling capacitor, if any.
 
-        Parameters
-        ----------
-        volts : ndarray, shape (..., sample)
-            Voltages minus the steady-light voltage [V], 0 before the first sample.
-        sample_ns : float
-            Time between samples [ns].
+        `volts`: voltages minus the steady-light voltage [V], 0 before the first sample, shape (..., sample).
+        `sample_ns`: time between samples [ns].
         """
         from scipy.signal import lfilter
 

@@ -44,12 +44,7 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
 
     Returns omega [rad/s], in the shape of `k`.
 
-    Parameters
-    ----------
-    k : array_like
-        Wavenumber [rad/m], not negative.
-    depth : float
-        Water depth [m], positive or infinite.
+    `k`: wavenumber [rad/m], not negative. `depth`: water depth [m], positive or infinite.
 
     Notes
     -----
@@ -173,10 +168,7 @@ def facet_slope_variance(
 def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     """Return numbers of wavelengths over a period along x and y, and their unit.
 
-    Parameters
-    ----------
-    period, cells
-        As for `wave_coefficients`.
+    `period`, `cells`: as for `wave_coefficients`.
 
     Returns
     -------

@@ -66,12 +66,8 @@ class WaveSpectrum(ABC):
 
         Returns psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
 
-        Parameters
-        ----------
-        ix, iy : ndarray of int, shapes (I,) and (J,)
-            Numbers of wave periods along x and y over the patch.
-        dk : float
-            Wavenumber spacing [rad/m]: 2 pi divided by the patch side.
+        `ix`, `iy`: numbers of wave periods along x and y over the patch, shapes (I,) and (J,). `dk`: wavenumber spacing
+        [rad/m]: 2 pi divided by the patch side.
         """
 
     @property
@@ -153,10 +149,7 @@ class SeaState:
 
     Raises UserError if there is no component, or one is not a spectrum.
 
-    Parameters
-    ----------
-    components : tuple of WaveSpectrum
-        At least one. The first determines `direction` and thus the axes of the slope variances.
+    `components`: at least one. The first determines `direction` and thus the axes of the slope variances.
     """
 
     components: tuple[WaveSpectrum, ...]

@@ -36,12 +36,7 @@ def inverse_wave_age(wind_speed: float, fetch: float) -> float:
 
     Raises UserError if the fetch is so short that Omega exceeds 5.
 
-    Parameters
-    ----------
-    wind_speed : float
-        Wind speed at 10 m [m/s], 0 to 30.
-    fetch : float
-        Distance from the upwind shore [m], positive.
+    `wind_speed`: wind speed at 10 m [m/s], 0 to 30. `fetch`: distance from the upwind shore [m], positive.
 
     Notes
     -----

@@ -65,12 +65,7 @@ def fournier_forand_cdf(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray
 
     Returns cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3761, 62.
 
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad], 0 to pi.
-    n, mu : float
-        As in `fournier_forand`.
+    `theta`: scattering angle [rad], 0 to pi. `n`, `mu`: as in `fournier_forand`.
     """
     nu, scale = _ff_shape(n, mu)
     s = _half_angle(theta)
@@ -92,10 +87,7 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
 
     Raises UserError if no member of the family has this ratio.
 
-    Parameters
-    ----------
-    backscatter_ratio : float
-        bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
+    `backscatter_ratio`: bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
 
     Returns
     -------
@@ -199,12 +191,9 @@ def petzold_water(name: str) -> PhaseFunction:
 
     Raises UserError if the name is unknown.
 
-    Parameters
-    ----------
-    name : str
-        ``clear`` (station AUTEC 8, Tongue of the Ocean, Bahamas), ``coastal`` (HAOCE 11, channel off Santa Catalina,
-        California), ``turbid`` (NUC 2040, San Diego harbour), or another station: ``autec_7``, ``autec_9``,
-        ``haoce_5`` (Avalon Cove, Catalina), ``nuc_2200`` or ``nuc_2240``.
+    `name`: ``clear`` (station AUTEC 8, Tongue of the Ocean, Bahamas), ``coastal`` (HAOCE 11, channel off Santa
+    Catalina, California), ``turbid`` (NUC 2040, San Diego harbour), or another station: ``autec_7``, ``autec_9``,
+    ``haoce_5`` (Avalon Cove, Catalina), ``nuc_2200`` or ``nuc_2240``.
 
     Notes
     -----

@@ -114,12 +114,8 @@ class PowerLawTable:
     def mixture(cls, tables: Sequence[PowerLawTable], weights: npt.ArrayLike) -> PowerLawTable:
         """Build a weighted sum of phase functions.
 
-        Parameters
-        ----------
-        tables : sequence of PowerLawTable
-            The functions; the result has the nodes of the finest.
-        weights : array_like
-            Weights, such as scattering coefficients, at least 0 and not all 0.
+        `tables`: the functions; the result has the nodes of the finest. `weights`: weights, such as scattering
+        coefficients, at least 0 and not all 0.
         """
         factors = finite_array("weights", weights)
         if factors.shape != (len(tables),):
@@ -143,10 +139,7 @@ class PowerLawTable:
 
         Raises UserError if A would be negative.
 
-        Parameters
-        ----------
-        chi : float
-            chi_p(pi) = (bb/b)/(2 pi p(pi)), greater than 0 (Boss and Pegau 2001, doi:10.1364/AO.40.005503).
+        `chi`: chi_p(pi) = (bb/b)/(2 pi p(pi)), greater than 0 (Boss and Pegau 2001, doi:10.1364/AO.40.005503).
         """
         count = max(self.count, _PEAK_COUNT)
         s = np.exp(self.log_s0 * np.linspace(1, 0, count))
@@ -265,12 +258,9 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     Raises UserError if the file cannot be read or does not hold such a table (the message names the line), or if the
     values rise towards 0 so steeply that their integral diverges.
 
-    Parameters
-    ----------
-    path : path-like
-        Text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in rad
-        if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
-        The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
+    `path`: text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in
+    rad if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
+    The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 
     Notes
     -----

@@ -99,10 +99,7 @@ def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
     The effects of salt and temperature, which matter in the red and infrared, are neglected. A later compilation (WOPP
     v3 of 2016) gives 2 % more at 532 nm.
 
-    Parameters
-    ----------
-    wavelength_nm : array_like
-        Wavelength [nm], 400 to 1100.
+    `wavelength_nm`: wavelength [nm], 400 to 1100.
 
     Notes
     -----
@@ -129,12 +126,8 @@ def water_scattering(
     Returns the scattering [1/m], of the broadcast shape; its authors report agreement with Morel's measurements within
     2 %.
 
-    Parameters
-    ----------
-    wavelength_nm, temperature, salinity : array_like
-        As in `refractive_index`.
-    depolarisation : float
-        Depolarisation ratio, 0 to 0.2.
+    `wavelength_nm`, `temperature`, `salinity`: as in `refractive_index`. `depolarisation`: depolarisation ratio, 0 to
+    0.2.
 
     Notes
     -----
@@ -162,12 +155,8 @@ def water_phase_function(theta: npt.ArrayLike, depolarisation: float = DEPOLARIS
 
     Returns the phase function [1/sr], in the shape of `theta`.
 
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad], 0 to pi.
-    depolarisation : float
-        Depolarisation ratio delta, 0 to 0.2: 0 is Rayleigh's function, 0.09 was Morel's value.
+    `theta`: scattering angle [rad], 0 to pi. `depolarisation`: depolarisation ratio delta, 0 to 0.2: 0 is Rayleigh's
+    function, 0.09 was Morel's value.
     """
     delta = in_range("depolarisation", depolarisation, 0, 0.2)
     p = (1 - delta) / (1 + delta)

@@ -24,11 +24,8 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
 
     Raises UserError if it has another shape, no angles of the pixels, or attributes or times that are invalid.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
-        ``shot`` if it has shots.
+    `dataset`: a result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
+    ``shot`` if it has shots.
     """
     name = next(name for name in RECORDS if name in dataset)
     dims = record_dims(dataset, name, shots=True)

@@ -24,12 +24,8 @@ class IndexLayers:
 
     Raises UserError if there are more than 16 index layers.
 
-    Parameters
-    ----------
-    layer_tops
-        Upper edge depths of the water layers [m], shape (layers,).
-    refractive_index, group_index
-        Indices of the water layers, shape (layers,).
+    `layer_tops`: upper edge depths of the water layers [m], shape (layers,). `refractive_index`, `group_index`: indices
+    of the water layers, shape (layers,).
     """
 
     def __init__(self, layer_tops: np.ndarray, refractive_index: np.ndarray, group_index: np.ndarray) -> None:
@@ -113,12 +109,8 @@ def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: mi.Float | float) 
 def refract_level(direction: mi.Vector3f, eta: mi.Float | float) -> tuple[mi.Vector3f, mi.Bool]:
     """Return a propagation direction beyond a horizontal plane, and whether light passes it.
 
-    Parameters
-    ----------
-    direction
-        Unit propagation direction.
-    eta
-        Refractive index before the plane over the index behind it. Where it exceeds 1, light may be totally reflected.
+    `direction`: unit propagation direction. `eta`: refractive index before the plane over the index behind it. Where it
+    exceeds 1, light may be totally reflected.
     """
     x, y = direction.x * eta, direction.y * eta
     cosine2 = 1 - x * x - y * y

@@ -189,12 +189,8 @@ def interaction_at(point: mi.Point3f, direction: mi.Vector3f) -> mi.MediumIntera
 class PathStep:
     """Path steps through sea surface, water and solids.
 
-    Parameters
-    ----------
-    flight
-        Free flight from which the distances to scattering events are drawn; None without water.
-    mode
-        ``Radiance`` for paths from the receiver, ``Importance`` for light.
+    `flight`: free flight from which the distances to scattering events are drawn; None without water. `mode`:
+    ``Radiance`` for paths from the receiver, ``Importance`` for light.
     """
 
     def __init__(self, scene: WaterScene, flight: LayeredFlight | None, mode: mi.TransportMode) -> None:
