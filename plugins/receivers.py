@@ -12,9 +12,15 @@ from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER, PIXEL_F
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, read_pose, refuse_medium, register
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
-from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.image_sampling import read_image
-from mitransient_lidar.transport.sensor.pixels import LayoutPixels, MappedPixels, PixelArray, ShapedPixels, parse_layout
+from mitransient_lidar.transport.sensor.pixels import (
+    HexPixels,
+    LayoutPixels,
+    MappedPixels,
+    PixelArray,
+    ShapedPixels,
+    parse_layout,
+)
 from mitransient_lidar.transport.sensor.receiver import (
     GaussianPointSpread,
     MeasuredPointSpread,

@@ -15,8 +15,8 @@ from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.core.tables.written import write_csv
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
+from mitransient_lidar.results.attributes import described
 from mitransient_lidar.results.geometry import required_number
-from mitransient_lidar.results.variables import described
 
 #: Smallest share of shots with a depth for which a cell has an uncertainty.
 LEAST_FOUND = 0.5

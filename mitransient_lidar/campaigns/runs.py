@@ -24,7 +24,7 @@ from mitransient_lidar.loading.scenes import open_scene, read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 #: Half the side of the square that contains a sea's locations [m].
 _REACH = 256.0

@@ -34,7 +34,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 _LOG = logging.getLogger(__name__)
 

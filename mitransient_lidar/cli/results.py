@@ -176,7 +176,7 @@ def _compare(
     """Compare and draw two results."""
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
-    from mitransient_lidar.plots.comparison import plot_comparison
+    from mitransient_lidar.plots.waveforms import plot_comparison
     from mitransient_lidar.results.waveform_files import is_waveform_file
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")

@@ -24,7 +24,7 @@ from mitransient_lidar.core.validation import finite_array, integer, positive
 from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
 from mitransient_lidar.flights.poses.records import ADJUSTMENT_S
 from mitransient_lidar.flights.waveform_packets import PacketWriter
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 if TYPE_CHECKING:
     import laspy

@@ -28,8 +28,8 @@ from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.results.attributes import PointClass, flagged, label
 from mitransient_lidar.results.geometry import lidar_system
-from mitransient_lidar.results.variables import PointClass, flagged, label
 
 #: Pulses of a chunk of a file.
 _CHUNK = 4096

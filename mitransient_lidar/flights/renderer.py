@@ -49,9 +49,8 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.results.attributes import join
+from mitransient_lidar.results.attributes import described, join
 from mitransient_lidar.results.geometry import LinesOfSight
-from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches

@@ -14,7 +14,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.products import Flown
 from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 #: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)

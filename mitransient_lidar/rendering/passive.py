@@ -37,8 +37,7 @@ from mitransient_lidar.rendering.passes import (
     run_passes,
     warn_of_edge_loss,
 )
-from mitransient_lidar.results.attributes import titled
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label, titled
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.daylight.renderer import DaylightRenderer

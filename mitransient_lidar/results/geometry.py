@@ -27,7 +27,7 @@ from mitransient_lidar.physics.lidar.level_sea import (
 )
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 Attributes = Mapping[str, Any]
 

@@ -24,8 +24,7 @@ from mitransient_lidar.core.formats.pulse_waves import pulse_blocks
 from mitransient_lidar.core.formats.waveform_blocks import WaveformBlock
 from mitransient_lidar.core.validation import finite, integer, require_memory
 from mitransient_lidar.physics.lidar.level_sea import snell, surface_time_ns
-from mitransient_lidar.results.attributes import check_attributes, step_of_history
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import check_attributes, label, step_of_history
 
 _LOG = logging.getLogger(__name__)
 

@@ -33,8 +33,8 @@ from mitransient_lidar.core.validation import FloatArray, finite
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.results.attributes import described, label
 from mitransient_lidar.results.files import Given
-from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.studies.cases import Cases
 
 _LOG = logging.getLogger(__name__)
@@ -365,7 +365,8 @@ HeightError = Annotated[float, Option("Standard deviation of the sea surface hei
 RIPPLES = 5.0
 
 #: Winds [m/s] and waters in the tables for uncertainty tools, and depths at which airborne lidars find the bottom.
-WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
+_SURVEY_WINDS, _SURVEY_DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), (1.0, 1.5, 3.0, 6.0, 10.0)
+_SURVEY_WATERS = ("III", "1C", "3C", "5C", "7C", "9C")
 
 
 @checked
@@ -379,9 +380,9 @@ def tpu(
     angles_deg: Annotated[
         Numbers | None, rising("Angles from nadir; by default the instrument's", "degrees", flag="--angles")
     ] = None,
-    winds: Winds = WINDS,
-    waters: Waters = WATERS,
-    depths: Depths = DEPTHS,
+    winds: Winds = _SURVEY_WINDS,
+    waters: Waters = _SURVEY_WATERS,
+    depths: Depths = _SURVEY_DEPTHS,
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
     infrared: Infrared = False,

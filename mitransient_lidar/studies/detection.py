@@ -38,7 +38,7 @@ from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.target_signal import find_target, signal_at, target_gates, target_signal
 

@@ -48,8 +48,8 @@ from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.files import Given
-from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.depth_bias import (
     HeightError,

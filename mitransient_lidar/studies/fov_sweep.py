@@ -27,7 +27,7 @@ from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene

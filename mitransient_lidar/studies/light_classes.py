@@ -16,7 +16,7 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
 
 #: Independent passes, for standard errors.

@@ -21,8 +21,8 @@ from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.geometry import lidar_geometry
-from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     import xarray as xr

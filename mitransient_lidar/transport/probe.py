@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
-from mitransient_lidar.transport.medium.index_layers import refract
+from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose

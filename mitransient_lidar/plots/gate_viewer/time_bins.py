@@ -7,10 +7,9 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.drawing import as_seen
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, described
 from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
-from mitransient_lidar.results.variables import described
 
 #: Variables with a record in time, and their errors; for a signal the standard deviation of one record.
 RECORDS = {"signal": "signal_deviation", "waveform": "waveform_stderr"}

@@ -19,7 +19,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.sea.sea_mesh import grid_faces
 from mitransient_lidar.plots import palette
 from mitransient_lidar.plots.gate_viewer.page import POLICY, packed, part
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid

@@ -30,8 +30,8 @@ from mitransient_lidar.rendering.passes import (
     pass_seed,
     warn_of_edge_loss,
 )
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import build_gates
-from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.paths.histogram import GateWeights

@@ -47,8 +47,7 @@ from mitransient_lidar.rendering.passes import (
 )
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
-from mitransient_lidar.results.attributes import join
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described, join
 
 if TYPE_CHECKING:
     import mitsuba as mi

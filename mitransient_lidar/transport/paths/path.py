@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
-from mitransient_lidar.transport.medium.index_layers import IndexLayers, coinciding
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
+from mitransient_lidar.transport.medium.water import IndexLayers, coinciding
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import WaterScene
