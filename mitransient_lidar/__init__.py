@@ -29,7 +29,6 @@ if importlib.util.find_spec("mitransient_lidar.plugins") is None:
     __path__.append(str(Path(__file__).resolve().parent.parent))
 
 from mitransient_lidar.core.errors import UserError as _UserError
-from mitransient_lidar.core.renamed import FUNCTIONS as _FORMER
 from mitransient_lidar.loading import variants as _variants
 
 _variants.prepare_llvm()
@@ -80,14 +79,12 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.series import render_shots
     from mitransient_lidar.results.waveform_files import waveform_chunks
     from mitransient_lidar.studies.bounds import bounds
-    from mitransient_lidar.studies.depth_bias import depth_bias
+    from mitransient_lidar.studies.depth_bias import depth_bias, tpu
     from mitransient_lidar.studies.detection import detect
-    from mitransient_lidar.studies.estimate import estimate
     from mitransient_lidar.studies.fit import fit
     from mitransient_lidar.studies.forecast import forecast
     from mitransient_lidar.studies.fov_sweep import fov_sweep
-    from mitransient_lidar.studies.scattering_orders import scattering_orders
-    from mitransient_lidar.studies.tpu import tpu
+    from mitransient_lidar.studies.light_classes import estimate, scattering_orders
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -101,7 +98,7 @@ _FUNCTIONS = {
     "depth_image": ("analysis.gates.range_images", "depth_image"),
     "detect": ("studies.detection", "detect"),
     "echoes": ("analysis.waveforms.echo_table", "extract"),
-    "estimate": ("studies.estimate", "estimate"),
+    "estimate": ("studies.light_classes", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
@@ -118,16 +115,19 @@ _FUNCTIONS = {
     "render_passive": ("rendering.passive", "render_passive"),
     "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
-    "scattering_orders": ("studies.scattering_orders", "scattering_orders"),
+    "scattering_orders": ("studies.light_classes", "scattering_orders"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
-    "tpu": ("studies.tpu", "tpu"),
+    "tpu": ("studies.depth_bias", "tpu"),
     "view": ("plots.viewer", "view"),
     "view_points": ("plots.viewer", "view_points"),
     "view_scene": ("plots.viewer", "view_scene"),
     "water_of": ("physics.water.water_types", "water_of"),
     "waveform_chunks": ("results.waveform_files", "waveform_chunks"),
 }
+
+#: Former names of functions, and those that have taken their place.
+_FORMER = {"depth_uncertainty": "tpu", "sweep": "campaign", "waveforms": "echoes"}
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [

@@ -21,11 +21,10 @@ from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.seawater import VISIBLE_RANGE, WAVELENGTH_RANGE, water_absorption
 from mitransient_lidar.physics.water.water_types import default_water, near_infrared_column, water_of
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
-from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
+from mitransient_lidar.plugins.phase import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
-from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.nested_objects import create_object
-from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.medium.water import IndexLayers, Water
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
 
 logger = logging.getLogger(__name__)
@@ -39,6 +38,7 @@ _LEAST_ABSORPTION = 0.8
 _PLUME = tuple(f"plume_{end}" for end in ("scattering", "x", "y", "bearing_deg", "length", "width", "depth"))
 
 
+@register("medium", LAYERED_WATER)
 @closed
 class LayeredWater(mi.Medium):
     r"""Water in horizontal layers (``layered_water``).
@@ -277,6 +277,3 @@ def _check_water_scattering(molecules: np.ndarray, column: WaterColumn) -> None:
             f"water_scattering = {molecules[layer]:g} must be at least 0 and at most scattering = "
             f"{column.scattering[layer]:g}, in layer {layer}"
         )
-
-
-register("medium", LAYERED_WATER, LayeredWater)

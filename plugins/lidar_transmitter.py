@@ -8,7 +8,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
-from mitransient_lidar.physics.lidar.lidar_geometry import WIDTHS, read_divergence
+from mitransient_lidar.physics.lidar.level_sea import WIDTHS, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import DeclaredProperties, EmitterWithoutExtent, read_pose, register
 from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
@@ -16,6 +16,7 @@ from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 
+@register("emitter", LIDAR_TRANSMITTER)
 class LidarTransmitter(EmitterWithoutExtent):
     r"""Pulsed laser transmitter (``lidar_transmitter``).
 
@@ -135,6 +136,3 @@ def _profile(props: DeclaredProperties, kind: str) -> BeamProfile:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
     rotation = float(np.deg2rad(read("ellipse_deg")))
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
-
-
-register("emitter", LIDAR_TRANSMITTER, LidarTransmitter)

@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
+from mitransient_lidar.physics.sea.sea_mesh import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
 from mitransient_lidar.plugins.bases import FOAM, DeclaredProperties, fill_mesh, register
@@ -27,6 +27,7 @@ WAITS = "_waits"
 _BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
 
 
+@register("shape", OCEAN_SURFACE)
 class OceanSurface(mi.Mesh):
     r"""Sea surface with waves of wind and swell, or from a height map (``ocean_surface``).
 
@@ -309,6 +310,3 @@ class SeaPatches:
         else:
             self.shapes.parameters_changed([])
         return positions
-
-
-register("shape", OCEAN_SURFACE, OceanSurface)

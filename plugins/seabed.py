@@ -197,6 +197,7 @@ def _read_patches(text: str) -> tuple[Patch, ...]:
     return tuple(patches)
 
 
+@register("shape", SEABED)
 class Seabed(mi.Mesh):
     r"""Bottom of the sea (``seabed``).
 
@@ -262,6 +263,3 @@ class Seabed(mi.Mesh):
         """Return whether places [m] lie beyond the height map; nowhere without one."""
         terrain = self.bottom.terrain
         return np.zeros(np.shape(x), dtype=bool) if terrain is None else ~terrain.covers(x, y)
-
-
-register("shape", SEABED, Seabed)

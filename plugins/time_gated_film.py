@@ -17,6 +17,7 @@ _GATE_START = ("gate_start_ns", "gate_start_depth", "gate_start_range")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
 
 
+@register("film", TIME_GATED_FILM)
 @closed
 class TimeGatedFilm(mi.Film):
     r"""Time histogram of each pixel's received energy, and gates (``time_gated_film``).
@@ -132,6 +133,3 @@ def _gate_plan(props: DeclaredProperties) -> GatePlan | None:
         shape = GateShape.edges(*map(read, _GATE_SHAPE))
     train = GateTrain.measured(shape.jittered(jitter), 0.0, read("gate_step_ns", shape.width_ns), count, pulses)
     return GatePlan(train, starts[0], start)
-
-
-register("film", TIME_GATED_FILM, TimeGatedFilm)

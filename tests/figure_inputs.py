@@ -15,8 +15,6 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plots.campaigns import plot_campaign
-from mitransient_lidar.plots.comparison import plot_comparison
-from mitransient_lidar.plots.derivatives import plot_derivatives
 from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import plot_gates
 from mitransient_lidar.plots.layout import plot_layout
@@ -27,9 +25,9 @@ from mitransient_lidar.plots.studies.parameters import plot_fit
 from mitransient_lidar.plots.studies.shots import plot_found_shots, plot_shot_statistics
 from mitransient_lidar.plots.studies.targets import plot_target_map, plot_target_signal
 from mitransient_lidar.plots.water import plot_phase_function, plot_profile
-from mitransient_lidar.plots.waveforms import plot_waveforms
+from mitransient_lidar.plots.waveforms import plot_comparison, plot_derivatives, plot_waveforms
 from mitransient_lidar.rendering.shots.truth import SeaMap, Shot
-from mitransient_lidar.studies.find_shots import RenderedShots
+from mitransient_lidar.studies.shots import RenderedShots
 from mitransient_lidar.studies.water_report import fournier_forand_of
 
 PIXELS = ["red", "green", "blue", "black"]

@@ -295,7 +295,7 @@ lever_arm = [0.3, 1.2, -0.5]
 def fly(path: Path) -> None:
     """Work out the pulses of a flight."""
     from mitransient_lidar.core.files import read_text
-    from mitransient_lidar.core.formats.toml_files import check_keys, parse_toml, required, table
+    from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required, table
     from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
     from mitransient_lidar.flights.poses.platforms import platform_of
     from mitransient_lidar.flights.poses.scanner import Scanner

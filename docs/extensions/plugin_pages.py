@@ -62,15 +62,11 @@ def setup(sphinx: Sphinx) -> dict[str, bool]:
 def plugins() -> list[Plugin]:
     """Return the plugins by kind, in the order of `_KINDS`, and by name."""
     found = []
-    for name in PLUGIN_MODULES:
-        module = importlib.import_module(f"mitransient_lidar.plugins.{name}")
-        registered = re.search(r'^register\("(\w+)", (\w+)', inspect.getsource(module), re.MULTILINE)
-        if registered is None:
-            continue  # a base class
-        kind, declared = registered[1], vars(module)[registered[2]]
+    for name, (place, kind) in PLUGIN_MODULES.items():
+        module = importlib.import_module(f"mitransient_lidar.plugins.{place}")
         manuals = {one.__doc__ for one in vars(module).values() if isinstance(one, type)}
-        (manual,) = (text for text in manuals if text and f"(``{declared.name}``)" in text.partition("\n")[0])
-        found.append(Plugin(declared.name, kind, inspect.cleandoc(manual)))
+        (manual,) = (text for text in manuals if text and f"(``{name}``)" in text.partition("\n")[0])
+        found.append(Plugin(name, kind, inspect.cleandoc(manual)))
     return sorted(found, key=lambda one: (list(_KINDS).index(one.kind), one.name))
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.flights.poses.attitude import rotation_matrices
+from mitransient_lidar.flights.poses.records import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Fixed
 from mitransient_lidar.plots import drawing, palette
 

@@ -33,13 +33,12 @@ import test_passive as daylight_scenes  # noqa: E402
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin  # noqa: E402
 from oracles.half_space import banded_reflectance, phase_moments, water_leaving_reflectance  # noqa: E402
 
-from mitransient_lidar.physics.lidar.level_sea import fresnel  # noqa: E402
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem  # noqa: E402
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, fresnel  # noqa: E402
 from mitransient_lidar.physics.sea.double_passage import slope_spread, slope_structures  # noqa: E402
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum  # noqa: E402
 from mitransient_lidar.physics.water.layers import WaterColumn  # noqa: E402
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters  # noqa: E402
-from mitransient_lidar.transport.paths.path_classes import PathClasses  # noqa: E402
+from mitransient_lidar.transport.paths.passes import PathClasses  # noqa: E402
 
 #: Number of random scenes in the table.
 RANDOM_SCENES = 6

@@ -15,8 +15,8 @@ from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.core.tables.written import write_csv
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
+from mitransient_lidar.results.attributes import described
 from mitransient_lidar.results.geometry import required_number
-from mitransient_lidar.results.variables import described
 
 #: Smallest share of shots with a depth for which a cell has an uncertainty.
 LEAST_FOUND = 0.5
@@ -104,13 +104,8 @@ def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: flo
 def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None = None) -> xr.Dataset:
     """Return the sounding uncertainties for one estimator at one altitude, and their fits.
 
-    Parameters
-    ----------
-    table : xarray.Dataset
-        From `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
-        ``refractive_index`` and ``divergence_mrad``.
-    trajectory : TrajectoryErrors, optional
-        Trajectory errors of the survey.
+    `table`: from `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
+    ``refractive_index`` and ``divergence_mrad``. `trajectory`: trajectory errors of the survey.
 
     Returns
     -------

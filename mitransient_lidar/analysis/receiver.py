@@ -30,10 +30,8 @@ from mitransient_lidar.physics.receiver.receiver_files import (
 )
 from mitransient_lidar.physics.receiver.receiver_files import camera as camera_of
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
-from mitransient_lidar.results.attributes import made_from
-from mitransient_lidar.results.companions import join, split
+from mitransient_lidar.results.attributes import join, label, made_from, split
 from mitransient_lidar.results.geometry import optional_number
-from mitransient_lidar.results.variables import label
 
 #: A power, or pixel powers.
 Powers = Union[npt.ArrayLike, "xr.DataArray"]

@@ -22,9 +22,9 @@ from mitransient_lidar.loading.parameters import check_known, values_of
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene, read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 #: Half the side of the square that contains a sea's locations [m].
 _REACH = 256.0
@@ -113,10 +113,7 @@ class RunRenderer(Renderer):
     def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
         """Return the renderer for a new campaign with its run columns, with a record that contains all runs.
 
-        Raises
-        ------
-        UserError
-            If the scene cannot be loaded, or lacks a parameter that the campaign sets.
+        Raises UserError if the scene cannot be loaded, or lacks a parameter that the campaign sets.
         """
         source = source_of(campaign)
         _check_parameters(campaign, columns, source.document())

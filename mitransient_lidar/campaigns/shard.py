@@ -85,12 +85,8 @@ class _End(NamedTuple):
 class Processes:
     """Processes of a campaign's shards, which `end` ends together.
 
-    Parameters
-    ----------
-    versions
-        Required versions, as from `versions.own_versions`; by default any.
-    place
-        Their machine, for messages.
+    `versions`: required versions, as from `versions.own_versions`; by default any. `place`: their machine, for
+    messages.
     """
 
     def __init__(self, versions: Mapping[str, str] | None = None, place: str = "this machine") -> None:
@@ -139,6 +135,8 @@ def render_in_process(
     A run in which the process ends twice has failed. Runs that meet an error of the program or hang stay planned, and
     so do all where the process ends three times before the first run.
 
+    Raises UserError if the store cannot be read or written, or the process has other versions than it must have.
+
     Parameters
     ----------
     path
@@ -151,11 +149,6 @@ def render_in_process(
         Called with the numbers of runs done and failed after each run.
     processes
         Processes that the new one belongs to.
-
-    Raises
-    ------
-    UserError
-        If the store cannot be read or written, or the process has other versions than it must have.
     """
     processes = processes or Processes()
     reasons: dict[int, str] = {}

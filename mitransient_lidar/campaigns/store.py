@@ -34,7 +34,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,15 +79,7 @@ class Store:
     Run arrays have the dimension ``run`` first, in chunks of one shard. One process writes a shard: its arrays, and
     last the ``status`` of its runs. Files replace former ones as a whole.
 
-    Parameters
-    ----------
-    path
-        Store folder.
-
-    Raises
-    ------
-    UserError
-        If there is no such store, or a link is in it.
+    Raises UserError if there is no such store in the folder `path`, or a link is in it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -132,10 +124,7 @@ class Store:
 
         Where another process has just made one, that one is returned.
 
-        Raises
-        ------
-        UserError
-            If the place cannot be written, or `shard_size` is not 1 to 1 000 000.
+        Raises UserError if the place cannot be written, or `shard_size` is not 1 to 1 000 000.
         """
         path = Path(path)
         check_encodable(path)
@@ -253,10 +242,7 @@ class Store:
     def mend(self) -> None:
         """Plan the runs in damaged shards, or shards that have lost an array, again; warn about them.
 
-        Raises
-        ------
-        UserError
-            If an array for all runs is damaged, or the operating system reports an error.
+        Raises UserError if an array for all runs is damaged, or the operating system reports an error.
         """
         self.inputs(slice(0, self.count))
         for shard in self.shards:

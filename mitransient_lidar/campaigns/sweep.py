@@ -120,6 +120,8 @@ def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
 def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
     """Render one campaign run: all shots with everything that `render_shots` returns, with the bits in the store.
 
+    Raises UserError if there is no such run, or it fails.
+
     Parameters
     ----------
     campaign
@@ -128,11 +130,6 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
         Run number.
     options
         Options of `render_shots` instead of the campaign's.
-
-    Raises
-    ------
-    UserError
-        If there is no such run, or it fails.
     """
     if isinstance(campaign, (str, os.PathLike)) and Path(campaign).is_dir():
         store = Store(campaign)

@@ -159,10 +159,7 @@ def on_this_machine(number: int, path: str, retry_failed: bool, tell: Tell) -> I
 def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Iterator[Workers]:
     """Yield the workers in a Dask cluster; processes that still render at the end of the context end with it.
 
-    Raises
-    ------
-    UserError
-        If the scheduler is lost or has other versions, or a shard has lost its worker too often.
+    Raises UserError if the scheduler is lost or has other versions, or a shard has lost its worker too often.
     """
     from distributed import KilledWorker
     from distributed.comm import CommClosedError

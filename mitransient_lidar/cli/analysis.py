@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.generator import OUTPUT, Call, Channel, Command, Lidar, Quiet, Waveforms, waveform_selection
 from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
-from mitransient_lidar.cli.options import OUTPUT, Channel, Lidar, Quiet, Waveforms, waveform_selection
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
@@ -149,7 +148,7 @@ def _echoes(
         raise UserError(f"--wind-speed {wind_speed:g} needs --correct")
     from mitransient_lidar import results
     from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, surface_times
-    from mitransient_lidar.results.companions import INFRARED
+    from mitransient_lidar.results.attributes import INFRARED
     from mitransient_lidar.results.waveform_files import waveform_chunks
 
     selection = waveform_selection(file, waveforms, channel, lidar)
@@ -206,7 +205,7 @@ def _retrieve(
     if output is not None:
         write_netcdf(found, output)
     if figure is not None:
-        from mitransient_lidar.plots.retrieval import plot_retrieval
+        from mitransient_lidar.plots.studies.shots import plot_retrieval
 
         with announced(figure.parent):
             plot_retrieval(found, figure)

@@ -25,7 +25,15 @@ from mitransient_lidar.cli import analysis, campaigns, render, results, scenes, 
 from mitransient_lidar.cli.generator import Command, LazyCommand
 from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.renamed import COMMANDS as RENAMED
+
+#: Former names of commands, and those that have taken their place.
+RENAMED = {
+    "sweep": "campaign",
+    "waveforms": "echoes",
+    "plot": "view --plot",
+    "shot-statistics": "shots --figure",
+    "instruments": "scenes instruments",
+}
 
 #: All commands but ``scenes``, in the order of the help.
 COMMANDS: dict[str, Command] = {

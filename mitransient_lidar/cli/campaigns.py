@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.generator import OUTPUT, Call, Command, Quiet
 from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
-from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.cli.overwriting import replace_freely
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.marks import read_mark

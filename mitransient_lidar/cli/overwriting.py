@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import typer
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli.options import parameters
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import Moves, before_moving
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
@@ -232,6 +231,17 @@ class _Running:
         if len(found) > _MOST_DIFFERENCES:
             found = [*found[:_MOST_DIFFERENCES], f"{len(found) - _MOST_DIFFERENCES} more"]
         return ", ".join(found) or "no option differs"
+
+
+def parameters(definitions: list[str] | None) -> dict[str, str]:
+    """Return scene parameters given as ``name=value``."""
+    params = {}
+    for definition in definitions or []:
+        name, equals, value = definition.partition("=")
+        if not (name.strip() and equals):
+            raise UserError(f"-D {definition} is not of the form name=value")
+        params[name.strip()] = value.strip()
+    return params
 
 
 def _tell(text: str) -> None:

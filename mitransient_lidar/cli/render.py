@@ -17,9 +17,8 @@ from mitransient_lidar.cli.files import (
     scene_of,
     write_netcdf,
 )
-from mitransient_lidar.cli.generator import Call, Command, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Command, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
-from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -66,7 +65,7 @@ def _render(
 #: Functions that draw a result, by their file name endings.
 _DRAWINGS = {
     "_components": "plots.waveforms:plot_components",
-    "_derivatives": "plots.derivatives:plot_derivatives",
+    "_derivatives": "plots.waveforms:plot_derivatives",
     "_layout": "plots.layout:plot_layout",
     "": "plots.waveforms:plot_waveforms",
 }
@@ -75,7 +74,7 @@ _DRAWINGS = {
 def _write(dataset: xr.Dataset, target: Path) -> None:
     """Write a result or its figure, but no EXR file beyond the memory, and no layout of pixels that miss the sea."""
     from mitransient_lidar import results
-    from mitransient_lidar.results.companions import split
+    from mitransient_lidar.results.attributes import split
 
     if target.suffix != ".nc":
         dataset, _ = split(dataset)
@@ -171,7 +170,7 @@ def _shots(
     from mitransient_lidar.plots.studies.shots import plot_shot_statistics
     from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.shots import series as study
-    from mitransient_lidar.studies import shot_statistics as statistics
+    from mitransient_lidar.studies import shots as statistics
 
     if places is not None:
         given = {**given, "positions": study.read_places(places)}

@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix, write_page
-from mitransient_lidar.cli.generator import Command
-from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import (
+from mitransient_lidar.cli.generator import (
     Channel,
+    Command,
     Define,
     DrawingOnly,
     Lidar,
     Quiet,
     Waveforms,
-    parameters,
     waveform_selection,
 )
-from mitransient_lidar.cli.overwriting import draws_again
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.overwriting import draws_again, parameters
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -177,7 +176,7 @@ def _compare(
     """Compare and draw two results."""
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
-    from mitransient_lidar.plots.comparison import plot_comparison
+    from mitransient_lidar.plots.waveforms import plot_comparison
     from mitransient_lidar.results.waveform_files import is_waveform_file
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")

@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import Call, Command, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Command, DrawingOnly, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
-from mitransient_lidar.cli.options import OUTPUT, DrawingOnly, Quiet
 
 Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
 
@@ -22,16 +21,18 @@ def _study(
     describe: str,
     text: str,
     *,
+    module: str = "",
     function: str = "",
     table: str = "",
     table_suffix: str = ".csv",
     has_data: bool = True,
 ) -> Command:
-    """Return the command for a study module and its function, which by default share their name.
+    """Return the command for a study function, which by default shares its name with its module and files.
 
     `plot` is the function in ``plots`` that draws the result, as ``module:name``; `describe` returns its lines; `table`
     writes another file, with the suffix `table_suffix`.
     """
+    place = f"studies.{module or name}"
     suffixes = (".nc",) * has_data + (table_suffix,) * bool(table)
 
     def body(call: Call, output: Figure = OUTPUT / f"{name}.png", quiet: Quiet = False) -> None:
@@ -42,12 +43,12 @@ def _study(
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
-                function_at(f"studies.{name}:{table}")(found, output.with_suffix(table_suffix))
-        typer.echo("\n".join(function_at(f"studies.{name}:{describe}")(found)))
+                function_at(f"{place}:{table}")(found, output.with_suffix(table_suffix))
+        typer.echo("\n".join(function_at(f"{place}:{describe}")(found)))
         for one in getattr(found, "results", [found])[:1]:
             exit_if_interrupted(one)
 
-    return Command("Study", f"studies.{name}:{function or name}", body, text)
+    return Command("Study", f"{place}:{function or name}", body, text)
 
 
 def _water(call: Call, output: DrawingOnly = None) -> None:
@@ -94,7 +95,7 @@ def _tpu(
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
     from mitransient_lidar.loading.instruments import read_instrument
     from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
-    from mitransient_lidar.studies.tpu import describe_tpu
+    from mitransient_lidar.studies.depth_bias import describe_tpu
 
     instrument = call.arguments["instrument"]
     read_instrument(instrument)
@@ -128,6 +129,7 @@ STUDIES = {
 
         Lists and draws locations whose slope faces the lidar or turns away from it, is level, or sideways.
         """,
+        module="shots",
         has_data=False,
     ),
     "target-signal": _study(
@@ -157,6 +159,7 @@ STUDIES = {
 
         Looks up the light in maps of the beam: a first look, and a second opinion on a render.
         """,
+        module="light_classes",
     ),
     "bounds": _study(
         "bounds",
@@ -192,6 +195,7 @@ STUDIES = {
 
         Each order is also separated by its vertical reversals: one, or several.
         """,
+        module="light_classes",
     ),
     "forecast": _study(
         "forecast",
@@ -225,7 +229,7 @@ STUDIES = {
     ),
     "tpu": Command(
         "Study",
-        "studies.tpu:tpu",
+        "studies.depth_bias:tpu",
         _tpu,
         """Determine the vertical and horizontal uncertainty of an instrument's soundings.
 

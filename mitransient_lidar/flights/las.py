@@ -22,9 +22,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file, replacing, together
 from mitransient_lidar.core.validation import finite_array, integer, positive
 from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, TIME_NOTES, coordinate_system_wkt, las_header
-from mitransient_lidar.flights.poses.times import ADJUSTMENT_S
+from mitransient_lidar.flights.poses.records import ADJUSTMENT_S
 from mitransient_lidar.flights.waveform_packets import PacketWriter
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 if TYPE_CHECKING:
     import laspy

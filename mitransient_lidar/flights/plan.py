@@ -16,10 +16,9 @@ import numpy as np
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.formats.toml_files import parse_toml
+from mitransient_lidar.core.formats.documents import parse_toml
 from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan, one_of
+from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
@@ -28,7 +27,7 @@ from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
-from mitransient_lidar.rendering.options import LIGHT, LightOption
+from mitransient_lidar.rendering.passes import LIGHT, LightOption
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
@@ -188,7 +187,7 @@ class FlightPlan(Plan):
         return pulse_poses(trajectory, self.mounting, Scanner.of_table(self.scanner), times)
 
     def time_system(self, times: FloatArray) -> str:
-        """Return the system of the times [s] of the pulses, as of `times.time_system`."""
+        """Return the system of the times [s] of the pulses, as of `records.time_system`."""
         return self._platform.time_system(times)
 
     @cached_property

@@ -16,8 +16,8 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, IntArray, f
 from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths, Timing
 from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.results.attributes import PointClass, flagged, label
 from mitransient_lidar.results.geometry import optional_number
-from mitransient_lidar.results.variables import PointClass, flagged, label
 
 _PER_NS = 0.5e-9 * C0  # distance in air per nanosecond of a two-way time [m/ns]
 _ORTHONORMAL = 1e-6  # largest error of lengths and products of the directions of a pose

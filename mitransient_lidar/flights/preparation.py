@@ -98,11 +98,8 @@ def axis_of(plan: FlightPlan, source: SceneSource, inputs: Mapping[str, Column])
 
     The number is that of pulses which meet the bottom beyond its height map.
 
-    Raises
-    ------
-    UserError
-        If the bottom does not cover the places of the pulses or lies elsewhere than the flight says, or its light
-        arrives after the record.
+    Raises UserError if the bottom does not cover the places of the pulses or lies elsewhere than the flight says, or
+    its light arrives after the record.
     """
     from mitransient_lidar.transport.plugin_types import SeabedShape
     from mitransient_lidar.transport.probe import axis_on_bottom

@@ -28,8 +28,8 @@ from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.results.attributes import PointClass, flagged, label
 from mitransient_lidar.results.geometry import lidar_system
-from mitransient_lidar.results.variables import PointClass, flagged, label
 
 #: Pulses of a chunk of a file.
 _CHUNK = 4096
@@ -113,13 +113,8 @@ class Flown:
 def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     """Return the echoes of all pulses, with times after their pulse, and depths for the angle of each.
 
-    Parameters
-    ----------
-    flown
-        The pulses.
-    corrections
-        ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With them there is ``beyond_table``:
-        whether the angle of the pulse or the depth is outside the table.
+    `flown`: the pulses. `corrections`: ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With
+    them there is ``beyond_table``: whether the angle of the pulse or the depth is outside the table.
     """
     attributes, store = flown.attributes, flown.store
     later = flown.values("time_offset_ns")
@@ -168,15 +163,11 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
 def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     """Return the points of all echoes, in coordinates of the scene.
 
-    Returns
-    -------
-    xarray.Dataset
-        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
-        ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
-        ``class_probability``; and the truth: ``true_z`` [m], the mean
-        height of the surface in the beam or, for points below it, that of the highest solid at x and y;
-        ``true_target``, whether that solid is a target; and of the pulse ``true_surface_height``,
-        ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
+    Returns points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
+    ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
+    ``class_probability``; and the truth: ``true_z`` [m], the mean height of the surface in the beam or, for points
+    below it, that of the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
+    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
     """
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
@@ -209,10 +200,7 @@ def read_points(path: Path) -> xr.Dataset:
     Those of a store are as of `points_of`. Those of a file have ``x``, ``y``, ``z`` [m], ``kind`` and, if the file has
     it, ``vertical_uncertainty`` [m].
 
-    Raises
-    ------
-    UserError
-        If nothing of these is there, or it has no points.
+    Raises UserError if nothing of these is there, or it has no points.
     """
     if path.is_dir():
         flown = Flown.of(Store(path / "flight.zarr" if (path / "flight.zarr").is_dir() else path))

@@ -37,12 +37,7 @@ def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -
 def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str, float]:
     """Return the settings of automatic channels, as inputs of pulses: those with which no probe saturates.
 
-    Parameters
-    ----------
-    probes
-        Rendered pulses of the flight, in parts.
-    plan
-        The flight.
+    `probes`: rendered pulses of the flight, in parts. `plan`: the flight.
     """
     gains: dict[int, float] = {}
     densities: dict[int, float] = {}

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_array
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract
@@ -33,10 +32,8 @@ class PoseErrors(Plan):
         Roll turns about the horizontal part of `forward`, shape (3,) or (shots, 3), pitch about the horizontal
         direction across it, heading about the vertical. With equal errors of roll and pitch any direction will do.
 
-        Raises
-        ------
-        UserError
-            If `forward` is vertical, of another shape, or missing where roll and pitch have different errors.
+        Raises UserError if `forward` is vertical, of another shape, or missing where roll and pitch have different
+        errors.
         """
         if forward is None:
             if self.roll_deg != self.pitch_deg:

@@ -24,7 +24,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
-from mitransient_lidar.flights.poses.times import tell_time_system
+from mitransient_lidar.flights.poses.records import tell_time_system
 from mitransient_lidar.flights.preparation import (
     axis_of,
     input_columns,
@@ -49,9 +49,8 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import read_source
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.results.companions import join
+from mitransient_lidar.results.attributes import described, join
 from mitransient_lidar.results.geometry import LinesOfSight
-from mitransient_lidar.results.variables import described
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches
@@ -89,11 +88,8 @@ class FlightRenderer(Renderer):
         That is what poses are beyond the corrections, and by a sample of pulses the time that the flight takes and how
         many pulses saturate. `progress` is called with a `Progress` of the groups, and of the sample.
 
-        Raises
-        ------
-        UserError
-            If the flight, its scene or its corrections are invalid, the bottom does not cover it, or its echo is
-            outside the record.
+        Raises UserError if the flight, its scene or its corrections are invalid, the bottom does not cover it, or its
+        echo is outside the record.
         """
         poses = plan.poses()
         tell_time_system(plan.time_system(poses.time_s), poses.time_s)
@@ -321,10 +317,7 @@ class FlightRenderer(Renderer):
 def scene_of(plan: FlightPlan) -> SceneSource:
     """Return the source of the scene of a flight, with its instrument.
 
-    Raises
-    ------
-    UserError
-        If it cannot be read, or lacks a parameter.
+    Raises UserError if it cannot be read, or lacks a parameter.
     """
     source = read_source(plan.scene, plan.parameters, plan.instrument, plan.stated_origin)
     for name in POSE_PARAMETERS:

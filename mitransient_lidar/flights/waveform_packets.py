@@ -25,18 +25,11 @@ _MOST_SHIFT_PS = 10.0  # 1.5 mm in air
 class PacketWriter:
     """Writer of a file of waveform packets (.wdp) of LAS 1.4: a header of 60 bytes, then packets of one size.
 
-    Parameters
-    ----------
-    file : IO[bytes]
-        File, empty and open for writing, that can seek.
-    first : xr.Dataset
-        First waveforms, see `append`; they give samples per packet, gain, offset and spacing for the file.
+    Raises UserError if `gain` or `sampling_ns` is not positive, `offset` is not finite, there is no sample, or rounding
+    the spacing to whole picoseconds, as LAS stores it, shifts the last sample by more than 10 ps.
 
-    Raises
-    ------
-    UserError
-        If `gain` or `sampling_ns` is not positive, `offset` is not finite, there is no sample, or rounding the spacing
-        to whole picoseconds, as LAS stores it, shifts the last sample by more than 10 ps.
+    `file`: file, empty and open for writing, that can seek. `first`: first waveforms, see `append`; they give samples
+    per packet, gain, offset and spacing for the file.
     """
 
     def __init__(self, file: IO[bytes], first: xr.Dataset):

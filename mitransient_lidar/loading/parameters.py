@@ -217,13 +217,9 @@ def value_of(parameters: Mapping[str, str], name: str) -> float:
     Raises UserError if there is no such parameter or element, it is a list and `name` has no index, or it is no finite
     number.
 
-    Parameters
-    ----------
-    parameters
-        Scene parameters with their values as text.
-    name
-        Parameter name; for a list, such as "0.9, 0.5", with the index of an element from 0 on (``attenuation[1]``). A
-        list with one value holds for every layer of ``layer_tops``, and has their indices, too.
+    `parameters`: scene parameters with their values as text. `name`: parameter name; for a list, such as "0.9, 0.5",
+    with the index of an element from 0 on (``attenuation[1]``). A list with one value holds for every layer of
+    ``layer_tops``, and has their indices, too.
     """
     words, index = _words(parameters, name)
     return finite(name, words[index])

@@ -27,32 +27,18 @@ OLDEST_USABLE_LLVM = 17
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
-#: Plugin modules, below ``mitransient_lidar.plugins``, each with its plugin's kind.
+#: Plugins: module below ``mitransient_lidar.plugins``, and kind. Modules are imported in this order.
 PLUGIN_MODULES = {
-    "bases": None,  # first, with phase.tabulated: others derive from them
-    "phase.tabulated": None,
-    "phase.fournier_forand": "phase",
-    "phase.petzold": "phase",
-    "phase.sea_water": "phase",
-    "phase.measured_phase": "phase",
-    "phase.two_term_henyey_greenstein": "phase",
-    "layered_water": "medium",
-    "gram_charlier_dielectric": "bsdf",
-    "ocean_surface": "shape",
-    "seabed": "shape",
-    "retroreflector": "bsdf",
-    "plants.leaf": "bsdf",
-    "plants.canopy": "shape",
-    "sediment": "bsdf",
-    "lidar_transmitter": "emitter",
-    "sun": "emitter",
-    "sky": "emitter",
-    "pixel_fov": "sensor",
-    "multipixel_receiver": "sensor",
-    "time_gated_film": "film",
-    "lidar_volpath": "integrator",
-    "lidar_merging": "integrator",
-    "passive_volpath": "integrator",
+    **dict.fromkeys(("fournier_forand", "petzold", "sea_water", "measured_phase"), ("phase", "phase")),
+    "two_term_henyey_greenstein": ("phase", "phase"),
+    "layered_water": ("layered_water", "medium"),
+    **dict.fromkeys(("gram_charlier_dielectric", "retroreflector", "leaf", "sediment"), ("bsdfs", "bsdf")),
+    **{name: (name, "shape") for name in ("ocean_surface", "seabed", "canopy")},
+    "lidar_transmitter": ("lidar_transmitter", "emitter"),
+    **dict.fromkeys(("sun", "sky"), ("daylight", "emitter")),
+    **dict.fromkeys(("pixel_fov", "multipixel_receiver"), ("receivers", "sensor")),
+    "time_gated_film": ("time_gated_film", "film"),
+    **dict.fromkeys(("lidar_volpath", "lidar_merging", "passive_volpath"), ("integrators", "integrator")),
 }
 
 _registered_for: str | None = None
@@ -235,7 +221,7 @@ def register_plugins(_old: str | None, new: str) -> None:
         return
     if new == _registered_for:
         return
-    for name in PLUGIN_MODULES:
+    for name in dict.fromkeys(["bases", *(module for module, _ in PLUGIN_MODULES.values())]):
         module = f"mitransient_lidar.plugins.{name}"
         if module in sys.modules:
             importlib.reload(sys.modules[module])
@@ -254,9 +240,8 @@ def _register_refusals() -> None:
             "is active: call mitsuba.set_variant before the scene is loaded"
         )
 
-    for name, kind in PLUGIN_MODULES.items():
-        if kind is not None:
-            getattr(mi, f"register_{kind}")(name.rpartition(".")[2], refuse)
+    for name, (_, kind) in PLUGIN_MODULES.items():
+        getattr(mi, f"register_{kind}")(name, refuse)
 
 
 def versions() -> dict[str, str]:

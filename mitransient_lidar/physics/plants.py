@@ -80,12 +80,7 @@ class Canopy:
 
         Raises UserError if they exceed the memory.
 
-        Parameters
-        ----------
-        side
-            Side of the square that contains the blades, or the leaf centres [m].
-        seed
-            Random seed.
+        `side`: side of the square that contains the blades, or the leaf centres [m]. `seed`: random seed.
 
         Returns
         -------

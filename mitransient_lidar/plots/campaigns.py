@@ -42,6 +42,8 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
     parameter pairs: the mean over runs of the share of records with a bottom echo, else of the peak power, else of the
     error.
 
+    Raises UserError if no run is done, or the file name has another suffix.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -50,11 +52,6 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
         PNG, PDF or SVG file to write.
     seed : int
         Sample seed.
-
-    Raises
-    ------
-    UserError
-        If no run is done, or the file name has another suffix.
     """
     figure = drawing.new_figure(path, 11.0, 9.6)
     done = np.flatnonzero(dataset["status"].values == _DONE)

@@ -74,10 +74,8 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
 
     Results without refractive index, targets or bottom in their attributes have fewer planes.
 
-    Raises
-    ------
-    UserError
-        If the result's attributes contain no lidar pose or no field of view, or the receiver looks above the horizon.
+    Raises UserError if the result's attributes contain no lidar pose or no field of view, or the receiver looks above
+    the horizon.
     """
     attributes = dataset.attrs
     ground = _Ground.of_result(attributes)
@@ -109,10 +107,7 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
 def draw_sea_level(ax: Axes, dataset: xr.Dataset) -> None:
     """Draw pixels, beam and targets on the mean sea level, as `plot_layout`; targets are where the receiver sees them.
 
-    Raises
-    ------
-    UserError
-        As `plot_layout`.
+    Raises UserError as `plot_layout`.
     """
     ground = _Ground.of_result(dataset.attrs)
     plane = _planes(dataset.attrs, json.loads(dataset.attrs.get("target_outlines", "[]")))[0]
@@ -124,10 +119,7 @@ def draw_sea_level(ax: Axes, dataset: xr.Dataset) -> None:
 def axis_points(dataset: xr.Dataset) -> list[str]:
     """Return, for each plane of `plot_layout`, its name and the points where receiver's axis and laser's axis meet it.
 
-    Raises
-    ------
-    UserError
-        If the result's attributes contain no lidar pose.
+    Raises UserError if the result's attributes contain no lidar pose.
     """
     ground = _Ground.of_result(dataset.attrs)
     planes = _planes(dataset.attrs, json.loads(dataset.attrs.get("target_outlines", "[]")))

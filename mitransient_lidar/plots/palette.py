@@ -14,7 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.colors import to_hex
 
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 #: Colours of things without an order; the first four are those of the published pixels.
 CATEGORIES = RED, GREEN, BLUE, BLACK, ORANGE, SKY, PURPLE = (

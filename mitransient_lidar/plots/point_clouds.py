@@ -14,7 +14,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.products import Flown
 from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 #: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
@@ -42,6 +42,8 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
     errors. The second one has the waveforms and points in a strip, through a target if points lie on one. The side view
     is along x or y, over which points extend farther, the strip along x or y and through most points.
 
+    Returns the files.
+
     Parameters
     ----------
     flown
@@ -50,11 +52,6 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
         Their points, as from `flights.products.points_of`.
     folder
         Folder for the files.
-
-    Returns
-    -------
-    list of Path
-        The files.
     """
     paths = [folder / "flight.png", folder / "profile.png"]
     figure = drawing.new_figure(paths[0], 11, 8.5)

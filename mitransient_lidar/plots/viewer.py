@@ -125,13 +125,12 @@ def view_scene(
         As `open_scene`, and if the scene has no receiver.
     """
     from mitransient_lidar.loading.scenes import open_scene
-    from mitransient_lidar.plots.scene_viewer import traces
-    from mitransient_lidar.plots.scene_viewer.page import page_text
+    from mitransient_lidar.plots.scene_viewer import page
     from mitransient_lidar.rendering.geometry import scene_geometry
 
     geometry = scene_geometry(open_scene(scene, params, instrument))
-    about = traces.scene_views(geometry), traces.scene_notes(geometry)
-    return View(page_text(geometry.name, "scene", [*traces.scene_traces(geometry)], *about), geometry.name, height)
+    about = page.scene_views(geometry), page.scene_notes(geometry)
+    return View(page.page_text(geometry.name, "scene", [*page.scene_traces(geometry)], *about), geometry.name, height)
 
 
 def view_points(source: str | os.PathLike[str], *, height: int = 640) -> View:
@@ -153,11 +152,10 @@ def view_points(source: str | os.PathLike[str], *, height: int = 640) -> View:
         If it is no such store or file, or has no points.
     """
     from mitransient_lidar.flights.products import read_points
-    from mitransient_lidar.plots.scene_viewer import traces
-    from mitransient_lidar.plots.scene_viewer.page import page_text
+    from mitransient_lidar.plots.scene_viewer import page
 
     path = checked_path("source", source)
     points = read_points(path)
     name = path.parent.name if path.name == "flight.zarr" else path.stem
-    about = traces.point_views(points), traces.point_notes(points)
-    return View(page_text(name, "points", [*traces.point_traces(points)], *about), name, height)
+    about = page.point_views(points), page.point_notes(points)
+    return View(page.page_text(name, "points", [*page.point_traces(points)], *about), name, height)

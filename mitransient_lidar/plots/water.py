@@ -90,10 +90,7 @@ def plot_profile(profile: Profile, layers: WaterColumn, title: str, path: drawin
     The left panel has the coefficients against depth, lines for the profile and steps for the layers; the right panel
     has the Fournier-Forand functions of at most 8 layers that differ in bb/b.
 
-    Raises
-    ------
-    UserError
-        If no Fournier-Forand function has the bb/b of a layer.
+    Raises UserError if no Fournier-Forand function has the bb/b of a layer.
     """
     figure = drawing.new_figure(path, 10.4, 5.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))

@@ -1,9 +1,9 @@
-"""Figures for a result: waveforms of a few pixels, or an imager's image and summed waveform."""
+"""Figures for a result: waveforms of a few pixels with their derivatives, or an imager's image and summed waveform."""
 
 from __future__ import annotations
 
 import json
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
@@ -11,11 +11,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from mitransient_lidar.analysis.comparison import Comparison
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 from mitransient_lidar.results.waveform_files import FILE
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
 
 Scale = Literal["both", "linear", "log"]
 
@@ -71,17 +76,9 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
 
     For a shot series, it is their mean.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result of `rendering.render.render`, or a shot series, with components.
-    path : path, optional
-        File to write.
+    Raises UserError if the result's light was not separated.
 
-    Raises
-    ------
-    UserError
-        If the result's light was not separated.
+    `dataset`: a result of `rendering.render.render`, or a shot series, with components. `path`: file to write.
     """
     name = "waveform_by_origin"
     if name not in dataset:
@@ -264,3 +261,134 @@ def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
     if error is not None:
         parts.append(f"median standard error {100 * error:.2g} %")
     return "  ·  ".join(parts)
+
+
+#: Panel height [inch], and largest number of panels.
+_PANEL, _MOST = 1.5, 12
+
+#: Share of the largest power below which relative changes are not drawn.
+_SMALLEST = 1e-3
+
+
+def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw how much the waveform over all pixels changes where a parameter grows, with its standard error.
+
+    A panel for each parameter, below the waveform: the change in percent for 1 % more of the parameter, where the power
+    is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the band
+    over several pixels is an upper bound, the sum of their errors.
+
+    Raises UserError if the result has no derivatives.
+
+    `dataset`: a result of `rendering.render.render` with derivatives, for one shot. `path`: file to write.
+    """
+    name = "waveform_derivative"
+    if name not in dataset or "shot" in dataset[name].dims:
+        raise UserError(f"the dataset has no variable {name} of one shot: render it with derivatives")
+    pixels = [dim for dim in dataset["waveform"].dims if dim != "time"]
+    power = dataset["waveform"].sum(pixels).values
+    slopes = dataset[name].sum(pixels).transpose("parameter", "time").values
+    errors = dataset[f"{name}_stderr"].sum(pixels).transpose("parameter", "time").values
+    parameters = [str(one) for one in dataset["parameter"].values][:_MOST]
+    lit = power > _SMALLEST * np.nanmax(power, initial=0.0)
+    factor, prefix = drawing.si_prefix(float(np.nanmax(power, initial=0.0)) or 1.0)
+    figure = drawing.new_figure(path, 8.0, _PANEL * (len(parameters) + 1.4))
+    panels = figure.subplots(len(parameters) + 1, 1, sharex=True, squeeze=False)[:, 0]
+    panels[0].plot(dataset["time"], power / factor, color="black", linewidth=1.3)
+    panels[0].set_ylabel(f"power ({prefix}W)")
+    for number, (parameter, ax) in enumerate(zip(parameters, panels[1:], strict=True)):
+        value = float(dataset["parameter_value"].values[number])
+        scale = np.where(lit, (value or 1.0) / np.where(lit, power, 1.0), np.nan)
+        change, spread = slopes[number] * scale, errors[number] * np.abs(scale)
+        time, colour = dataset["time"].values, palette.CATEGORIES[number % len(palette.CATEGORIES)]
+        ax.axhline(0, color="0.6", linewidth=0.8)
+        ax.fill_between(time, change - spread, change + spread, color=colour, alpha=0.35, linewidth=0)
+        ax.plot(time, change, color=colour, linewidth=1.2)
+        unit = str(dataset["parameter_units"].values[number])
+        shown = f"{parameter} = {value:.4g}" + ("" if unit == "1" else f" {unit}")
+        ax.set_title(shown, loc="left", fontsize="medium", pad=3)
+        ax.set_ylabel("% per %" if value else "relative")
+    panels[-1].set_xlabel(drawing.TIME_LABEL)
+    for ax in panels:
+        ax.set_xlim(drawing.time_limits(dataset))
+        drawing.add_grid(ax, hide=("right", "top"))
+    bands = "standard errors" if dataset["waveform"].isel(time=0).size == 1 else "upper bounds of standard errors"
+    text = f"change of the received power with parameters of the scene; bands, where wider than lines: {bands}"
+    figure.suptitle(text, fontsize="medium")
+    return drawing.save(figure, path)
+
+
+#: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
+_MOST_CURVES = 64
+
+#: Bins from one marker on a curve to the next one.
+_MARK_EVERY = 12
+
+
+def plot_comparison(
+    first: xr.Dataset, second: xr.Dataset, outcome: Comparison, path: drawing.FilePath | None = None
+) -> Figure:
+    """Draw two results with bands of two standard errors, and below them their difference in standard errors.
+
+    For more than 64 pixels, it draws the summed waveforms, and the range of all differences in each bin. The results
+    have the same pixels and time bins; `outcome` comes from `analysis.comparison.compare`.
+    """
+    figure = drawing.new_figure(path, 9.6, 6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
+    time = first["time"].values
+    are_few = len(outcome.z) <= _MOST_CURVES
+    marks = palette.marked(len(outcome.z) if are_few else 1)
+    powers, errors = ([_by_pixel(one, name) for one in (first, second)] for name in ("waveform", "waveform_stderr"))
+    counted = np.isfinite(outcome.z)
+    if not are_few:
+        # Pixels share light: their sum's error differs from the error for independent pixels, and has no band.
+        known = np.isfinite(powers[0]) & np.isfinite(powers[1])
+        powers = [np.where(known, power, 0).sum(axis=0, keepdims=True) for power in powers]
+        errors = [np.zeros_like(power) for power in powers]
+    for power, error, style, label in zip(powers, errors, ("-", "--"), _labels(first, second), strict=True):
+        for i, mark in enumerate(marks):
+            curve = {
+                **mark,
+                "markevery": _MARK_EVERY,
+                "markersize": 3.5,
+                "linestyle": style,
+                "linewidth": 0.9,
+                "label": "_" if i else label,
+            }
+            drawing.draw_band(upper, time, power[i], 2 * error[i], lowest=1e-30, **curve)
+    shown = powers[0][counted if are_few else counted.any(axis=0, keepdims=True)]
+    upper.set_yscale("log")
+    upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
+    upper.set_xlim(drawing.time_limits(first))
+    quantity, unit = ("energy in the gate", "J") if "gate" in first.coords else ("received power", "W")
+    upper.set_ylabel(f"{quantity}{'' if are_few else ', all pixels'} ({unit})")
+    upper.legend(frameon=False)
+    if are_few:
+        for z, mark in zip(outcome.z, marks, strict=True):
+            lower.plot(time, z, linestyle="none", markersize=3, **mark)
+    else:
+        lowest, highest = np.where(counted, outcome.z, np.inf).min(0), np.where(counted, outcome.z, -np.inf).max(0)
+        lower.vlines(time[counted.any(0)], lowest[counted.any(0)], highest[counted.any(0)], color=marks[0]["color"])
+    for level in (-outcome.limit, outcome.limit):
+        lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
+    largest = 1.5 * max(outcome.limit, outcome.largest)
+    lower.set(ylim=(-largest, largest), xlabel=drawing.time_label(first), ylabel="difference\n(standard errors)")
+    for ax in (upper, lower):
+        drawing.add_grid(ax)
+    text = f"{outcome.bin_count} bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f} standard errors"
+    text += f" (limit of chance {outcome.limit:.1f})"
+    figure.suptitle(drawing.titled(first.attrs, text), fontsize="medium")
+    return drawing.save(figure, path)
+
+
+def _labels(first: xr.Dataset, second: xr.Dataset) -> list[str]:
+    """Return labels for two results: the first of their attributes that differs."""
+    for name in ("integrator", "scene", "instrument", "variant", "passes", "seed"):
+        values = [str(result.attrs.get(name, "")) for result in (first, second)]
+        if values[0] != values[1] and all(values):
+            return [value if name in ("integrator", "scene", "instrument") else f"{name} {value}" for value in values]
+    return ["first result", "second result"]
+
+
+def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:
+    values = result[name].values
+    return np.asarray(values.reshape(-1, values.shape[-1]))

@@ -21,9 +21,9 @@ from mitransient_lidar.rendering.accuracy import (
     PassStatistics,
     received_power,
 )
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
-from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -18,7 +18,7 @@ from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_source import SceneSource, json_attribute
-from mitransient_lidar.rendering.options import KEPT, LIGHT
+from mitransient_lidar.rendering.passes import KEPT, LIGHT
 from mitransient_lidar.rendering.passive import MOST_FRAMES
 
 logger = logging.getLogger(__name__)
@@ -69,13 +69,9 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
 
     Raises UserError if the result does not contain its scene or an option, or contains only some shots of a series.
 
-    Parameters
-    ----------
-    result
-        Dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
-    options
-        Options of that function which replace the result's, unless they are None; its parameters are added to the
-        scene's.
+    `result`: dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
+    `options`: options of that function which replace the result's, unless they are None; its parameters are added to
+    the scene's.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)

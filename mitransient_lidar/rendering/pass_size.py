@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.transport.paths.histogram import GateWeights
 from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
 from mitransient_lidar.transport.scene import LidarScene

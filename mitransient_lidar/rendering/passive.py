@@ -22,25 +22,22 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.rendering.accuracy import RatioStatistics
-from mitransient_lidar.rendering.options import (
+from mitransient_lidar.rendering.passes import (
     MOST_PASSES,
+    TOLERATED_LOSS,
+    Goal,
     MaxTime,
+    PassLog,
+    ProgressCallback,
     SignedSeed,
     TargetError,
     TargetQuantile,
     Variant,
-)
-from mitransient_lidar.rendering.passes import (
-    TOLERATED_LOSS,
-    Goal,
-    PassLog,
-    ProgressCallback,
     pass_seed,
     run_passes,
     warn_of_edge_loss,
 )
-from mitransient_lidar.results.attributes import titled
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label, titled
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.daylight.renderer import DaylightRenderer

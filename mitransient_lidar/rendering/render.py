@@ -16,23 +16,27 @@ from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, ope
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.options import (
+from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
+    TOLERATED_LOSS,
     Batches,
     Components,
     Derivatives,
+    Goal,
     MaxMemory,
     MaxTime,
     Passes,
+    ProgressCallback,
     RenderOptions,
     SignedSeed,
     Smooth,
     TargetError,
     TargetQuantile,
     Variant,
+    run_passes,
+    warn_of_edge_loss,
 )
-from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.companions import join, split
+from mitransient_lidar.results.attributes import join, split
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -82,21 +86,15 @@ def render(
         unless others are given. See `render_again`.
     params
         Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
-    instrument
-        Name of the instrument whose laser and receiver replace an XML scene's, as `loading.instruments` lists them.
     infrared
         Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
-        `loading.instruments.with_infrared` for the parameters, and `results.companions`.
-    sensor
-        Id of a receiver in the scene, by default the first one.
+        `loading.instruments.with_infrared` for the parameters, and `results.attributes`.
     integrator
         Name or dict of an integrator plugin, or an integrator; by default the scene's.
     target_error
         Relative standard error, greater than 0, at most 1, that ends the render after at least 8 passes. 95 % of the
         bins of lit pixels must have reached it, from the surface echo to the end of the bottom echo. With gates, 95 %
         of the gates must have reached it, in the median over their lit pixels.
-    target_quantile
-        Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time
         Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
         longer, with fewer paths (the attribute ``pass_share``).
@@ -186,15 +184,10 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     Raises UserError if the result does not contain its scene, a file of the scene has changed, shots were selected or
     reordered, or an option is invalid.
 
-    Parameters
-    ----------
-    result
-        Dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset that was
-        computed from a result, such as gates or receiver signals, gives a render of that result. A series gives all
-        shots, or the shots that were completed before Ctrl-C.
-    options
-        Options of the function that rendered the result, by default the values in its attributes. `params` are added to
-        its scene's parameters.
+    `result`: dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset
+    that was computed from a result, such as gates or receiver signals, gives a render of that result. A series gives
+    all shots, or the shots that were completed before Ctrl-C. `options`: options of the function that rendered the
+    result, by default the values in its attributes. `params` are added to its scene's parameters.
 
     Returns
     -------
@@ -229,7 +222,7 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or DEFAULT_MAX_MEMORY_GB
-    from mitransient_lidar.transport.paths.path_classes import check_solids
+    from mitransient_lidar.transport.paths.passes import check_solids
 
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))

@@ -1,11 +1,19 @@
-"""Attributes and coordinates of results: their types in files, kinds and ranges, checked where a result is read."""
+"""Variables, attributes and coordinates of results: units and long names (CF-1.11), types in files, and ranges.
+
+The registry of variables is the file ``variables.csv``. `label` describes a dataset's variables by their names.
+Standard errors and limits follow from their variable. A name with several meanings has an entry for each dataset kind,
+``kind.name``. Variables of an instrument's infrared channel have names of their own in its results.
+"""
 
 from __future__ import annotations
 
+import csv
+import importlib.resources
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from datetime import UTC, datetime
+from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +22,82 @@ import xarray as xr
 
 from mitransient_lidar._version import release
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.parameters.catalogue import limits
 from mitransient_lidar.core.validation import shown as printed
+
+
+def _read() -> dict[str, tuple[str, str]]:
+    """Return the unit, empty for texts, and the long name of each variable."""
+    table = importlib.resources.files("mitransient_lidar.results") / "variables.csv"
+    return {row[0]: (row[1], row[2]) for row in csv.reader(table.read_text("utf-8").splitlines()[1:])}
+
+
+VARIABLES = _read()
+
+#: Directions of coordinates that count downwards.
+_DOWN = ("gate_depth", "depth")
+
+
+class PointClass(IntEnum):
+    """Point class, by the codes in LAS 1.4 and in its profile for bathymetry; 1 is an object above the water."""
+
+    UNCLASSIFIED = 1
+    GROUND = 2
+    BOTTOM = 40
+    SURFACE = 41
+    OBJECT = 43
+    NO_ECHO = 45
+
+    @property
+    def text(self) -> str:
+        """Class name in tables and legends."""
+        names = {"SURFACE": "water surface", "UNCLASSIFIED": "above the water", "GROUND": "land"}
+        return names.get(self.name, self.name.lower().replace("_", " "))
+
+
+def described(name: str, kind: str = "", unit: str | None = None) -> dict[str, Any]:
+    """Return a variable's attributes ``units`` and ``long_name``, empty if it is not in the registry.
+
+    ``_stderr``, ``_low`` or ``_high`` after another one's name is its standard error or a limit of its interval. For a
+    dataset kind, the entry ``kind.name`` goes first. `unit`, such as counts for signals, replaces the registry's.
+    """
+    for key in (f"{kind}.{name}", name):
+        if key in VARIABLES:
+            own, text = VARIABLES[key]
+            own = own if unit is None else unit
+            down = {"positive": "down"} if name in _DOWN and kind != "points" else {}
+            return {**({"units": own} if own else {}), "long_name": text, **down}
+    for end, what in (("_stderr", "standard error"), ("_low", "lower limit"), ("_high", "upper limit")):
+        if name.endswith(end) and (of := described(name.removesuffix(end), kind, unit)):
+            return {**of, "long_name": f"{what} of the {of['long_name']}"}
+    return {}
+
+
+def label(dataset: xr.Dataset, kind: str = "", **units: str) -> xr.Dataset:
+    """Return a dataset whose variables without attributes are `described`, with other `units` for some.
+
+    A variable with a standard error names it in ``ancillary_variables``.
+    """
+    dataset = dataset.copy()
+    for name, variable in dataset.variables.items():
+        if "long_name" not in variable.attrs and "units" not in variable.attrs:
+            base = str(name).removesuffix("_stderr")
+            about = described(str(name), kind, units.get(base))
+            if about and f"{name}_stderr" in dataset:
+                about["ancillary_variables"] = f"{name}_stderr"
+            variable.attrs.update({**about, **variable.attrs})
+    return dataset
+
+
+def flagged(meanings: type[IntEnum] | type[IntFlag]) -> dict[str, Any]:
+    """Return the attributes for a variable whose values, or bits in a set of flags, are members of an enum."""
+    key = "flag_masks" if issubclass(meanings, IntFlag) else "flag_values"
+    return {
+        key: [int(one) for one in meanings],
+        "flag_meanings": " ".join(str(one.name).lower() for one in meanings),
+    }
+
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
 
@@ -232,3 +314,46 @@ def _are_lines(value: object) -> bool:
 def _is_line(value: object) -> bool:
     """Return whether a value is a list of points x, y, x, y, ..."""
     return isinstance(value, list) and len(value) % 2 == 0 and (not value or _are_numbers(value))
+
+
+#: Attribute with the JSON of the attributes of the infrared channel; group of its data in files; and part of names.
+INFRARED = "infrared"
+
+_PREFIX, _SHARED = f"{INFRARED}_", "shot"
+
+
+def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
+    """Return one dataset of both channels.
+
+    Variables and dimensions of the infrared channel have the prefix ``infrared_``, but for ``shot``, which is that of
+    both; of two series, the shots that both have remain.
+    """
+    names: dict[Hashable, str] = {name: f"{_PREFIX}{name}" for name in (*infrared.variables, *infrared.dims)}
+    names.pop(_SHARED, None)
+    attributes = {str(name): attribute(str(name), value) for name, value in infrared.attrs.items()}
+    own = infrared.rename(names)
+    if _SHARED in green.dims:
+        count = min(green.sizes[_SHARED], own.sizes[_SHARED])
+        green, own = (one.isel({_SHARED: slice(count)}) for one in (green, own))
+    return green.assign_coords(own.coords).assign(own.data_vars).assign_attrs({INFRARED: json.dumps(attributes)})
+
+
+def split(dataset: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Return the green and the infrared channel of a dataset, the latter None where it has none."""
+    own = [name for name in dataset.variables if str(name).startswith(_PREFIX)]
+    green = dataset.drop_vars(own)
+    green.attrs = {name: value for name, value in dataset.attrs.items() if name != INFRARED}
+    if INFRARED not in dataset.attrs or not own:
+        return green, None
+    attributes = parse_json(str(dataset.attrs[INFRARED]), f"the attribute {INFRARED}")
+    if not isinstance(attributes, dict):
+        raise UserError(f"the attribute {INFRARED} must be an object of JSON")
+    kept = own + [name for name in (_SHARED,) if name in dataset.coords]
+    infrared = dataset[[name for name in kept if name not in dataset.coords]]
+    infrared = infrared.assign_coords({name: dataset.coords[name] for name in kept if name in dataset.coords})
+    infrared = infrared.drop_vars([name for name in infrared.coords if name not in kept])
+    listed = [*infrared.variables, *infrared.dims]
+    names = {name: str(name).removeprefix(_PREFIX) for name in listed if str(name).startswith(_PREFIX)}
+    infrared = infrared.rename(names)
+    infrared.attrs = attributes
+    return green, infrared

@@ -24,9 +24,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, positive
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates, provenance, text
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, described, label, provenance, text
 from mitransient_lidar.results.geometry import optional_number
-from mitransient_lidar.results.variables import described, label
 
 _LOG = logging.getLogger(__name__)
 

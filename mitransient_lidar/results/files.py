@@ -17,8 +17,7 @@ from mitransient_lidar.core.files import checked_path, open_file, replacing
 from mitransient_lidar.core.formats.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.results import exr, image_files, netcdf, sum_errors, waveform_files
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates
-from mitransient_lidar.results.companions import INFRARED
+from mitransient_lidar.results.attributes import INFRARED, check_attributes, check_coordinates
 from mitransient_lidar.results.dataset import LIGHT, check_axes
 from mitransient_lidar.results.gate_stack import check_stack, has_frames
 

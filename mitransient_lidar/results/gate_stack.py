@@ -25,9 +25,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain, range_time_ns
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import sum_errors
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates, made_from
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, label, made_from
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number, required_number
-from mitransient_lidar.results.variables import label
 
 #: Dimensions that only results with time bins have.
 _OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)

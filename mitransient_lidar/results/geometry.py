@@ -18,11 +18,16 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.lidar.level_sea import snell, solid_angle_per_area, surface_time_ns
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import (
+    LidarGeometry,
+    LidarSystem,
+    snell,
+    solid_angle_per_area,
+    surface_time_ns,
+)
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 Attributes = Mapping[str, Any]
 

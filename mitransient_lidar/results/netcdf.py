@@ -1,7 +1,7 @@
 """NetCDF files for labelled datasets.
 
 A file has at most 40 attributes of its own, numbers and texts, and so has the group ``infrared`` of a result with two
-channels (`results.companions`). The attribute ``mitransient_lidar`` is a text of JSON
+channels (`results.attributes`). The attribute ``mitransient_lidar`` is a text of JSON
 with all others, lists among them, which `read` restores.
 """
 
@@ -23,8 +23,7 @@ from mitransient_lidar.core.formats.array_files import check_hdf5, check_size, d
 from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.physics.receiver.electronics import Digitiser
-from mitransient_lidar.results.attributes import attribute, shown
-from mitransient_lidar.results.companions import INFRARED, join, split
+from mitransient_lidar.results.attributes import INFRARED, attribute, join, shown, split
 
 #: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "

@@ -12,7 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 
 #: Variable with the correlation between bin errors, and its dimensions.
 VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")

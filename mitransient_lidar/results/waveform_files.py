@@ -24,8 +24,7 @@ from mitransient_lidar.core.formats.pulse_waves import pulse_blocks
 from mitransient_lidar.core.formats.waveform_blocks import WaveformBlock
 from mitransient_lidar.core.validation import finite, integer, require_memory
 from mitransient_lidar.physics.lidar.level_sea import snell, surface_time_ns
-from mitransient_lidar.results.attributes import check_attributes, step_of_history
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import check_attributes, label, step_of_history
 
 _LOG = logging.getLogger(__name__)
 
@@ -135,11 +134,8 @@ def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any
     Several channels are pixels of the shots that each of them has, whose number is that of the first channel. They are
     drawn side by side (``angle_x``, ``angle_y``), since files do not have their angles. Shorter waveforms end in NaN.
 
-    Raises
-    ------
-    UserError
-        As in `waveform_chunks`, and if the waveforms take too much memory, their spacing differs, or channels do not
-        have the same pulses.
+    Raises UserError as in `waveform_chunks`, and if the waveforms take too much memory, their spacing differs, or
+    channels do not have the same pulses.
     """
     parts: dict[str, list[xr.Dataset]] = {}
     size, widths = 0, set[float]()

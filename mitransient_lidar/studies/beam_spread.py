@@ -17,7 +17,7 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.plane_crossings import PlaneCrossings
@@ -67,11 +67,6 @@ def beam_spread(
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
-
-    Parameters
-    ----------
-    depths
-        Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
 
     Returns
     -------

@@ -32,7 +32,7 @@ from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 
 #: Most designs in a comparison.

@@ -33,12 +33,12 @@ from mitransient_lidar.core.options import (
 from mitransient_lidar.core.validation import in_range, require_memory, shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.target_signal import find_target, signal_at, target_gates, target_signal
 

@@ -15,10 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information import bandwidth
-from mitransient_lidar.analysis.information.bandwidth import BANDWIDTH
+from mitransient_lidar.analysis.information.alignment import (
+    BANDWIDTH,
+    BANDWIDTH_BOUNDS,
+    BANDWIDTH_START,
+    behind_bandwidth,
+)
+from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
-from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured, with_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, checked, positive_option
@@ -29,8 +33,7 @@ from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.rendering.options import MOST_PASSES
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.passes import MOST_PASSES, Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.waveform_files import FILE
 
@@ -150,8 +153,8 @@ def fit(
     if BANDWIDTH in names:
         if found.receiver is not None:
             raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
-        start = {BANDWIDTH: bandwidth.BANDWIDTH_START, **(start or {})}
-        bounds = {BANDWIDTH: bandwidth.BANDWIDTH_BOUNDS, **(bounds or {})}
+        start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
+        bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
     model = None
     if callable(scene):
         if missing := [name for name in names if name not in (start or {})]:
@@ -174,7 +177,7 @@ def fit(
         bounds = {**model.bounds(), **(bounds or {})}
 
     def light() -> Model:
-        return bandwidth.behind_bandwidth(render_at) if BANDWIDTH in names else render_at
+        return behind_bandwidth(render_at) if BANDWIDTH in names else render_at
 
     problem = WaveformFit(found, light(), starts, bounds, free_scale=free_scale, free_time=free_time)
     problem.approach(most_renders=most_renders, until=began + limit)

@@ -48,11 +48,20 @@ from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.files import Given
-from mitransient_lidar.results.variables import label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.depth_bias import InstrumentName, OwnReceiver, Places, Records, SeaScene, SeaSeed
-from mitransient_lidar.studies.tpu import HeightError, Pointing, PositionError
+from mitransient_lidar.studies.depth_bias import (
+    HeightError,
+    InstrumentName,
+    OwnReceiver,
+    Places,
+    Pointing,
+    PositionError,
+    Records,
+    SeaScene,
+    SeaSeed,
+)
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
 _COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
@@ -170,7 +179,7 @@ def forecast(
     corrections
         As of `depth_correction.correct_depths`.
     pointing_mrad, position_m, height_m
-        As for `tpu.tpu`.
+        As for `depth_bias.tpu`.
     progress
         Called with a `passes.Progress` after every water.
 

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.jackknife import jackknife_error
-from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
+from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Numbers, Option, Scene, Seed, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
@@ -24,10 +24,10 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import plugins_of
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene

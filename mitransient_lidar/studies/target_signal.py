@@ -23,8 +23,8 @@ from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.describe import describe_scene
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
+from mitransient_lidar.results.attributes import described, label
 from mitransient_lidar.results.gate_stack import check_train
-from mitransient_lidar.results.variables import described, label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.solids import shape_groups

@@ -139,13 +139,9 @@ class TopHatBeam(_Ellipse):
 class ImageBeam(BeamProfile):
     """Measured beam: uniform irradiance within each cell of an image that is centred on the optical axis.
 
-    Parameters
-    ----------
-    irradiance
-        Image in any unit, shape (rows, columns), 1 to 2048 each: row 0 is the far edge (+angle_x), column 0 the
-        left one (+angle_y). Finite, not negative, not all 0; else UserError.
-    side
-        Full angle [rad] from the first column's outer edge to the last one's, positive. Cells are squares.
+    `irradiance`: image in any unit, shape (rows, columns), 1 to 2048 each: row 0 is the far edge (+angle_x), column 0
+    the left one (+angle_y). Finite, not negative, not all 0; else UserError. `side`: full angle [rad] from the first
+    column's outer edge to the last one's, positive. Cells are squares.
     """
 
     def __init__(self, irradiance: NDArray[np.float64], side: float) -> None:
@@ -230,10 +226,7 @@ class BeamSampler:
     Light that enters the water farther from the view the deeper reaches it, so that those samples are distributed in
     `Octaves`. Both halves are weighted by the balance heuristic. Samples are stratified.
 
-    Parameters
-    ----------
-    spread
-        Distance from the view, on the sea, from which light reaches the view in the water [m].
+    `spread`: distance from the view, on the sea, from which light reaches the view in the water [m].
     """
 
     def __init__(self, transmitter: mi.Emitter, receiver: Receiver, spread: float = 0.0) -> None:

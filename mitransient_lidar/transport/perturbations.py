@@ -127,13 +127,7 @@ class _Tables:
 
 
 class Perturbations:
-    """Perturbation sums along paths; without perturbations all are empty.
-
-    Parameters
-    ----------
-    perturbations
-        The perturbations.
-    """
+    """Perturbation sums along paths; without perturbations all are empty."""
 
     def __init__(self, perturbations: Sequence[Perturbation] = ()) -> None:
         self.perturbations = tuple(perturbations)

@@ -13,7 +13,7 @@ from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.height_maps import HeightMap
-from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.physics.sea.sea_mesh import Footprint
 from mitransient_lidar.transport.laser import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose

@@ -79,12 +79,7 @@ class RelativePose:
     |p - o| - |r - o| = (p - r) . (p - r + 2 (r - o)) / (|p - o| + |r - o|). Single precision has rounding errors of
     3 cm in coordinates and distances of 500 km, but of less than 0.1 mm in such differences to points within 100 m.
 
-    Parameters
-    ----------
-    pose
-        Transmitter or receiver.
-    reference
-        Reference point [m], shape (3,).
+    `pose`: transmitter or receiver. `reference`: reference point [m], shape (3,).
     """
 
     def __init__(self, pose: KernelPose, reference: FloatArray) -> None:

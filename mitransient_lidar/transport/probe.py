@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
-from mitransient_lidar.transport.medium.index_layers import refract
+from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_point, shape_number
 from mitransient_lidar.transport.plugin_types import Transmitter
 from mitransient_lidar.transport.pose import KernelPose
@@ -316,17 +316,10 @@ def _quantiles(
 def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> FloatArray:
     """Return where axes, refracted by a level sea, first meet a bottom (`WaterScene.bottoms`).
 
-    Parameters
-    ----------
-    scene
-        The scene.
-    origins, axes
-        Points in its frame from which the axes start [m], and their directions, shape (n, 3), or (3,) of all axes.
+    Returns points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
 
-    Returns
-    -------
-    ndarray
-        Points x, y, z in the scene as it is given [m], shape (n, 3); NaN where an axis meets no bottom.
+    `origins`, `axes`: points in the scene's frame from which the axes start [m], and their directions, shape (n, 3), or
+    (3,) of all axes.
     """
     sea, bottoms = scene.level_sea, scene.bottoms
     if not bottoms or np.any(axes[..., 2] >= 0):

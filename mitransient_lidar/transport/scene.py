@@ -17,8 +17,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain, range_time_ns
 from mitransient_lidar.physics.lidar.level_sea import LevelSea, refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.medium.water import IndexLayers, Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter

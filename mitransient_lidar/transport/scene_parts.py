@@ -15,7 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.sea.resolution import Footprint
+from mitransient_lidar.physics.sea.sea_mesh import Footprint
 from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water

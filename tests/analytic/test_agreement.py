@@ -10,7 +10,7 @@ import significance
 
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"}

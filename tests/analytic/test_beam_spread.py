@@ -14,7 +14,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.level_sea import fresnel, snell
 from mitransient_lidar.transport.laser import BeamSampler
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.rng import pass_streams

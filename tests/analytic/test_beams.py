@@ -6,7 +6,7 @@ from oracles.lidar_equation import bottom_energy
 from significance import assert_equal, largest_z
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 ENERGY = 5e-3 * 0.81 * 0.9

@@ -16,12 +16,11 @@ from oracles.lidar_equation import bottom_energy, column_energy, cos_water, surf
 from oracles.phase import henyey_greenstein
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.level_sea import surface_time_ns
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_average_particle
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]

@@ -9,10 +9,10 @@ from significance import largest_z
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 ORIGINS = ["surface", "water", "target", "bottom"]

@@ -8,7 +8,7 @@ import significance
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import significance
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.estimate import describe_estimate, estimate
+from mitransient_lidar.studies.light_classes import describe_estimate, estimate
 
 LEVEL = {"spectrum": "flat"}
 

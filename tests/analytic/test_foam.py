@@ -9,7 +9,7 @@ from significance import assert_equal
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.foam import LAWS, foam_cover
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface

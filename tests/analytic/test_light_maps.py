@@ -18,7 +18,7 @@ from mitransient_lidar.rendering.shots.batches import ShotPoses, suits_maps
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.transport.light_maps.heights import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

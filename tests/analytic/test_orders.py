@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar.studies.scattering_orders import scattering_orders
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.studies.light_classes import scattering_orders
+from mitransient_lidar.transport.paths.passes import PathClasses
 
 PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}
 FEW = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}

@@ -9,8 +9,8 @@ import pytest
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.sea.double_passage import LEAST_DEPTH
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.path import PathPoint
-from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 
 SEA = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "shortest_wave": 1.0}

@@ -11,8 +11,7 @@ from oracles.refracted_path import refracted_path
 from significance import largest_z, mean_and_error
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.level_sea import fresnel, solid_angle_per_area
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, fresnel, solid_angle_per_area
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.sediments import HapkeSurface
 

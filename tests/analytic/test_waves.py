@@ -7,7 +7,7 @@ from oracles.beam_average import echo_energies
 from oracles.two_scale import two_scale_ratio
 from significance import largest_z
 
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 #: So high that one shot takes in a patch of 40 m: the mean over seas needs fewer of them.

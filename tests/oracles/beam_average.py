@@ -18,8 +18,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, finite_array, positive
-from mitransient_lidar.physics.lidar.level_sea import surface_time_ns
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
 from oracles.echo_times import bottom_time_ns
 from oracles.lidar_equation import Attenuation, bottom_energy, column_energy, cos_water, surface_energy

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
+from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.results.geometry import lidar_geometry
 
 

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.level_sea import fresnel, snell
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, fresnel, snell
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 Attenuation = Literal["c", "a+bb"]

@@ -9,8 +9,8 @@ from mitransient_lidar.physics.sea.realization import (
     wave_coefficients,
     wave_numbers,
 )
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState
+from mitransient_lidar.physics.sea.wind_spectra import SwellSpectrum
 
 
 def directional(spectrum, kx, ky):

@@ -16,8 +16,7 @@ from significance import largest_z
 
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.sensor.fov_shapes import Polygon, Rectangle, Sector, Strip
-from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
-from mitransient_lidar.transport.sensor.pixels import LayoutPixels, MappedPixels, ShapedPixels
+from mitransient_lidar.transport.sensor.pixels import HexPixels, LayoutPixels, MappedPixels, ShapedPixels
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MRAD = 1e-3

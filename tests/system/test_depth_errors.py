@@ -20,7 +20,7 @@ from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.plots.gates.images import reached_by_surface
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.studies.tpu import tpu
+from mitransient_lidar.studies.depth_bias import tpu
 
 pytestmark = pytest.mark.long
 

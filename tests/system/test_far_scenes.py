@@ -13,7 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.loading import catalogue, frame
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.studies.find_shots import find_shots
+from mitransient_lidar.studies.shots import find_shots
 from mitransient_lidar.transport.scene_parts import find_receiver, lidar_sensor
 
 #: As in map coordinates, a whole number of periods of the sea [m]; the other place is between its cells.

@@ -20,9 +20,9 @@ from mitransient_lidar.flights.products import Flown, Quality, describe_points, 
 from mitransient_lidar.flights.renderer import FlightRenderer
 from mitransient_lidar.loading.catalogue import folder_of_scenes
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.plots.scene_viewer.traces import point_traces
+from mitransient_lidar.plots.scene_viewer.page import point_traces
 from mitransient_lidar.rendering.describe import lines_of_sight
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: A short flight round a cube, over a level sea with the ripples of a wind and a bottom that slopes.

@@ -12,7 +12,7 @@ from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import instruments
-from mitransient_lidar.results.companions import split
+from mitransient_lidar.results.attributes import split
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 #: Its energies in 12 ns of an echo or of the water vary by 1 % from seed to seed.

@@ -11,7 +11,7 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.rendering.shots import truth as sea_map
-from mitransient_lidar.studies.shot_statistics import highest_points
+from mitransient_lidar.studies.shots import highest_points
 
 pytestmark = pytest.mark.long
 

@@ -8,8 +8,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.loading import scenes
-from mitransient_lidar.studies import find_shots as shots
-from mitransient_lidar.studies import shot_statistics
+from mitransient_lidar.studies import shots
 
 WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
 
@@ -59,5 +58,5 @@ def test_depth_bias_is_that_of_a_ray_through_the_slope():
         down = ray / 1.34 + (cosine / 1.34 - math.sqrt(1 - (1 - cosine**2) / 1.34**2)) * normal
         level = math.cos(math.asin(math.sin(0.35) / 1.34))
         expected = 5.0 / -down[1] * level - 5.0
-        assert shot_statistics.depth_bias(np.array([slope]), 5.0, 0.35, 1.34)[0] == pytest.approx(expected, abs=1e-12)
-    assert shot_statistics.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03
+        assert shots.depth_bias(np.array([slope]), 5.0, 0.35, 1.34)[0] == pytest.approx(expected, abs=1e-12)
+    assert shots.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03

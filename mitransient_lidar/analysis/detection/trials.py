@@ -14,9 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.detection import roc
 from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
-from mitransient_lidar.analysis.detection.statistics import Cases, sample_moments, within_range
+from mitransient_lidar.analysis.detection.statistics import (
+    Cases,
+    area_under_curve,
+    exceedance,
+    sample_moments,
+    within_range,
+)
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
@@ -223,9 +228,9 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
             for record in records[name == "single"]
         )
         thresholds = statistic.threshold(nominal)
-        area = roc.area_under_curve(null, target, CONFIDENCE)
-        rates["drawn_false_alarm"].append(roc.exceedance(null, thresholds, CONFIDENCE))
-        rates["drawn_detection"].append(roc.exceedance(target, thresholds, CONFIDENCE))
+        area = area_under_curve(null, target, CONFIDENCE)
+        rates["drawn_false_alarm"].append(exceedance(null, thresholds, CONFIDENCE))
+        rates["drawn_detection"].append(exceedance(target, thresholds, CONFIDENCE))
         rates["area"].append((area.value, area.low, area.high))
         rates["expected_area"].append(statistic.area())
         rates["expected_detection"].append(statistic.detection(nominal))

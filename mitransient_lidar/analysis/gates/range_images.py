@@ -12,7 +12,7 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, increasing_array, integer
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.gate_stack import as_stack, average_frames, has_frames
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number

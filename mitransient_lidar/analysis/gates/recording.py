@@ -16,9 +16,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.receiver.camera import Camera
-from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.attributes import label, made_from
 from mitransient_lidar.results.gate_stack import check_stack
-from mitransient_lidar.results.variables import label
 
 _LOG = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, Setting
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
-from mitransient_lidar.results.variables import label
+from mitransient_lidar.results.attributes import label
 
 _LOG = logging.getLogger(__name__)
 

@@ -22,9 +22,9 @@ from mitransient_lidar.analysis.information.alignment import (
     light_duration,
     residual_correlation,
 )
+from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
 from mitransient_lidar.analysis.information.fit_table import FittedSamples, fit_table
-from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer

@@ -23,8 +23,8 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, waveform_receiver
 from mitransient_lidar.results import waveform_files
+from mitransient_lidar.results.attributes import described
 from mitransient_lidar.results.files import Given
-from mitransient_lidar.results.variables import described
 
 _TIME, _STDERR = "time_ns", "_stderr"  # time column, and end of the error columns' names
 _STEP = 1e-4  # of the differences that give derivatives after a receiver, relative to the largest power

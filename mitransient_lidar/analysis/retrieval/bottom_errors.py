@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import error_of_sums
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Largest relative standard error with which a reflectance is given.

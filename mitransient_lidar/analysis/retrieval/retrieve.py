@@ -31,7 +31,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
-from mitransient_lidar.results.attributes import made_from
+from mitransient_lidar.results.attributes import flagged, label, made_from
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import (
     lidar_geometry,
@@ -40,7 +40,6 @@ from mitransient_lidar.results.geometry import (
     share_in_view,
     spot_diameter,
 )
-from mitransient_lidar.results.variables import flagged, label
 
 _LOG = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARI
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, water_and_bottoms
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.phase import fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function, water_scattering

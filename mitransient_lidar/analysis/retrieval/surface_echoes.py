@@ -12,8 +12,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.lidar.level_sea import fresnel
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, fresnel
 from mitransient_lidar.physics.piecewise_linear import inside_polygon
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
 from mitransient_lidar.physics.sea.realization import heights_of, wave_coefficients

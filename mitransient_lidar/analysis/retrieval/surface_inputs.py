@@ -12,7 +12,7 @@ from mitransient_lidar.analysis.retrieval.surface_echoes import LEAST_WIND_SPEED
 from mitransient_lidar.analysis.retrieval.surface_slope import PixelEchoes, PixelLight
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
 from mitransient_lidar.results import sum_errors

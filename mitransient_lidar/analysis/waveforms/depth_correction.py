@@ -16,10 +16,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoF
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.results.attributes import step_of_history
+from mitransient_lidar.results.attributes import described, step_of_history
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import required_number
-from mitransient_lidar.results.variables import described
 
 #: Dimensions of a table that depths are interpolated in, in this order, before estimator and pixel.
 AXES = ("off_nadir_deg", "wind_speed", "water", "depth")

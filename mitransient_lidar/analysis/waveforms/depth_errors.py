@@ -11,8 +11,7 @@ import numpy.typing as npt
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, snell, turn_by_slope
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_system, optional_number
 

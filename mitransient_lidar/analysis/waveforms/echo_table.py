@@ -24,11 +24,9 @@ from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
-from mitransient_lidar.results.attributes import made_from
-from mitransient_lidar.results.companions import split
+from mitransient_lidar.results.attributes import flagged, label, made_from, split
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.geometry import optional_number
-from mitransient_lidar.results.variables import flagged, label
 from mitransient_lidar.results.waveform_files import check_measurable
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")

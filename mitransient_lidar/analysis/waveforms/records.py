@@ -20,8 +20,7 @@ from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SH
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
-from mitransient_lidar.physics.lidar.level_sea import surface_time_ns
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, surface_time_ns
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, pulse_of, required_number

@@ -16,12 +16,8 @@ if TYPE_CHECKING:
 def table_lines(columns: Sequence[tuple[str, str]], rows: Iterable[Iterable[Any]]) -> list[str]:
     """Return a table's heading and rows as lines.
 
-    Parameters
-    ----------
-    columns
-        Heading and format of each, such as ``>10.2f``: side, width with the blanks before it, and digits.
-    rows
-        Numbers, or texts in their places; a row's cells may end before the heading's.
+    `columns`: heading and format of each, such as ``>10.2f``: side, width with the blanks before it, and digits.
+    `rows`: numbers, or texts in their places; a row's cells may end before the heading's.
     """
     places = [re.sub(r"(?<=\d)[,.a-z%].*", "", form) for _, form in columns]
 

@@ -9,10 +9,9 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.poses.attitude import rotation_matrices
+from mitransient_lidar.flights.poses.records import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -26,7 +25,7 @@ class Mounting(Plan):
     """Position and attitude of a scanner on its platform.
 
     Angles are those from the axes of the platform, with the signs and the order ``aerospace`` of
-    `attitude.rotation_matrices`.
+    `records.rotation_matrices`.
     """
 
     roll_deg: Annotated[float, Option("Roll, which turns the nadir of the scanner to the left", unit="deg")] = 0.0
@@ -65,12 +64,8 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
     With the rotations R of the platform and M of the mounting, a direction d of the scanner is R M d in the scene, and
     the scanner is at the position of the trajectory plus R times the lever arm.
 
-    Parameters
-    ----------
-    trajectory, mounting, scanner
-        Motion of the platform, place of the scanner on it, and scan.
-    times
-        Times of the pulses [s], on the flight lines, shape (shots,).
+    `trajectory`, `mounting`, `scanner`: motion of the platform, place of the scanner on it, and scan. `times`: times of
+    the pulses [s], on the flight lines, shape (shots,).
 
     Raises
     ------

@@ -11,14 +11,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan, of_kind
+from mitransient_lidar.core.options import Option, Plan, of_kind, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
-from mitransient_lidar.flights.poses.attitude import RotationSpec
-from mitransient_lidar.flights.poses.records import PlatformPoses
-from mitransient_lidar.flights.poses.times import TimeSystem, time_system
-from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory
-from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
+from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, TimeSystem, time_system
+from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory, read_sbet_records, read_text_records
 
 #: Most flight lines, and most records of all of them.
 _MOST_LINES, _MOST_RECORDS = 10_000, 10_000_000

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan, of_kind
+from mitransient_lidar.core.options import Option, Plan, of_kind, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 
 #: Part of the interval between two points of a raster by which a pulse may be early.

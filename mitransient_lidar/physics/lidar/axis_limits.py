@@ -262,6 +262,9 @@ SPOT_COEFFICIENT = 0.85
 def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diameter: npt.ArrayLike) -> FloatArray:
     """One-way attenuation coefficient of a lidar's column signal.
 
+    Returns K = Kd + (c - Kd) exp(-0.85 c D) [1/m], in the broadcast shape of the parameters. Without its geometric
+    factors the signal is proportional to exp(-2 K s) with the distance s in the water.
+
     Parameters
     ----------
     attenuation : array_like
@@ -270,12 +273,6 @@ def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diame
         Diffuse attenuation coefficient Kd of downwelling irradiance [1/m], at least 0.
     spot_diameter : array_like
         Diameter D of the spot on the sea surface that the lidar illuminates and views [m], at least 0.
-
-    Returns
-    -------
-    ndarray
-        K = Kd + (c - Kd) exp(-0.85 c D) [1/m], in the broadcast shape of the parameters. Without its geometric factors
-        the signal is proportional to exp(-2 K s) with the distance s in the water.
 
     Notes
     -----

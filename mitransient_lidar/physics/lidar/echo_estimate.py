@@ -22,8 +22,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.physics.lidar.level_sea import snell, turn_by_slope
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, snell, turn_by_slope
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import LARGEST_ANGLE, scattering_angles
 

@@ -1,4 +1,4 @@
-"""Gates of a gated receiver: one gate's transmission against time, and trains with an echo's weight in each gate.
+"""Gates of a gated receiver: transmission against time, trains with an echo's weight in each gate, and pulse times.
 
 A gated receiver takes one image per gate and shifts the gate by one step from image to image. Gate k collects the
 energy int P(t) G_k(t) dt from the received power P of every pulse, where G_k(t) = G_0(t - k step).
@@ -6,6 +6,7 @@ energy int P(t) G_k(t) dt from the received power P of every pulse, where G_k(t)
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
@@ -21,6 +22,7 @@ from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import (
     Checked,
     FloatArray,
+    IntArray,
     checked,
     finite,
     in_range,
@@ -29,6 +31,7 @@ from mitransient_lidar.core.validation import (
     positive,
     time_samples,
 )
+from mitransient_lidar.core.validation import non_negative as least_zero
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
@@ -79,13 +82,8 @@ class GateShape:
     def edges(cls, width_ns: float, rise_ns: float = 0.0, fall_ns: float = 0.0) -> GateShape:
         """Gate with raised-cosine edges.
 
-        Parameters
-        ----------
-        width_ns : float
-            Time between half heights [ns], greater than 0.
-        rise_ns, fall_ns : float
-            10-90 % times of the edges [ns], at least 0; the gate must reach 1 between them:
-            rise_ns + fall_ns at most 1.18 width_ns.
+        `width_ns`: time between half heights [ns], greater than 0. `rise_ns`, `fall_ns`: 10-90 % times of the edges
+        [ns], at least 0; the gate must reach 1 between them: rise_ns + fall_ns at most 1.18 width_ns.
         """
         longest = 2 * width_ns / _EDGE_PER_RISE
         if rise_ns + fall_ns > longest * (1 + _ROUNDING):
@@ -99,13 +97,8 @@ class GateShape:
     def sampled(cls, times_ns: npt.ArrayLike, transmission: npt.ArrayLike) -> GateShape:
         """Measured gate; its width and edge times follow from the samples.
 
-        Parameters
-        ----------
-        times_ns : array_like, shape (S,)
-            Strictly increasing times [ns], at least 2. They are shifted so that the transmission first reaches half its
-            maximum at 0.
-        transmission : array_like, shape (S,)
-            Transmission, 0 to 1, not all 0.
+        `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the transmission
+        first reaches half its maximum at 0. `transmission`: transmission, 0 to 1, not all 0, shape (S,).
         """
         t, g = time_samples(times_ns, "transmission", transmission)
         for extreme in (g.min(), g.max()):
@@ -133,10 +126,7 @@ class GateShape:
 
         Its width and edges remain those for one pulse, and its time 0 is the mean opening time.
 
-        Parameters
-        ----------
-        jitter_ns : float
-            Standard deviation of the opening time [ns], at least 0.
+        `jitter_ns`: standard deviation of the opening time [ns], at least 0.
         """
         if non_negative("jitter_ns", jitter_ns) == 0:
             return self
@@ -273,12 +263,8 @@ class GateTrain(Checked):
         the shortest of pulse, edges and width apart, with which linear interpolation is accurate to 1e-5. They are
         farther apart where there would be more than 2^17.
 
-        Parameters
-        ----------
-        pulse : Pulse
-            Transmitted pulse.
-        response_time_ns : float
-            Time constant of the receiver's single-pole response [ns], at least 0.
+        `pulse`: transmitted pulse. `response_time_ns`: time constant of the receiver's single-pole response [ns], at
+        least 0.
         """
         from scipy.signal import fftconvolve
 
@@ -352,3 +338,63 @@ class GatePlan:
     #: Its value: half-height time of the first gate's rising edge [ns]; or the depth below the mean sea level, or range
     #: from the lidar [m], from which echoes on the receiver's axis arrive then.
     start: float
+
+
+#: Orders in which a camera takes the gates of a frame.
+ORDERS = ("in_order", "interleaved", "random")
+
+
+@dataclass(frozen=True)
+class GateSequence(Checked):
+    """Pulses of several frames' gates, from a laser with a constant pulse rate.
+
+    An image is the camera's read-out for one gate in one frame: the sum of `pulses` pulses. The order ``in_order`` puts
+    all pulses of a gate before the next gate's pulses. The order ``random`` does the same, with each frame's gates in
+    an order of their own. In ``interleaved``, successive pulses belong to successive gates, and a frame's images are
+    read out together.
+    """
+
+    gates: int = checked(integer, 1, 100_000)  #: Gates per frame.
+    pulses: int = checked(integer, 1, 10**9)  #: Pulses per image.
+    frames: int = checked(integer, 1, 100_000)  #: Frames.
+    pulse_rate_hz: float = checked(positive)  #: Pulses a second, greater than 0.
+    gate_order: str = "in_order"  #: An entry of `ORDERS`.
+    readout_s: float = checked(least_zero, default=0.0)  #: Time without pulses for each read-out [s].
+    speed: float = checked(least_zero, default=0.0)  #: Platform speed [m/s].
+    heading_deg: float = checked(finite, default=0.0)  #: Its direction, from +y (north) clockwise towards +x.
+    seed: int = checked(integer, 0, 2**53, default=0)  #: Random seed for orders.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.gate_order not in ORDERS:
+            raise UserError(f"gate_order = {self.gate_order!r} must be one of {', '.join(ORDERS)}")
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Place of each gate in its frame, shape (frame, gate)."""
+        shape = self.frames, self.gates
+        in_order = np.broadcast_to(np.arange(self.gates), shape)
+        return np.random.default_rng(self.seed).permuted(in_order, axis=1) if self.gate_order == "random" else in_order
+
+    def times(self, frame: IntArray, gate: IntArray, pulse: IntArray | int = 0) -> FloatArray:
+        """Return the times [s] of an image's pulses since the first pulse of all, given their numbers in the image."""
+        readouts = frame * self.gates + self.places[frame, gate]
+        number = readouts * self.pulses + pulse
+        if self.gate_order == "interleaved":
+            readouts, number = frame, (frame * self.pulses + pulse) * self.gates + gate
+        return np.asarray(number / self.pulse_rate_hz + readouts * self.readout_s)
+
+    def displacements(self, times_s: FloatArray) -> FloatArray:
+        """Return how far the platform has come at times [s], along x and y [m], shape (..., 2)."""
+        heading = math.radians(self.heading_deg)
+        direction = np.array([math.sin(heading), math.cos(heading)])
+        return np.asarray(self.speed * np.asarray(times_s)[..., None] * direction)
+
+    def sampled_pulse(self, number: int, passes: int, uniform: FloatArray) -> IntArray:
+        """Return the image pulse that pass `number` of `passes` renders, from uniform numbers in [0, 1).
+
+        Each pass draws from its own part of the pulses. All parts are equally long: the expected mean over passes is
+        the mean over all pulses.
+        """
+        part = (number + np.asarray(uniform)) / passes * self.pulses
+        return np.minimum(part.astype(np.int64), self.pulses - 1)

@@ -59,12 +59,8 @@ class Pulse:
     def sampled(cls, times_ns: npt.ArrayLike, power: npt.ArrayLike) -> Pulse:
         """Pulse given by samples.
 
-        Parameters
-        ----------
-        times_ns : array_like, shape (S,)
-            Strictly increasing times [ns], at least 2. They are shifted so that the (first) largest sample is at 0.
-        power : array_like, shape (S,)
-            Power in any unit, not negative, not all 0. It is scaled to unit area.
+        `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the (first) largest
+        sample is at 0. `power`: power in any unit, not negative, not all 0, shape (S,). It is scaled to unit area.
         """
         t, p = time_samples(times_ns, "power", power)
         non_negative("power", p.min())
@@ -79,17 +75,11 @@ class Pulse:
     def from_file(cls, path: str | PathLike[str]) -> Pulse:
         """Read a sampled pulse from a text file.
 
-        Parameters
-        ----------
-        path : path-like
-            File for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may be
-            called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
-            to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
+        Raises UserError if the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
 
-        Raises
-        ------
-        UserError
-            If the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
+        `path`: file for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
+        be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
+        to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
         """
         times, power = read_time_samples(path, _POWER)
         lowest = power.min(initial=0.0)
@@ -128,12 +118,10 @@ class Pulse:
     def kernel(self, bin_width_ns: float, response_time_ns: float = 0.0) -> tuple[int, FloatArray]:
         """Discrete impulse response of pulse and receiver for ideal echo histograms.
 
-        Parameters
-        ----------
-        bin_width_ns : float
-            Bin width [ns], positive.
-        response_time_ns : float
-            Time constant tau of a causal single-pole response exp(-t/tau)/tau [ns]; 0 for none.
+        Raises UserError if a number is out of range, or pulse and response have more than 10 million bins.
+
+        `bin_width_ns`: bin width [ns], positive. `response_time_ns`: time constant tau of a causal single-pole response
+        exp(-t/tau)/tau [ns]; 0 for none.
 
         Returns
         -------
@@ -142,11 +130,6 @@ class Pulse:
         weights : ndarray, shape (M,)
             weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are
             exact integrals over the bins with the sum 1, truncated where less than 1e-10 lies outside.
-
-        Raises
-        ------
-        UserError
-            If a number is out of range, or pulse and response have more than 10 million bins.
         """
         dt = positive("bin_width_ns", bin_width_ns)
         tau = non_negative("response_time_ns", response_time_ns)

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan, positive_option
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer, non_negative_array
 from mitransient_lidar.physics.receiver.detectors import multiplied, photons_per_joule
 from mitransient_lidar.physics.receiver.electronics import Expected

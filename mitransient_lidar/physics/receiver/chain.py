@@ -56,10 +56,7 @@ class Record(NamedTuple):
 class ReceiverChain:
     """Receiver stages, in signal order.
 
-    Raises
-    ------
-    UserError
-        If the stages do not fit together.
+    Raises UserError if the stages do not fit together.
 
     Notes
     -----
@@ -123,6 +120,8 @@ class ReceiverChain:
     ) -> Record:
         """Draw independent shots.
 
+        Returns the signal in `units`, and whether amplifier or digitiser are saturated.
+
         Parameters
         ----------
         power : array_like, shape (..., time)
@@ -140,11 +139,6 @@ class ReceiverChain:
             records are channels that share a shot's energy and trigger.
         common_seed : int, optional
             Seed of energy and trigger, by default `seed`: the same one for channels that are drawn one by one.
-
-        Returns
-        -------
-        Record
-            Signal in `units`, and whether amplifier or digitiser are saturated.
         """
         light, sky = self._light(power, bin_width_ns, background)
         number, start = integer("shots", shots, 1, 10**9), integer("seed", seed, 0, 2**63 - 1)
@@ -196,10 +190,7 @@ class ReceiverChain:
     def with_gain(self, factor: float) -> ReceiverChain:
         """Return the chain with another gain, by a photomultiplier's dynodes or the amplifier of other detectors.
 
-        Raises
-        ------
-        UserError
-            If the factor is not positive, there is no amplifier, or dynodes would cease to amplify.
+        Raises UserError if the factor is not positive, there is no amplifier, or dynodes would cease to amplify.
         """
         if self.amplifier is None:
             raise UserError(f"gain = {factor:g} needs an amplifier, which this receiver lacks")

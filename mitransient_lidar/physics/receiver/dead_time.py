@@ -37,12 +37,8 @@ class DeadBins(NamedTuple):
 def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
     """Return a dead time in bins.
 
-    Parameters
-    ----------
-    dead_time_ns : float
-        Dead time [ns], at least the bin width. One that is longer than the record leaves only the first count.
-    bin_width_ns : float
-        Bin width [ns], positive.
+    `dead_time_ns`: dead time [ns], at least the bin width. One that is longer than the record leaves only the first
+    count. `bin_width_ns`: bin width [ns], positive.
     """
     tau, width = positive("dead_time_ns", dead_time_ns), positive("bin_width_ns", bin_width_ns)
     if tau < width:

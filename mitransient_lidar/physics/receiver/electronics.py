@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import BOLTZMANN
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, positive_option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.physics.piecewise_linear import integral
 
@@ -165,12 +164,8 @@ class Amplifier(Plan):
     def coupled(self, volts: FloatArray, sample_ns: float) -> FloatArray:
         """Return voltages behind the coupling capacitor, if any.
 
-        Parameters
-        ----------
-        volts : ndarray, shape (..., sample)
-            Voltages minus the steady-light voltage [V], 0 before the first sample.
-        sample_ns : float
-            Time between samples [ns].
+        `volts`: voltages minus the steady-light voltage [V], 0 before the first sample, shape (..., sample).
+        `sample_ns`: time between samples [ns].
         """
         from scipy.signal import lfilter
 

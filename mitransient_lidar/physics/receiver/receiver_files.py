@@ -14,10 +14,9 @@ from typing import Annotated, Any, Literal
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.formats.toml_files import check_keys, parse_toml, required
-from mitransient_lidar.core.options import Option, positive_option
+from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required
+from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
-from mitransient_lidar.core.plans import Plan, one_of
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import shown
@@ -104,6 +103,9 @@ class Channel:
 class ReceiverChannels:
     """Receivers for all channels.
 
+    Raises UserError if the channels differ in the amplifier response, the logarithm, the converter or the jitter, which
+    the record has in common.
+
     Attributes
     ----------
     default
@@ -114,12 +116,6 @@ class ReceiverChannels:
         Pulse repetition rate [kHz], or None.
     name
         Name of the preset, instrument, or file.
-
-    Raises
-    ------
-    UserError
-        If the channels differ in the amplifier response, the logarithm, the converter or the jitter, which the record
-        has in common.
     """
 
     default: Channel
@@ -251,10 +247,7 @@ def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
 
     Files that it names are in `folder`.
 
-    Raises
-    ------
-    UserError
-        If a key is unknown, a parameter is out of range, or the stages do not fit together.
+    Raises UserError if a key is unknown, a parameter is out of range, or the stages do not fit together.
     """
     return waveform_receiver(_parsed(text, name, folder))
 

@@ -43,6 +43,8 @@ def sample_moments(
 ) -> SampleMoments:
     """Return mean and covariance of one record's samples, and their derivatives.
 
+    Raises UserError if a number is out of range, or shapes disagree.
+
     Parameters
     ----------
     chain : ReceiverChain
@@ -60,11 +62,6 @@ def sample_moments(
     -------
     SampleMoments
         In `ReceiverChain.units`, and per parameter unit.
-
-    Raises
-    ------
-    UserError
-        If a number is out of range, or shapes disagree.
 
     Notes
     -----

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from mitransient_lidar.core.options import Option
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Option, Plan
 from mitransient_lidar.core.validation import FloatArray
 
 
@@ -74,12 +73,8 @@ class ShotJitter(Plan):
 def delayed(power: FloatArray, bins: FloatArray) -> FloatArray:
     """Return means over bins that are delayed by fractions of bins.
 
-    Parameters
-    ----------
-    power : ndarray, shape (records, time)
-        Means over bins, constant within a bin and 0 before and after the record.
-    bins : ndarray, shape (shots, records)
-        Delays in bins, of either sign.
+    `power`: means over bins, constant within a bin and 0 before and after the record, shape (records, time). `bins`:
+    delays in bins, of either sign, shape (shots, records).
 
     Returns
     -------

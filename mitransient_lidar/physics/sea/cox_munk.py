@@ -65,15 +65,9 @@ class GramCharlierSeries:
     def of_clean_sea(cls, wind_speed: float) -> GramCharlierSeries:
         """Return the series for a clean sea.
 
-        Parameters
-        ----------
-        wind_speed
-            Wind speed [m/s], 1 to 14.
+        Raises UserError if the wind speed is out of range.
 
-        Raises
-        ------
-        UserError
-            If the wind speed is out of range.
+        `wind_speed`: wind speed [m/s], 1 to 14.
 
         Notes
         -----
@@ -88,11 +82,8 @@ class GramCharlierSeries:
 
         Third and fourth cumulants come from this part alone; the sum then has exactly this series.
 
-        Parameters
-        ----------
-        total, part
-            Slope variances upwind and crosswind for both parts together and for this part [1], positive; in reverse
-            order, the series of the sum follows from the part's.
+        `total`, `part`: slope variances upwind and crosswind for both parts together and for this part [1], positive;
+        in reverse order, the series of the sum follows from the part's.
         """
         y, x = (np.sqrt(both / one) for both, one in zip(total, part, strict=True))
         factors = x**2 * y, y**3, x**4, x**2 * y**2, y**4

@@ -50,12 +50,8 @@ class SlopeStructure:
     def enhancement(self, spread: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
         """Return the enhancement g [1].
 
-        Parameters
-        ----------
-        spread
-            Displacement of a ray over the slope that causes it [m], a depth times a factor below 1; any shape.
-        displacement
-            Displacement of the two ways against each other [m]; broadcast with `spread`.
+        `spread`: displacement of a ray over the slope that causes it [m], a depth times a factor below 1; any shape.
+        `displacement`: displacement of the two ways against each other [m]; broadcast with `spread`.
         """
         spreads, apart = np.broadcast_arrays(np.asarray(spread, np.float64), np.asarray(displacement, np.float64))
         found = np.ones(spreads.shape)
@@ -126,13 +122,9 @@ def slope_structures(
 ) -> tuple[SlopeStructure, SlopeStructure]:
     """Return the structure functions of a sea, and of the same sea with ripples drawn anew for each way.
 
-    Parameters
-    ----------
-    spectrum
-        Spectrum of all waves.
-    resolved_variance, ripple_variance
-        Slope variances of longer waves and of ripples, both axes [1]: ripples are the waves above the wavenumber at
-        which the spectrum reaches the first variance, scaled to the second.
+    `spectrum`: spectrum of all waves. `resolved_variance`, `ripple_variance`: slope variances of longer waves and of
+    ripples, both axes [1]: ripples are the waves above the wavenumber at which the spectrum reaches the first variance,
+    scaled to the second.
     """
     from scipy.special import j0, j1
 

@@ -89,6 +89,13 @@ def read_height_map(
 ) -> HeightMap:
     """Read a height map from a file.
 
+    Raises UserError if the file is missing, damaged or in another format; the map not two-dimensional, with fewer than
+    2 rows or columns, or with holes; heights beyond 12 000 m, or equal to an undeclared value for no data; units
+    unknown or not stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or with
+    another scale than the ground; `size` not positive, missing or superfluous; `origin` far outside the map, or given
+    for a file without positions; `cell` for another file than points, or more than half of their extent; or points on a
+    line, or too many.
+
     Parameters
     ----------
     path : path
@@ -128,16 +135,6 @@ def read_height_map(
         Unit of the values, such as 'ft', if the file does not state it. Default: metres.
     no_data : float, optional
         Value of cells without a height, if the file does not declare it.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, damaged or in another format; the map not two-dimensional, with fewer than 2 rows or
-        columns, or with holes; heights beyond 12 000 m, or equal to an undeclared value for no data; units unknown or
-        not stated beside feet; positions not increasing or not evenly spaced, in degrees, rotated, or with another
-        scale than the ground; `size` not positive, missing or superfluous; `origin` far outside the map, or given for a
-        file without positions; `cell` for another file than points, or more than half of their extent; or points on a
-        line, or too many.
 
     Notes
     -----

@@ -42,17 +42,9 @@ _STILL = Motion()
 def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
     """Angular frequency of gravity-capillary waves.
 
-    Parameters
-    ----------
-    k : array_like
-        Wavenumber [rad/m], not negative.
-    depth : float
-        Water depth [m], positive or infinite.
+    Returns omega [rad/s], in the shape of `k`.
 
-    Returns
-    -------
-    ndarray
-        omega [rad/s], in the shape of `k`.
+    `k`: wavenumber [rad/m], not negative. `depth`: water depth [m], positive or infinite.
 
     Notes
     -----
@@ -80,6 +72,9 @@ def wave_coefficients(
 
     Raises UserError if `period` is not positive, or `cells` not even and positive.
 
+    Returns complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
+    Nyquist wavenumbers have amplitude 0.
+
     Parameters
     ----------
     spectrum : WaveSpectrum or SeaState
@@ -95,12 +90,6 @@ def wave_coefficients(
         Time, depth and current; equal seeds are the same sea at different times.
     only : int, optional
         Number of the one wave system to realise, by default all.
-
-    Returns
-    -------
-    ndarray, shape (cells, cells/2 + 1)
-        Complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
-        Nyquist wavenumbers have amplitude 0.
     """
     ix, iy, dk = wave_numbers(period, cells)
     time = motion.time
@@ -179,10 +168,7 @@ def facet_slope_variance(
 def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     """Return numbers of wavelengths over a period along x and y, and their unit.
 
-    Parameters
-    ----------
-    period, cells
-        As for `wave_coefficients`.
+    `period`, `cells`: as for `wave_coefficients`.
 
     Returns
     -------
@@ -289,6 +275,9 @@ def realise_heights(
 ) -> tuple[PeriodicHeights, float, tuple[float, float]]:
     """Realise a sea for facets with a given size.
 
+    Returns the elevations, the cell side [m], and the expected slope variances [1] of the facets along and across the
+    axis.
+
     Parameters
     ----------
     spectrum, seed
@@ -307,11 +296,6 @@ def realise_heights(
         Band wavenumbers [rad/m], increasing, by which the waves are also divided; by default not divided. A band's
         share in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is the
         last band, on its own.
-
-    Returns
-    -------
-    waves, cell, variance
-        Elevations, the cell side [m], and the expected slope variances [1] of the facets along and across the axis.
     """
 
     def grid_of_waves(part: float) -> int:

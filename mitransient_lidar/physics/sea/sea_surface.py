@@ -19,8 +19,7 @@ from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_o
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
-from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
-from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
+from mitransient_lidar.physics.sea.sea_mesh import Footprint, Resolution, SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.shoaling import (
     BottomDepths,
     DepthResponse,
@@ -29,7 +28,6 @@ from mitransient_lidar.physics.sea.shoaling import (
     is_limited,
     limited_wake,
 )
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import (
     CosineSpectrum,
     MatchedSpectrum,
@@ -42,6 +40,7 @@ from mitransient_lidar.physics.sea.wind_spectra import (
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
     ShallowSpectrum,
+    SwellSpectrum,
     inverse_wave_age,
 )
 

@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.realization import PeriodicHeights
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
-from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
 
 #: Largest significant height of waves (four standard deviations) over the local depth.
 HEIGHT_PER_DEPTH = 0.5

@@ -64,17 +64,10 @@ class WaveSpectrum(ABC):
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances of the waves in a periodic patch.
 
-        Parameters
-        ----------
-        ix, iy : ndarray of int, shapes (I,) and (J,)
-            Numbers of wave periods along x and y over the patch.
-        dk : float
-            Wavenumber spacing [rad/m]: 2 pi divided by the patch side.
+        Returns psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
 
-        Returns
-        -------
-        ndarray, shape (J, I)
-            Psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
+        `ix`, `iy`: numbers of wave periods along x and y over the patch, shapes (I,) and (J,). `dk`: wavenumber spacing
+        [rad/m]: 2 pi divided by the patch side.
         """
 
     @property
@@ -154,15 +147,9 @@ class CosineSpectrum(WaveSpectrum):
 class SeaState:
     """Sum of independent wave systems, each with its own travel direction.
 
-    Parameters
-    ----------
-    components : tuple of WaveSpectrum
-        At least one. The first determines `direction` and thus the axes of the slope variances.
+    Raises UserError if there is no component, or one is not a spectrum.
 
-    Raises
-    ------
-    UserError
-        If there is no component, or one is not a spectrum.
+    `components`: at least one. The first determines `direction` and thus the axes of the slope variances.
     """
 
     components: tuple[WaveSpectrum, ...]

@@ -71,11 +71,8 @@ class WindBubbles:
 
         Raises UserError if the number lies outside its range.
 
-        Parameters
-        ----------
-        backscatter
-            Volume scattering at 180 degrees over void fraction [1/(m sr)], 100 to 1445. 233 for clean bubbles, 1445 for
-            a thick coating: Churnside (2010), Opt. Express 18, 8294, doi:10.1364/OE.18.008294.
+        `backscatter`: volume scattering at 180 degrees over void fraction [1/(m sr)], 100 to 1445. 233 for clean
+        bubbles, 1445 for a thick coating: Churnside (2010), Opt. Express 18, 8294, doi:10.1364/OE.18.008294.
         """
         wanted = in_range("backscatter", backscatter, 100.0, 1445.0) * self.radius / 1.5
         low, high = _RATIOS

@@ -22,6 +22,9 @@ class WaterColumn:
     Depth is positive downwards from the mean sea level. The first layer also fills everything above z = 0 (wave
     crests); the last is unbounded below. A layer owns its upper edge.
 
+    Raises UserError if a value is not finite or negative, the lengths differ, the layers are out of order, or bb <= b
+    <= c fails.
+
     Parameters
     ----------
     layer_tops : array_like, shape (L,)
@@ -32,11 +35,6 @@ class WaterColumn:
         Scattering coefficient b [1/m], at least `backscattering`.
     backscattering : array_like, shape (L,)
         Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
-
-    Raises
-    ------
-    UserError
-        If a value is not finite or negative, the lengths differ, the layers are out of order, or bb <= b <= c fails.
     """
 
     layer_tops: FloatArray
@@ -71,10 +69,7 @@ class WaterColumn:
 
         A single coefficient value applies to all layers. Parameters and units as for the class.
 
-        Raises
-        ------
-        UserError
-            As for the class, or if a string contains anything else than numbers.
+        Raises UserError as for the class, or if a string contains anything else than numbers.
         """
         edges = number_list("layer_tops", layer_tops)
         coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}

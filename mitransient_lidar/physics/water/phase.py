@@ -63,17 +63,9 @@ def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
 def fournier_forand_cdf(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     """Fraction of light scattered by less than `theta` with a Fournier-Forand phase function.
 
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad], 0 to pi.
-    n, mu : float
-        As in `fournier_forand`.
+    Returns cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3761, 62.
 
-    Returns
-    -------
-    ndarray
-        Cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3761, 62.
+    `theta`: scattering angle [rad], 0 to pi. `n`, `mu`: as in `fournier_forand`.
     """
     nu, scale = _ff_shape(n, mu)
     s = _half_angle(theta)
@@ -93,20 +85,14 @@ def fournier_forand_backscatter_ratio(n: float, mu: float) -> float:
 def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
     """Index and slope of the Fournier-Forand phase function with a given bb/b.
 
-    Parameters
-    ----------
-    backscatter_ratio : float
-        bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
+    Raises UserError if no member of the family has this ratio.
+
+    `backscatter_ratio`: bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
 
     Returns
     -------
     n, mu : float
         Parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
-
-    Raises
-    ------
-    UserError
-        If no member of the family has this ratio.
 
     Notes
     -----
@@ -137,11 +123,8 @@ def henyey_greenstein_backscatter_ratio(g: float) -> float:
 def petzold_average_particle() -> PhaseFunction:
     """Petzold's average-particle phase function as a function of angle [rad].
 
-    Returns
-    -------
-    callable
-        Function from angles [rad] to p [1/sr], normalised to 1. Between the tabulated angles ln p is linear in ln
-        theta; below 0.1 degree p ~ theta^-1.346.
+    Returns the function from angles [rad] to p [1/sr], normalised to 1. Between the tabulated angles ln p is linear in
+    ln theta; below 0.1 degree p ~ theta^-1.346.
 
     Notes
     -----
@@ -202,24 +185,15 @@ PETZOLD_WATERS = {
 def petzold_water(name: str) -> PhaseFunction:
     """Phase function of one of Petzold's waters as a function of angle [rad].
 
-    Parameters
-    ----------
-    name : str
-        ``clear`` (station AUTEC 8, Tongue of the Ocean, Bahamas), ``coastal`` (HAOCE 11, channel off Santa Catalina,
-        California), ``turbid`` (NUC 2040, San Diego harbour), or another station: ``autec_7``, ``autec_9``,
-        ``haoce_5`` (Avalon Cove, Catalina), ``nuc_2200`` or ``nuc_2240``.
+    Returns the function from angles [rad], 0 to pi, to p [1/sr], normalised to 1; infinite at 0. Between the tabulated
+    angles ln p is linear in ln theta; below 0.1 degree the power law through the first two angles continues, with
+    exponents from -1.19 to -1.60.
 
-    Returns
-    -------
-    callable
-        Function from angles [rad], 0 to pi, to p [1/sr], normalised to 1; infinite at 0. Between the tabulated angles
-        ln p is linear in ln theta; below 0.1 degree the power law through the first two angles continues, with
-        exponents from -1.19 to -1.60.
+    Raises UserError if the name is unknown.
 
-    Raises
-    ------
-    UserError
-        If the name is unknown.
+    `name`: ``clear`` (station AUTEC 8, Tongue of the Ocean, Bahamas), ``coastal`` (HAOCE 11, channel off Santa
+    Catalina, California), ``turbid`` (NUC 2040, San Diego harbour), or another station: ``autec_7``, ``autec_9``,
+    ``haoce_5`` (Avalon Cove, Catalina), ``nuc_2200`` or ``nuc_2240``.
 
     Notes
     -----

@@ -54,6 +54,8 @@ class PowerLawTable:
     ) -> PowerLawTable:
         """Build from p at the nodes, then normalise.
 
+        Raises UserError if a value is not positive and finite, or the integral towards s = 0 diverges.
+
         Parameters
         ----------
         values : array_like, shape (N,)
@@ -62,11 +64,6 @@ class PowerLawTable:
             ln s at the first node, negative.
         cap_probability : float, optional
             4 pi int_0^s_0 p ds in the unit of `values`. By default the first segment's power law continues to s = 0.
-
-        Raises
-        ------
-        UserError
-            If a value is not positive and finite, or the integral towards s = 0 diverges.
         """
         p = finite_array("values", values)
         if p.ndim != 1 or p.size < 2:
@@ -117,12 +114,8 @@ class PowerLawTable:
     def mixture(cls, tables: Sequence[PowerLawTable], weights: npt.ArrayLike) -> PowerLawTable:
         """Build a weighted sum of phase functions.
 
-        Parameters
-        ----------
-        tables : sequence of PowerLawTable
-            The functions; the result has the nodes of the finest.
-        weights : array_like
-            Weights, such as scattering coefficients, at least 0 and not all 0.
+        `tables`: the functions; the result has the nodes of the finest. `weights`: weights, such as scattering
+        coefficients, at least 0 and not all 0.
         """
         factors = finite_array("weights", weights)
         if factors.shape != (len(tables),):
@@ -144,15 +137,9 @@ class PowerLawTable:
         not nearer to 180 degrees (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where the
         function has no peak of its own in the last 10 degrees.
 
-        Parameters
-        ----------
-        chi : float
-            chi_p(pi) = (bb/b)/(2 pi p(pi)), greater than 0 (Boss and Pegau 2001, doi:10.1364/AO.40.005503).
+        Raises UserError if A would be negative.
 
-        Raises
-        ------
-        UserError
-            If A would be negative.
+        `chi`: chi_p(pi) = (bb/b)/(2 pi p(pi)), greater than 0 (Boss and Pegau 2001, doi:10.1364/AO.40.005503).
         """
         count = max(self.count, _PEAK_COUNT)
         s = np.exp(self.log_s0 * np.linspace(1, 0, count))
@@ -266,23 +253,14 @@ class PhaseOfFile(NamedTuple):
 def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     """Read a phase function from a file.
 
-    Parameters
-    ----------
-    path : path-like
-        Text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in rad
-        if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
-        The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
+    Returns the normalised phase function, and the integral by which the values were divided.
 
-    Returns
-    -------
-    PhaseOfFile
-        The normalised phase function, and the integral by which the values were divided.
+    Raises UserError if the file cannot be read or does not hold such a table (the message names the line), or if the
+    values rise towards 0 so steeply that their integral diverges.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read or does not hold such a table (the message names the line), or if the values rise
-        towards 0 so steeply that their integral diverges.
+    `path`: text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in
+    rad if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
+    The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 
     Notes
     -----

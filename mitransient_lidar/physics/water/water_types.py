@@ -131,10 +131,7 @@ def pure_seawater(
 ) -> InherentProperties:
     """Sea water without particles and dissolved organic matter; half of its scattering is backscattering.
 
-    Parameters
-    ----------
-    wavelength_nm, temperature, salinity : float
-        As in `seawater.water_scattering`: [nm], [degrees C], [per mille].
+    `wavelength_nm`, `temperature`, `salinity`: as in `seawater.water_scattering`: [nm], [degrees C], [per mille].
     """
     b = float(water_scattering(wavelength_nm, temperature, salinity))
     return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2, b)
@@ -224,12 +221,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
 def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentProperties:
     """Return a 532 nm water at a wavelength in the near infrared.
 
-    Parameters
-    ----------
-    green : InherentProperties
-        The water at 532 nm.
-    wavelength_nm : float
-        Wavelength [nm], above 700 to 1100.
+    `green`: the water at 532 nm. `wavelength_nm`: wavelength [nm], above 700 to 1100.
 
     Notes
     -----
@@ -276,10 +268,7 @@ def default_water(wavelength_nm: float) -> dict[str, float]:
 def from_kd(kd: float) -> InherentProperties:
     """Water given by its diffuse attenuation at 532 nm.
 
-    Parameters
-    ----------
-    kd : float
-        Diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
+    `kd`: diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
 
     Notes
     -----
@@ -310,10 +299,7 @@ def from_secchi(depth: float) -> InherentProperties:
 
     The particles have the bb/b of Petzold's average particle, 0.0183.
 
-    Parameters
-    ----------
-    depth : float
-        Secchi depth z [m], 0.5 to 25.
+    `depth`: Secchi depth z [m], 0.5 to 25.
 
     Notes
     -----

@@ -69,6 +69,9 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     and a note about it. Since pixels share photons, such a mean's error is unknown; the page shows its upper bound, the
     mean of the errors.
 
+    Raises UserError if `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not
+    above 0 or too small for the gates of one block (of all pixels, if they form no image).
+
     Parameters
     ----------
     stack : xarray.Dataset
@@ -86,12 +89,6 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
         record of a pixel is its energy in the gates.
     limit_mb : float
         Largest page size [MB of 1e6 bytes], above 0.
-
-    Raises
-    ------
-    UserError
-        If `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not above 0 or
-        too small for the gates of one block (of all pixels, if they form no image).
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None

@@ -7,10 +7,9 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.drawing import as_seen
-from mitransient_lidar.results.attributes import check_attributes, check_coordinates
+from mitransient_lidar.results.attributes import check_attributes, check_coordinates, described
 from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
-from mitransient_lidar.results.variables import described
 
 #: Variables with a record in time, and their errors; for a signal the standard deviation of one record.
 RECORDS = {"signal": "signal_deviation", "waveform": "waveform_stderr"}
@@ -22,16 +21,10 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
     and its ``long_name`` belongs to the variable shown.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
-        ``shot`` if it has shots.
+    Raises UserError if it has another shape, no angles of the pixels, or attributes or times that are invalid.
 
-    Raises
-    ------
-    UserError
-        If it has another shape, no angles of the pixels, or attributes or times that are invalid.
+    `dataset`: a result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
+    ``shot`` if it has shots.
     """
     name = next(name for name in RECORDS if name in dataset)
     dims = record_dims(dataset, name, shots=True)

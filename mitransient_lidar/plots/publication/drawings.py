@@ -11,8 +11,7 @@ from matplotlib.patches import Ellipse
 
 from mitransient_lidar.physics.lidar.level_sea import LevelSea, refract
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.studies.publication.renders import Renders
-from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, System, outlines
+from mitransient_lidar.studies.publication.scenes import FOUR, LAYOUTS, Renders, System, outlines
 
 #: Half side of the drawn part of the sea, and distance between the refracted axes [m].
 _HALF_SIDE, _AXES_APART = 1.3, 0.25

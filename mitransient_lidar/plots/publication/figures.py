@@ -17,11 +17,10 @@ from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
-from mitransient_lidar.plots.publication import waves as wave_drawings
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.publication import quantities
-from mitransient_lidar.studies.publication.renders import Renders
+from mitransient_lidar.studies.publication.scenes import Renders
 from mitransient_lidar.studies.publication.statements import Measured, Statement, statements_of, write_statements
 
 _LOG = logging.getLogger(__name__)
@@ -45,9 +44,9 @@ _FIGURES = {
     "fig06": _Figure(drawings.mesh),
     "fig08": _Figure(drawings.pixels, quantities.pixel_shapes),
     "fig09": _Figure(waveforms.pixels_over_bottom, quantities.pixels_over_bottom),
-    "fig10": _Figure(wave_drawings.surface_echoes, quantities.surface_echoes),
-    "fig11": _Figure(wave_drawings.bottom_echoes, quantities.bottom_echoes),
-    "fig12": _Figure(wave_drawings.paths, quantities.paths),
+    "fig10": _Figure(waveforms.surface_echoes, quantities.surface_echoes),
+    "fig11": _Figure(waveforms.bottom_echoes, quantities.bottom_echoes),
+    "fig12": _Figure(waveforms.paths, quantities.paths),
     "fig13": _Figure(waveforms.square_target, quantities.square_target),
     "fig14": _Figure(waveforms.strip_target, quantities.strip_target),
     "fig15": _Figure(waveforms.layered, quantities.layer_delays),

@@ -47,8 +47,8 @@ def plot_depth_bias(found: xr.Dataset, path: drawing.FilePath | None = None) -> 
 def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the total vertical uncertainty at 95 % against depth, one panel per water, with the S-44 orders.
 
-    `found` is a result of `studies.tpu.tpu` at one altitude and angle. Lines with full markers show corrected depths,
-    or measured ones without corrections; open markers show measured depths.
+    `found` is a result of `studies.depth_bias.tpu` at one altitude and angle. Lines with full markers show corrected
+    depths, or measured ones without corrections; open markers show measured depths.
     """
     waters = found["water"].values
     figure, axes, lowest, first = new_panels(path, waters.size, (3.9, 3.1), (1.2, 0.6), sharex=True, sharey=True)
@@ -71,8 +71,8 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
 def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the strictest S-44 order met against wind and water, one panel per depth.
 
-    `found` is a result of `studies.tpu.tpu` at one altitude and angle; corrected depths count where there are any.
-    Cells for omitted seas are empty.
+    `found` is a result of `studies.depth_bias.tpu` at one altitude and angle; corrected depths count where there are
+    any. Cells for omitted seas are empty.
     """
     depths = found["depth"].values
     figure = drawing.new_figure(path, 2.3 * depths.size + 1.8, 3.4)

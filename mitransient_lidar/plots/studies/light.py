@@ -106,7 +106,7 @@ def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
 def plot_scattering_orders(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw power by scattering order, and the share of light with several reversals, summed over the pixels.
 
-    `result` comes from `studies.scattering_orders.scattering_orders`.
+    `result` comes from `studies.light_classes.scattering_orders`.
     """
     figure = drawing.new_figure(path, 9.0, 6.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

@@ -1,4 +1,4 @@
-"""Figures for shots on a sea: footprints and waveforms, and echoes against the sea slopes."""
+"""Figures for shots on a sea: footprints and waveforms, echoes against slopes, and estimates against the truth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
+from mitransient_lidar.analysis.retrieval.retrieval_table import estimates, truth_statistics
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies.panels import finish
 from mitransient_lidar.rendering.shots.truth import Shot
-from mitransient_lidar.studies.find_shots import RenderedShots
-from mitransient_lidar.studies.shot_statistics import depth_bias, slope_correlations, slope_effects
+from mitransient_lidar.studies.shots import RenderedShots, depth_bias, slope_correlations, slope_effects
 
 #: Share of a pixel's peak that counts as an echo.
 _FAINT = 5e-3
@@ -26,7 +28,7 @@ _FAINT = 5e-3
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
     """Draw the sea with the footprints of beam and pixels at each shot, and the shots' waveforms.
 
-    `rendered` is a result of `studies.find_shots.render_found_shots`.
+    `rendered` is a result of `studies.shots.render_found_shots`.
     """
     columns = min(2, len(rendered.results))
     rows = -(-len(rendered.results) // columns) if columns else 1
@@ -124,7 +126,7 @@ _LABELS = {
 def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the strength, the times and the depths of echoes against the slopes that the beam meets.
 
-    `shots` is a result of `studies.shot_statistics.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
+    `shots` is a result of `studies.shots.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
     """
     figure = drawing.new_figure(path, 9.6, 7.0)
     effects, correlations = slope_effects(shots), slope_correlations(shots)
@@ -143,4 +145,33 @@ def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None
             ax.plot(np.degrees(np.arctan(slopes)), bias, color=palette.RED, label="refraction alone")
             ax.legend(frameon=False)
     figure.suptitle(drawing.titled(shots.attrs, f"{shots.sizes['shot']} shots"))
+    return drawing.save(figure, path)
+
+
+def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the estimates for a shot series against the truth, with their standard errors if known.
+
+    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series from
+    `rendering.shots.series.render_shots`.
+
+    Raises UserError if the shots have no truth.
+    """
+    figure = drawing.new_figure(path, 9.6, 9.0)
+    shown = [(one, one.truth) for one in estimates(found) if one.truth is not None]
+    if not shown:
+        raise UserError("found has no truth: it must come from a series of shots with true slopes and depths")
+    for ax, (one, truth) in zip(figure.subplots(2, 2).flat, shown, strict=False):
+        varied = bool(np.any(truth != truth[0]))
+        x, label = (truth, f"true {one.head}") if varied else (np.arange(len(truth)), "shot")
+        ax.errorbar(x, one.values, one.errors, fmt=".", color=palette.BLUE, markersize=5, linewidth=0.7)
+        middle = float(np.mean(truth[np.isfinite(truth)])) if np.isfinite(truth).any() else 0.0
+        ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9)
+        ax.set(xlabel=label, ylabel=f"estimated {one.head}")
+        ax.set_title(truth_statistics(one).partition(": ")[2].replace(", rms of", ",\nrms of"), fontsize="small")
+        ax.locator_params(nbins=6)
+        drawing.add_grid(ax)
+    bars = Line2D([], [], color=palette.BLUE, marker=".", label="estimates, ±1 standard error")
+    line = Line2D([], [], color="0.5", linewidth=0.9, label="truth")
+    figure.legend(handles=[bars, line], loc="outside lower center", ncols=2, frameon=False)
+    figure.suptitle(drawing.titled(found.attrs, f"{found.sizes['shot']} shots"))
     return drawing.save(figure, path)

@@ -18,14 +18,20 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, require_memo
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
-from mitransient_lidar.physics.lidar.gate_sequence import GateSequence
-from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateSequence, GateTrain
 from mitransient_lidar.rendering.accumulators import placed_gates
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.options import DEFAULT_MAX_MEMORY_GB, PassShare, SignedSeed
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import (
+    DEFAULT_MAX_MEMORY_GB,
+    PassShare,
+    Progress,
+    ProgressCallback,
+    SignedSeed,
+    pass_seed,
+    warn_of_edge_loss,
+)
+from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import build_gates
-from mitransient_lidar.results.variables import label
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.paths.histogram import GateWeights

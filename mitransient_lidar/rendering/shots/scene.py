@@ -80,7 +80,7 @@ class ShotScene:
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shots.batches import check_size
-        from mitransient_lidar.transport.paths.path_classes import check_solids
+        from mitransient_lidar.transport.paths.passes import check_solids
         from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         variants.leave_the_gpu("shots are rendered")
@@ -114,7 +114,7 @@ class ShotScene:
         loaded = self.session.scene, self.session.sensor
         if light == "maps":
             from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-            from mitransient_lidar.transport.paths.path_classes import PathClasses
+            from mitransient_lidar.transport.paths.passes import PathClasses
             from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
             return LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())

@@ -16,9 +16,17 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked, positive_option
+from mitransient_lidar.core.options import (
+    Infrared,
+    Instrument,
+    Option,
+    SceneOrResult,
+    Sensor,
+    checked,
+    one_of,
+    positive_option,
+)
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
-from mitransient_lidar.core.plans import one_of
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_two_columns
 from mitransient_lidar.core.tables.written import table_lines
@@ -28,12 +36,18 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.options import LIGHT, Components, LightOption, RenderOptions
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback, warn_of_edge_loss
+from mitransient_lidar.rendering.passes import (
+    LIGHT,
+    Components,
+    LightOption,
+    Progress,
+    ProgressCallback,
+    RenderOptions,
+    warn_of_edge_loss,
+)
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
-from mitransient_lidar.results.companions import join
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described, join
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -12,7 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.sea.height_maps import HeightMap
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.results.variables import described
+from mitransient_lidar.results.attributes import described
 
 if TYPE_CHECKING:
     import mitsuba as mi

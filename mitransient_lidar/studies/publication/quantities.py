@@ -12,7 +12,18 @@ import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.studies.publication import scenes
-from mitransient_lidar.studies.publication.measures import (
+from mitransient_lidar.studies.publication.scenes import (
+    PLACES_OF_SLOPE,
+    RANDOM,
+    SEAS,
+    Renders,
+    as_series,
+    described,
+    echo_gate,
+    geometry_of,
+)
+from mitransient_lidar.studies.publication.statements import (
+    Measured,
     Series,
     Waveform,
     change,
@@ -24,18 +35,7 @@ from mitransient_lidar.studies.publication.measures import (
     near_share,
     rise_time,
 )
-from mitransient_lidar.studies.publication.renders import (
-    PLACES_OF_SLOPE,
-    RANDOM,
-    SEAS,
-    Renders,
-    as_series,
-    described,
-    echo_gate,
-    geometry_of,
-)
-from mitransient_lidar.studies.publication.statements import Measured
-from mitransient_lidar.studies.shot_statistics import depth_bias
+from mitransient_lidar.studies.shots import depth_bias
 from mitransient_lidar.transport.sensor.outlines import enclosed_area
 
 #: Quantities by their names.

@@ -26,8 +26,7 @@ from mitransient_lidar.transport.light_maps.heights import HeightFields
 from mitransient_lidar.transport.light_maps.maps import LightMaps, Planes
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
-from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose

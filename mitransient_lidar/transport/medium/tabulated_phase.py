@@ -28,10 +28,8 @@ class TabulatedPhase:
     A segment is drawn by Walker's alias method (two look-ups for any table size), and s within it by the inverse of its
     power law, so that samples are accurate in the forward peak.
 
-    Parameters
-    ----------
-    tables
-        Phase functions, each normalised to 1 over the sphere, all with the same nodes. Lanes select theirs by number.
+    `tables`: phase functions, each normalised to 1 over the sphere, all with the same nodes. Lanes select theirs by
+    number.
     """
 
     def __init__(self, *tables: PowerLawTable) -> None:

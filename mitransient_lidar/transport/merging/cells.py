@@ -66,10 +66,7 @@ class Cell:
 class RefractedProfile:
     """Approximate profile of the beam's unscattered light: a Gaussian function that ripples widen, and a halo.
 
-    Parameters
-    ----------
-    spreads
-        Standard deviations of the beam on the sea along and across its azimuth, both normal to the axis [m].
+    `spreads`: standard deviations of the beam on the sea along and across its azimuth, both normal to the axis [m].
     """
 
     def __init__(self, scene: LidarScene, spreads: tuple[float, float]) -> None:

@@ -10,8 +10,8 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.patches import SolidPatch
 from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import opaque_index
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.path import PathPoint
-from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.random_walk import RandomWalkPath
 from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.rng import Lanes, Shots

@@ -16,8 +16,7 @@ from mitransient_lidar.transport.merging.patches import SolidPatches, foreshorte
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import PATHS_OF_GROUP, SegmentBuffer, memory_of_path
 from mitransient_lidar.transport.opaque import changed, opaque
-from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
-from mitransient_lidar.transport.paths.path_classes import PathClasses
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.paths.refracted_connection import connect_laser, perturbed_to_laser
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, trace_connected

@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract as refract_at_facet
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.transport.medium.index_layers import refract
+from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.opaque import aligned, changed, opaque
 
 #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.opaque import opaque, opaque_index
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.path import PathPoint
-from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene

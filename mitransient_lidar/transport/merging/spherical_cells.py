@@ -30,12 +30,7 @@ class SphericalCells:
     Angles from the axis are measured by the tangent of their half, up to the opposite direction. Rings are of equal
     width in asinh(tan(theta / 2) / core), and shells in log(r) up to the radius where they have their final thickness.
 
-    Parameters
-    ----------
-    scene
-        Scene with laser and receiver under water.
-    thickness
-        Largest shell thickness [m].
+    `scene`: scene with laser and receiver under water. `thickness`: largest shell thickness [m].
     """
 
     OF_SHOTS = ("_shift", "_start")

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
-from mitransient_lidar.transport.medium.index_layers import IndexLayers, coinciding
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
+from mitransient_lidar.transport.medium.water import IndexLayers, coinciding
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import WaterScene
@@ -189,12 +189,8 @@ def interaction_at(point: mi.Point3f, direction: mi.Vector3f) -> mi.MediumIntera
 class PathStep:
     """Path steps through sea surface, water and solids.
 
-    Parameters
-    ----------
-    flight
-        Free flight from which the distances to scattering events are drawn; None without water.
-    mode
-        ``Radiance`` for paths from the receiver, ``Importance`` for light.
+    `flight`: free flight from which the distances to scattering events are drawn; None without water. `mode`:
+    ``Radiance`` for paths from the receiver, ``Importance`` for light.
     """
 
     def __init__(self, scene: WaterScene, flight: LayeredFlight | None, mode: mi.TransportMode) -> None:

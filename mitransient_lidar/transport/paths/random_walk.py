@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.medium.index_layers import refract_level
+from mitransient_lidar.transport.medium.water import refract_level
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.paths.path import Path, PathStep, Vertex
 from mitransient_lidar.transport.pose import KernelPose

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.medium.index_layers import coinciding, refract
+from mitransient_lidar.transport.medium.water import coinciding, refract
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene

@@ -14,9 +14,8 @@ from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.paths.passes import PassRenderer, ReceivedLight
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight
 from mitransient_lidar.transport.paths.path import ConnectedPath, PathStep, ScatteringEvent, Vertex
-from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.refracted_connection import (
     EmitterDirection,
     RefractedEmitterSampler,

@@ -217,11 +217,8 @@ class Strip(FovShape):
 class Polygon(FovShape):
     """Simple polygon, convex or not.
 
-    Parameters
-    ----------
-    vertices
-        Corners (angle_x, angle_y) [rad] in order, shape (n, 2), at least three, not all on one line. The first may be
-        repeated at the end.
+    `vertices`: corners (angle_x, angle_y) [rad] in order, shape (n, 2), at least three, not all on one line. The first
+    may be repeated at the end.
     """
 
     def __init__(self, vertices: Sequence[tuple[float, float]] | NDArray[np.float64]) -> None:

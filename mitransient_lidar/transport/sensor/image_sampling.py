@@ -58,10 +58,7 @@ _READERS = {".png": _read_png, ".npy": read_npy, ".exr": _read_channel}
 class ImageSampler:
     """Draws points of an image with a density in proportion to its values, which are constant in each cell.
 
-    Parameters
-    ----------
-    weights
-        Values, not negative and not all 0, shape (rows, columns).
+    `weights`: values, not negative and not all 0, shape (rows, columns).
     """
 
     def __init__(self, weights: NDArray[np.float64]) -> None:

@@ -179,12 +179,8 @@ class Octaves:
 
     The density is 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)) at the distance r, with the core q, up to the edge R.
 
-    Parameters
-    ----------
-    centre
-        (angle_x, angle_y) of the centre [rad], shape (2,).
-    core, edge
-        Radii of the core and of all samples [rad], positive.
+    `centre`: (angle_x, angle_y) of the centre [rad], shape (2,). `core`, `edge`: radii of the core and of all samples
+    [rad], positive.
     """
 
     def __init__(self, centre: FloatArray, core: float, edge: float) -> None:
@@ -242,13 +238,8 @@ class GaussianPointSpread(PointSpread):
 class MeasuredPointSpread(PointSpread):
     """Measured point-spread function, constant in each square cell of an image about the focus of sharp optics.
 
-    Parameters
-    ----------
-    values
-        Values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x), column
-        0 the left one (+angle_y).
-    width
-        Extent of the columns along angle_y [rad], positive.
+    `values`: values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x),
+    column 0 the left one (+angle_y). `width`: extent of the columns along angle_y [rad], positive.
     """
 
     def __init__(self, values: NDArray[np.float64], width: float) -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from rows import each_row
 
-from mitransient_lidar.campaigns.expressions import Expression
+from mitransient_lidar.campaigns.design import Expression
 from mitransient_lidar.core.errors import UserError
 
 

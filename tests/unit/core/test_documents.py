@@ -4,8 +4,7 @@ import pytest
 from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.formats.documents import check_nesting, check_xml, parse_json
-from mitransient_lidar.core.formats.toml_files import parse_toml
+from mitransient_lidar.core.formats.documents import check_nesting, check_xml, parse_json, parse_toml
 
 #: Nine levels of ten references each, of a billion letters.
 LAUGHS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))

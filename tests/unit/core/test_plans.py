@@ -8,8 +8,7 @@ import pytest
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import parts
-from mitransient_lidar.core.plans import Plan
+from mitransient_lidar.core.options import Plan, parts
 from mitransient_lidar.flights.plan import FlightPlan
 
 #: Values that a key without a usual one may have, where its declaration does not tell one.

@@ -13,7 +13,7 @@ from oracles.phase import henyey_greenstein
 from rows import each_row
 from significance import largest_z
 
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 

@@ -5,7 +5,7 @@ from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
-from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
+from mitransient_lidar.flights.poses.trajectory import read_sbet_records, read_text_records
 
 ROWS = np.array([(0, 1, 2, 350, 10, 20, 400), (0.5, 1.5, 2, 355, 12, 30, 401), (1.25, 2, -2, 5, 14, 40, 402)])
 NAMES = ("t", "roll", "pitch", "yaw", "x", "y", "z")

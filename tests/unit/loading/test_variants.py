@@ -13,7 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.studies.find_shots import find_shots
+from mitransient_lidar.studies.shots import find_shots
 
 
 def test_the_wheels_llvm_is_found_through_its_metadata():
@@ -85,9 +85,8 @@ def rgb():
 def test_plugins_name_the_variants_that_they_need(rgb):
     """In place of ``Plugin "petzold" not found!`` each refuses by a sentence; coming back they work again."""
     sources = "".join(path.read_text() for path in Path(variants.__file__).parents[2].glob("plugins/**/*.py"))
-    names = {name.rpartition(".")[2]: kind for name, kind in variants.PLUGIN_MODULES.items() if kind}
-    for name, kind in names.items():
-        assert f'register("{kind}", {name.upper()}, ' in sources
+    for name, (_, kind) in variants.PLUGIN_MODULES.items():
+        assert f'register("{kind}", {name.upper()}' in sources
         with pytest.raises(RuntimeError, match=f"UserError: {name} needs the variant llvm_ad_mono or .* scalar_rgb is"):
             mi.load_dict({"type": name})
     mi.set_variant(variants.set_variant())

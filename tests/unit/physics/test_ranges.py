@@ -8,8 +8,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.clear_sky import background_power, clear_sky_irradiance
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.physics.lidar.level_sea import snell
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, snell
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
@@ -19,12 +18,12 @@ from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import angular_frequency, wave_numbers
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
+    SwellSpectrum,
     inverse_wave_age,
 )
 from mitransient_lidar.physics.water.bubbles import WindBubbles

@@ -14,9 +14,8 @@ from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import wave_numbers
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, SeaState
-from mitransient_lidar.physics.sea.wind_spectra import JonswapSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import JonswapSpectrum, SwellSpectrum
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.physics.water.water_types import InherentProperties, jerlov

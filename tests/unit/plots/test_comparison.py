@@ -4,7 +4,7 @@ import pytest
 from figure_inputs import result
 
 from mitransient_lidar.analysis.comparison import compare
-from mitransient_lidar.plots.comparison import plot_comparison
+from mitransient_lidar.plots.waveforms import plot_comparison
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ from command_line import assert_refused, run
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.las import write_points
 from mitransient_lidar.plots import viewer
-from mitransient_lidar.plots.scene_viewer import traces
+from mitransient_lidar.plots.scene_viewer import page as traces
 from mitransient_lidar.plots.scene_viewer.page import page_text
 from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 RING = np.array([[1.0, 0.0], [0.0, 2.0], [-1.0, 0.0], [0.0, -2.0], [1.0, 0.0]])
 

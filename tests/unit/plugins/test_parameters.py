@@ -52,7 +52,7 @@ WITHOUT_VALUE = {
     "fournier_forand": {"refractive_index", "junge_slope"},
 }
 
-PLUGINS = [name.rpartition(".")[2] for name in PLUGIN_MODULES if name not in ("bases", "phase.tabulated")]
+PLUGINS = list(PLUGIN_MODULES)
 #: What else is given where a number needs it.
 RECTANGLE, SECTOR, STRIP = ({"shape": shape} for shape in ("rectangle", "sector", "strip"))
 NEEDED = {
@@ -132,7 +132,7 @@ def test_every_text_that_is_no_choice_is_refused(plugin):
 def test_manual_pages_have_the_table_of_the_declared_parameters():
     pages = {
         match[1]: part.__doc__
-        for name in PLUGIN_MODULES
+        for name, _ in set(PLUGIN_MODULES.values())
         for part in vars(importlib.import_module(f"mitransient_lidar.plugins.{name}")).values()
         if isinstance(part, type) and (match := re.search(r"\(``(\w+)``\)", (part.__doc__ or "").partition("\n")[0]))
     }

@@ -181,15 +181,12 @@ def test_defaults_are_the_published_system():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "module", [name for name in variants.PLUGIN_MODULES if name not in ("phase.tabulated", "bases")]
-)
-def test_examples_in_the_manual_load(module, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", variants.PLUGIN_MODULES)
+def test_examples_in_the_manual_load(name, tmp_path, monkeypatch):
     # The file that an example reads: an isotropic phase function.
     (tmp_path / "harbour.csv").write_text("".join(f"{angle}, 0.0796\n" for angle in range(0, 181, 10)))
     monkeypatch.chdir(tmp_path)
-    classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
-    name = module.rpartition(".")[2]
+    classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{variants.PLUGIN_MODULES[name][0]}")).values()
     (manual,) = (c.__doc__ for c in classes if isinstance(c, type) and f"(``{name}``)" in (c.__doc__ or ""))
     xml, python = re.search(r"code-block:: xml\n(.*?)\.\. code-block:: python\n(.*)", manual, re.DOTALL).groups()
     load = ast.literal_eval(python.strip())

@@ -10,7 +10,7 @@ from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser import enclosed_area
-from mitransient_lidar.transport.medium.index_layers import refract
+from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.probe import Probe, axis_on_bottom
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 

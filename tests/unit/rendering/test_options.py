@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import mitransient_lidar
 from mitransient_lidar.core.options import declared
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passes import RenderOptions
 
 NAMES = [one.name for one in fields(RenderOptions)]
 

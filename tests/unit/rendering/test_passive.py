@@ -14,8 +14,7 @@ from mitransient_lidar.rendering import passive
 from mitransient_lidar.results import save
 from mitransient_lidar.transport.daylight.renderer import DaylightLight, pixel_solid_angles
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
-from mitransient_lidar.transport.sensor.pixels import LayoutPixels
+from mitransient_lidar.transport.sensor.pixels import HexPixels, LayoutPixels
 
 PASSIVE = {"type": "passive_volpath", "paths_per_pass": 4096}
 

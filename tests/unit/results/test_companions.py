@@ -7,7 +7,7 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.companions import join, split
+from mitransient_lidar.results.attributes import join, split
 
 
 def result(bins, wavelength):

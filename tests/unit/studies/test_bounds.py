@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
-from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passes import RenderOptions
 from mitransient_lidar.studies import bounds as study
 
 T = np.arange(60.0)

@@ -10,7 +10,7 @@ from rows import each_row
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies import depth_bias as study
-from mitransient_lidar.studies.tpu import tpu
+from mitransient_lidar.studies.depth_bias import tpu
 
 
 @pytest.fixture
@@ -186,7 +186,7 @@ def test_uncertainty_reports_the_cells_of_all_altitudes(monkeypatch):
         }
         return xr.Dataset(data, {**coords, "estimator": ["gaussian"], "pixel": ["single"]}, attributes)
 
-    monkeypatch.setattr("mitransient_lidar.studies.tpu.depth_bias", table)
+    monkeypatch.setattr("mitransient_lidar.studies.depth_bias.depth_bias", table)
     states = []
     errors = {"pointing_mrad": 0.0, "position_m": 2.0, "height_m": 5.0}
     found = tpu("riegl_vq840g", altitudes=[100, 400], corrections=None, **errors, progress=states.append)

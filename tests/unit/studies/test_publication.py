@@ -14,9 +14,8 @@ from scipy.special import erf
 import mitransient_lidar
 from mitransient_lidar.plots import palette
 from mitransient_lidar.plots.publication import figures as publication
-from mitransient_lidar.studies.publication import measures
-from mitransient_lidar.studies.publication.measures import Series, Waveform
-from mitransient_lidar.studies.publication.statements import COLUMNS, Statement, write_statements
+from mitransient_lidar.studies.publication import statements as measures
+from mitransient_lidar.studies.publication.statements import COLUMNS, Series, Statement, Waveform, write_statements
 
 TIME = np.arange(0.125, 120, 0.25)
 

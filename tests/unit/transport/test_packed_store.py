@@ -8,8 +8,8 @@ from kernel_arrays import array, vector
 from mitransient_lidar.transport.merging.photon_map import PhotonMap
 from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.path import PathPoint
-from mitransient_lidar.transport.paths.path_classes import PathClasses
 
 #: Zero, numbers from the smallest to the largest of single precision, and those that are not finite.
 NUMBERS = np.float32([0, 1e-45, 1.2e-38, 0.1, 3.4e38, np.inf, np.nan, -np.nan])

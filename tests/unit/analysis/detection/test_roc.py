@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom, chi2
 from significance import FALSE_ALARM
 
-from mitransient_lidar.analysis.detection.roc import area_under_curve, binomial_rates, exceedance
+from mitransient_lidar.analysis.detection.statistics import area_under_curve, binomial_rates, exceedance
 
 
 def test_rates_have_the_published_intervals():

@@ -6,8 +6,7 @@ import xarray as xr
 from closed_form_waveform import METRES_PER_NS, SURFACE_NS
 
 import mitransient_lidar
-from mitransient_lidar.analysis.information.alignment import light_duration
-from mitransient_lidar.analysis.information.bandwidth import behind_bandwidth
+from mitransient_lidar.analysis.information.alignment import behind_bandwidth, light_duration
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 

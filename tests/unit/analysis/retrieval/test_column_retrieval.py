@@ -9,7 +9,7 @@ from rows import each_row
 
 from mitransient_lidar.analysis.retrieval.column_retrieval import bottom_class, bottom_reflectance, water_of_column
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import water_of
 

@@ -7,9 +7,9 @@ from rows import each_row
 from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.retrieval.column_slope import ColumnBins
+from mitransient_lidar.analysis.retrieval.column_retrieval import ColumnBins
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.studies.fov_sweep import fov_sweep, slope_and_error
 

@@ -7,7 +7,7 @@ import pytest
 
 from mitransient_lidar.analysis.retrieval import scattered_light
 from mitransient_lidar.analysis.retrieval.scattered_light import View, light_of
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 
 SYSTEM = LidarSystem(200, math.radians(20), 1.34, 1.364, energy=1.0, aperture_area=1.0)
 # 30 mrad around a beam of 10 mrad, ripples of 3 m/s, and echoes of 8.3 ns.

@@ -7,8 +7,7 @@ import pytest
 from oracles.lidar_equation import cos_water
 
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
-from mitransient_lidar.physics.lidar.level_sea import snell
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem, snell
 
 THETA, N = math.radians(20), 1.34
 RANGE = 200 / math.cos(THETA)

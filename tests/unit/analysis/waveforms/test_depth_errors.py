@@ -9,7 +9,7 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.geometry import LinesOfSight
 
 N, GROUP, C0 = 1.34, 1.364, 0.299792458

@@ -8,7 +8,7 @@ from oracles.phase import henyey_greenstein
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.echo_estimate import _backscatter, water_and_bottoms
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 

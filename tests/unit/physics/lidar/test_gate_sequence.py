@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.gate_sequence import GateSequence
+from mitransient_lidar.physics.lidar.gate_train import GateSequence
 
 GATES, PULSES, FRAMES = 5, 3, 4
 ALL = np.meshgrid(np.arange(FRAMES), np.arange(GATES), np.arange(PULSES), indexing="ij")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry, LidarSystem
+from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, LidarSystem
 
 
 def test_gain_at_nadir():

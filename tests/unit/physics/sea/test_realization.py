@@ -10,9 +10,13 @@ from significance import largest_z
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import angular_frequency
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, SeaState
-from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, JonswapSpectrum, PiersonMoskowitzSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import (
+    ElfouhailySpectrum,
+    JonswapSpectrum,
+    PiersonMoskowitzSpectrum,
+    SwellSpectrum,
+)
 
 SPECTRA = {
     "elfouhaily": ElfouhailySpectrum(6, direction=0.3),

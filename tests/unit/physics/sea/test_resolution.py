@@ -8,7 +8,7 @@ import pytest
 
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
+from mitransient_lidar.physics.sea.sea_mesh import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 
 TILT = math.radians(20)

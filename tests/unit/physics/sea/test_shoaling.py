@@ -8,9 +8,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, DepthResponse, band_wavenumbers
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState
-from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
+from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, SwellSpectrum
 
 SEEDS = range(16)
 #: Total slope variances of the spectrum itself: no waves are scaled to measured ones.

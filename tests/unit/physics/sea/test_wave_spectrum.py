@@ -10,13 +10,13 @@ from scipy.integrate import quad, trapezoid
 from scipy.special import exp1
 
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
     ShallowSpectrum,
+    SwellSpectrum,
     inverse_wave_age,
 )
 

@@ -3,7 +3,7 @@
 import numpy as np
 from figure_inputs import shot_statistics
 
-from mitransient_lidar.studies.shot_statistics import slope_correlations
+from mitransient_lidar.studies.shots import slope_correlations
 
 
 def test_correlations_are_those_of_the_panels():

@@ -16,6 +16,7 @@ from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, regis
 from mitransient_lidar.transport.medium.nested_objects import create_object
 
 
+@register("shape", CANOPY)
 class CanopyShape(mi.Mesh):
     r"""Plants on a bottom (``canopy``).
 
@@ -93,6 +94,3 @@ def _ground(props: DeclaredProperties, grounds: list[mi.Shape], feet: FloatArray
 
     x, y = bottom.lines()
     return np.asarray(RegularGridInterpolator((y, x), bottom.heights(x, y))(feet[:, 1::-1]))
-
-
-register("shape", CANOPY, CanopyShape)

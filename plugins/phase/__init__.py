@@ -1,1 +1,0 @@
-"""Phase-function plugins for water and particles."""
