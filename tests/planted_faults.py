@@ -285,7 +285,7 @@ FAULTS = (
         near=f"{_UNIT}/analysis/waveforms",
     ),
     Fault(
-        *("variances_of_area_exchanged", f"{_A}/detection/roc.py"),
+        *("variances_of_area_exchanged", f"{_A}/detection/statistics.py"),
         "ddof=1) / m + np.var(below, ddof=1) / n",
         "ddof=1) / n + np.var(below, ddof=1) / m",
         near=f"{_UNIT}/analysis/detection",
@@ -325,7 +325,7 @@ FAULTS = (
         near=f"{_UNIT}/physics/receiver/test_camera.py",
     ),
     Fault(
-        *("platform_to_the_left", f"{_P}/lidar/gate_sequence.py"),
+        *("platform_to_the_left", f"{_P}/lidar/gate_train.py"),
         "[math.sin(heading), math.cos",
         "[-math.sin(heading), math.cos",
         near=f"{_UNIT}/physics/lidar/test_gate_sequence.py",

@@ -49,7 +49,7 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         Points of the flight, or chunks of them, of which one is in memory at a time. Variables over ``point``:
 
         - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
-        - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.times.TIME_SYSTEMS`, is
+        - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.records.TIME_SYSTEMS`, is
           ``flight`` by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 1 an object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged
           object, 45 no bottom found. The last is flagged as synthetic, since no echo is there;

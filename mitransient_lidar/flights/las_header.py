@@ -22,7 +22,7 @@ SCENE_WKT = (
     'AXIS["x",EAST],AXIS["y",NORTH],AXIS["z",UP]]'
 )
 
-#: What the times of points are, by their system (`poses.times.TIME_SYSTEMS`).
+#: What the times of points are, by their system (`poses.records.TIME_SYSTEMS`).
 TIME_NOTES = {
     "flight": "seconds as in the trajectory of the flight, not of a known GPS week",
     "gps_week": "seconds of the GPS week",

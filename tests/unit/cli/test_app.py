@@ -19,6 +19,7 @@ from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import messages
+from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue
@@ -139,11 +140,11 @@ def test_interrupted_render_is_kept(scene, calls, tmp_path):
 def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, monkeypatch, tmp_path):
     """Their drawings are of the passes until then; the exit code was once 0."""
     name = command.replace("-", "_")
-    study = f"mitransient_lidar.studies.{name}"
+    study = COMMANDS[command].function.partition(":")[0]
     interrupted = xr.Dataset(attrs={"interrupted": 1, "passes": 3})
     module = "targets" if command == "target-signal" else "light"
     stub(monkeypatch, command, lambda **_: interrupted)
-    monkeypatch.setattr(f"{study}.{describe}", lambda _: ["lines"])
+    monkeypatch.setattr(f"mitransient_lidar.{study}.{describe}", lambda _: ["lines"])
     monkeypatch.setattr(f"mitransient_lidar.plots.studies.{module}.plot_{name}", lambda *_: None)
     depths = ["--depths", "3"] if command == "beam-spread" else []
     done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")

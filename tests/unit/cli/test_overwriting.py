@@ -272,13 +272,13 @@ def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
 @pytest.mark.usefixtures("small_figures")
 def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
     """The new one gets another, so that no render is lost."""
-    from mitransient_lidar.studies import estimate
+    from mitransient_lidar.studies import light_classes
 
     def slow(*arguments, **options):
         (folder / "d/f.nc").write_text("mine")
         return found(*arguments, **options)
 
-    found = estimate.estimate
+    found = light_classes.estimate
     stub(monkeypatch, "estimate", slow)
     done = run("estimate", "table1", "--paths", 64, "-o", "d/f.png")
     assert done.exit_code == 0

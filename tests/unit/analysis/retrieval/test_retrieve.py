@@ -33,7 +33,7 @@ from synthetic_shots import (
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieval_table, retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots import retrieval
+from mitransient_lidar.plots.studies import shots as retrieval
 from mitransient_lidar.rendering.shots import series as shot_series
 
 pytestmark = pytest.mark.usefixtures("scattered_once")
