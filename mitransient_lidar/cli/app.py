@@ -40,9 +40,9 @@ COMMANDS: dict[str, Command] = {
     **render.COMMANDS,
     **campaigns.COMMANDS,
     **studies.STUDIES,
-    **campaigns.FIGURES,
     **results.COMMANDS,
     **analysis.COMMANDS,
+    **campaigns.FIGURES,
     **scenes.COMMANDS,
 }
 

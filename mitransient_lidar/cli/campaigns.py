@@ -165,7 +165,7 @@ COMMANDS = {
 
 FIGURES = {
     "figures": Command(
-        "Study",
+        "Scenes and system",
         "plots.publication.figures:figures",
         _figures,
         """Make the figures of the published model again.

@@ -14,8 +14,12 @@ from mitransient_lidar.cli.messages import exit_if_interrupted
 
 Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
 
+#: Headings of the help.
+_DESIGN, _LIGHT, _SURVEY = "Targets and designs", "Light in water", "Depths and their uncertainty"
+
 
 def _study(
+    heading: str,
     name: str,
     plot: str,
     describe: str,
@@ -48,7 +52,7 @@ def _study(
         for one in getattr(found, "results", [found])[:1]:
             exit_if_interrupted(one)
 
-    return Command("Study", f"{place}:{function or name}", body, text)
+    return Command(heading, f"{place}:{function or name}", body, text)
 
 
 def _water(call: Call, output: DrawingOnly = None) -> None:
@@ -122,6 +126,7 @@ def _tpu(
 
 STUDIES = {
     "find-shots": _study(
+        _DESIGN,
         "find_shots",
         "studies.shots:plot_found_shots",
         "describe_found_shots",
@@ -133,6 +138,7 @@ STUDIES = {
         has_data=False,
     ),
     "target-signal": _study(
+        _DESIGN,
         "target_signal",
         "studies.targets:plot_target_signal",
         "describe_target",
@@ -142,6 +148,7 @@ STUDIES = {
         """,
     ),
     "detect": _study(
+        _DESIGN,
         "detection",
         "studies.targets:plot_detection",
         "describe_detection",
@@ -152,6 +159,7 @@ STUDIES = {
         function="detect",
     ),
     "estimate": _study(
+        _LIGHT,
         "estimate",
         "waveforms:plot_components",
         "describe_estimate",
@@ -162,6 +170,7 @@ STUDIES = {
         module="light_classes",
     ),
     "bounds": _study(
+        _DESIGN,
         "bounds",
         "studies.parameters:plot_bounds",
         "describe_bounds",
@@ -173,6 +182,7 @@ STUDIES = {
         table="write_table",
     ),
     "beam-spread": _study(
+        _LIGHT,
         "beam_spread",
         "studies.light:plot_beam_spread",
         "describe_spread",
@@ -182,12 +192,14 @@ STUDIES = {
         """,
     ),
     "fov-sweep": _study(
+        _LIGHT,
         "fov_sweep",
         "studies.light:plot_fov_sweep",
         "describe_fov_sweep",
         "Measure the water's attenuation at several fields of view.",
     ),
     "scattering-orders": _study(
+        _LIGHT,
         "scattering_orders",
         "studies.light:plot_scattering_orders",
         "describe_orders",
@@ -198,6 +210,7 @@ STUDIES = {
         module="light_classes",
     ),
     "forecast": _study(
+        _SURVEY,
         "forecast",
         "studies.depths:plot_forecast",
         "describe_forecast",
@@ -211,13 +224,13 @@ STUDIES = {
         table_suffix=".tif",
     ),
     "water": Command(
-        "Study",
+        _LIGHT,
         "studies.water_report:describe_water",
         _water,
         "Print the optical properties of a water and its parameters.",
     ),
     "depth-bias": Command(
-        "Study",
+        _SURVEY,
         "studies.depth_bias:depth_bias",
         _depth_bias,
         """Measure the depth errors in an instrument's records.
@@ -228,7 +241,7 @@ STUDIES = {
         """,
     ),
     "tpu": Command(
-        "Study",
+        _SURVEY,
         "studies.depth_bias:tpu",
         _tpu,
         """Determine the vertical and horizontal uncertainty of an instrument's soundings.
