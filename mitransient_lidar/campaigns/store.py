@@ -131,7 +131,8 @@ class Store:
         sweep(path.parent)
         count = len(next(iter(columns.values())))
         bytes_of_run = sum(array.values.nbytes for array in arrays.values())
-        size = _shard_size(count, bytes_of_run)
+        size = int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
+        size = max(min(size, _MOST_BYTES // max(bytes_of_run, 1)), 1)
         size = size if shard_size is None else integer("shard_size", shard_size, 1, LARGEST_SHARD)
         needed = BYTES_PER_BYTE * bytes_of_run * min(size, count)
         require_memory(f"shards of {size} runs", needed, "take a smaller shard_size, or fewer pixels or bins")
@@ -475,9 +476,3 @@ def seal(attributes: Mapping[str, Any]) -> str:
 def _texts(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return texts in NumPy's fixed length, as in the table of the runs."""
     return np.array([str(one) for one in values], dtype=np.str_)
-
-
-def _shard_size(count: int, bytes_of_run: int) -> int:
-    """Return the number of runs per shard."""
-    size = int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
-    return max(min(size, _MOST_BYTES // max(bytes_of_run, 1)), 1)

@@ -29,7 +29,9 @@ def _quotas(groups: Path, mount: Path) -> Iterator[float]:
         _, controllers, path = line.split(":", 2)
         if controllers and "cpu" not in controllers.split(","):
             continue
-        root = mount if not controllers else _mounted(mount, controllers)
+        # First-version controllers have folders of their own.
+        folders = (mount / name for name in (controllers, "cpu", "cpu,cpuacct") if controllers)
+        root = next((folder for folder in folders if folder.is_dir()), mount)
         # A container sees its own group as the mount, whatever the path is.
         folder = root / path.lstrip("/")
         for group in (folder, *folder.parents[: len(folder.parts) - len(root.parts)]):
@@ -38,11 +40,6 @@ def _quotas(groups: Path, mount: Path) -> Iterator[float]:
                 quota, period = (float(word) for name in names for word in _text(group / name).split())
                 if quota > 0:
                     yield quota / period
-
-
-def _mounted(mount: Path, controllers: str) -> Path:
-    """Return the folder of first-version controllers."""
-    return next((mount / name for name in (controllers, "cpu", "cpu,cpuacct") if (mount / name).is_dir()), mount)
 
 
 def _text(path: Path) -> str:

@@ -223,11 +223,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     middle, edge = (low + high) / 2, 0.56 * (float((high - low).max()) or 1.0)
     ax.set(xlim=(middle[0] + edge, middle[0] - edge), ylim=(middle[1] - edge, middle[1] + edge), aspect="equal")
-    _name_edges(ax, optional_number(attributes, "field_of_view_mrad"))
-
-
-def _name_edges(ax: Axes, width: float | None) -> None:
-    """Write which edge is far from nadir, and the width of the field of view [mrad] if known."""
+    width = optional_number(attributes, "field_of_view_mrad")
     near = "near" if width is None else f"near · {width:g} mrad"
     for y, text, side in ((1, "far", "bottom"), (0, near, "top")):
         ax.text(0.5, y, text, ha="center", va=side, fontsize="small", color="0.3", transform=ax.transAxes)

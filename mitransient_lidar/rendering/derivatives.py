@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
-    from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
+    from mitransient_lidar.transport.plugin_types import SeaShape
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest number of parameters in a render.
@@ -105,7 +105,10 @@ def known_names(scene: LidarScene) -> list[str]:
             count = layers.column.count
             names += [name] if count == 1 else [f"{name}[{layer}]" for layer in range(count)]
         names += ["phase_g"] if layers.kind == "hg" and not layers.nested else []
-    names += [DIVERGENCE] if _is_gaussian(scene.transmitter) else []
+    # Both widths of a circular Gaussian beam follow from its divergence.
+    beam = scene.transmitter
+    is_circular = beam.beam_profile == "gaussian" and not beam.parameters.get("divergence_across_mrad")
+    names += [DIVERGENCE] if is_circular else []
     names += [RIPPLES] if _rippled(scene) else []
     diffuse = [solid for solid in scene.solids if _uniform_reflectance(solid) is not None]
     return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in diffuse)]
@@ -147,11 +150,6 @@ def _parameters(renderer: PassRenderer, name: str, others: Mapping[str, str]) ->
         )
         for layer in layers
     ]
-
-
-def _is_gaussian(transmitter: Transmitter) -> bool:
-    """Return whether both widths of a Gaussian beam follow from its divergence."""
-    return transmitter.beam_profile == "gaussian" and not transmitter.parameters.get("divergence_across_mrad")
 
 
 def _rippled(scene: LidarScene) -> list[SeaShape]:

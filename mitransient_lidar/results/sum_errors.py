@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -88,7 +87,8 @@ class SumErrors:
 
         Raises `UserError` if the result states another kind of correlation.
         """
-        curve = _curve(dataset.attrs)
+        bins, inflation = (np.atleast_1d(np.asarray(dataset.attrs.get(name, []), np.float64)) for name in _CURVE)
+        curve = np.stack([bins, inflation]) if bins.size and bins.shape == inflation.shape else np.zeros((2, 0))
         if VARIABLE not in dataset:
             return cls(None, curve) if curve.size else None
         _check(dataset)
@@ -192,8 +192,3 @@ def _check(dataset: xr.Dataset) -> None:
         values = dataset[name]
         if values.dtype.kind not in "fiu" or (dims and values.dims != dims) or not np.isfinite(values.values).all():
             raise UserError(f"the result has {name} that is not of finite numbers: {VARIABLE} needs them")
-
-
-def _curve(attributes: Mapping[str, Any]) -> FloatArray:
-    bins, inflation = (np.atleast_1d(np.asarray(attributes.get(name, []), np.float64)) for name in _CURVE)
-    return np.stack([bins, inflation]) if bins.size and bins.shape == inflation.shape else np.zeros((2, 0))

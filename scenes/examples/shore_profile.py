@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.flights.products import read_points
 from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
-from mitransient_lidar.results.variables import PointClass
+from mitransient_lidar.results.attributes import PointClass
 
 #: Marker of each class, so that colour is not all that tells them apart.
 MARKERS = {PointClass.GROUND: "^", PointClass.SURFACE: "_", PointClass.BOTTOM: "o", PointClass.NO_ECHO: "x"}
