@@ -284,6 +284,9 @@ class PassiveVolpath(PassIntegrator):
     by chance, and the image is noisy. Distances to scattering events are drawn from the scattering coefficient, and
     absorption is a weight.
 
+    Light that the water scatters towards the receiver causes most of the noise, and varies slowly over an image. The
+    option ``smooth`` of `mitransient_lidar.render_passive` smooths this part alone.
+
     Light from outside the surface mesh is lost. The air is clear; the receiver's optics do not affect the radiance.
     There are no derivatives.
 

@@ -20,6 +20,7 @@ from mitransient_lidar.rendering.accuracy import (
     LightStatistics,
     PassStatistics,
     received_power,
+    smoothing_bias,
 )
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
@@ -46,9 +47,6 @@ _ERROR_PIXELS = 4096
 
 #: Smallest path share in a pass with smoothed images: with fewer, paths take little of the time.
 _LEAST_SHARE_OF_SMOOTH = 2**-3
-
-#: Noise in the estimated bias over the smoothed image's noise, squared, for noise that pixels do not share.
-_NOISE_OF_BIAS = 1 / 6
 
 #: A pixel is lit in a gate with this share of the energy in the gate's brightest pixels (99th percentile).
 _LIT = 0.05
@@ -212,17 +210,11 @@ class PassAccumulator:
         return np.asarray(smoothed.reshape(energy.shape))
 
     def _smoothing_bias(self) -> FloatArray:
-        """Return the relative bias of each gate by smoothing, rms over its lit pixels, shape (gates,); NaN if unknown.
-
-        A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise
-        is subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
-        """
+        """Return the bias of each gate by smoothing, rms over its lit pixels, shape (gates,); NaN if unknown."""
         energy, stderr = self.gates.mean, self.gates.stderr
         change = self._smoothed(energy) - energy
         lit = energy > _LIT * np.nanpercentile(energy, 99, axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            square = np.sum((change**2 - _NOISE_OF_BIAS * stderr**2) / energy**2, axis=0, where=lit) / lit.sum(axis=0)
-        return np.asarray(np.sqrt(np.maximum(square, 0)))
+        return smoothing_bias(change, stderr, energy, lit)
 
     def require_light(self, passes: int) -> None:
         """Raise UserError if the record of all passes is empty; values that are not finite count as light."""

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 #: Pixels darker than this fraction of the median are excluded from the radiance errors.
 _DARK_PIXEL = 1e-2
 
+#: Noise in the estimated bias of smoothing over the smoothed image's noise, squared, where pixels share no noise.
+_NOISE_OF_BIAS = 1 / 6
+
 #: Values of an array that are added at a time.
 _PART = 2**17
 
@@ -70,6 +73,24 @@ class PassStatistics:
             return np.full_like(self._squares[part], np.nan)
         found = self._squares[part] / (self.count - 1)
         return np.asarray(np.sqrt(np.divide(found, self.count, out=np.asarray(found)), out=np.asarray(found)))
+
+
+def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, lit: BoolArray) -> FloatArray:
+    """Return the bias of smoothed images over their light, rms over lit pixels, NaN without any.
+
+    A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise is
+    subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
+
+    Parameters
+    ----------
+    change, stderr
+        Change of the smoothed part by a second smoothing, and standard error of the part, shape (pixels, ...).
+    light, lit
+        All light, and which pixels count, in the same shape.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.sum((change**2 - _NOISE_OF_BIAS * stderr**2) / light**2, axis=0, where=lit) / lit.sum(axis=0)
+    return np.asarray(np.sqrt(np.maximum(square, 0)))
 
 
 class LightStatistics:

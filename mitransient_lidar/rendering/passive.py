@@ -21,7 +21,7 @@ from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.clear_sky import background_power
-from mitransient_lidar.rendering.accuracy import RatioStatistics
+from mitransient_lidar.rendering.accuracy import PassStatistics, RatioStatistics, smoothing_bias
 from mitransient_lidar.rendering.passes import (
     MOST_PASSES,
     TOLERATED_LOSS,
@@ -80,6 +80,14 @@ def render_passive(
     filter_width_nm: Annotated[
         float | None, positive_option("Width of the receiver's filter, for the daylight power", "nm")
     ] = None,
+    smooth: Annotated[
+        float | None,
+        Option(
+            "Smooth the light that the water scatters towards the receiver by a Gaussian with this standard deviation "
+            "[pixels]: less noise, and a bias, which results state",
+            *(0.2, 20),
+        ),
+    ] = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -101,6 +109,10 @@ def render_passive(
     frame_step_s
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to a dict's
         ``ocean_surface`` parameter ``time``.
+    smooth
+        Standard deviation of a Gaussian that smooths, in each pass, the radiance of paths that the water has scattered
+        on their way to the receiver, 0.2 to 20 pixels; none by default. Reflections, and what is seen without
+        scattering, stay sharp. The attribute ``smoothing_bias`` estimates the relative change, rms over the pixels.
     progress
         Called with a `passes.Progress` of the frame after every pass.
 
@@ -125,6 +137,7 @@ def render_passive(
         raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")
     goals = [Goal.from_options(target_error, max_time, count, DEFAULT_GOAL, target_quantile) for count in counts]
     rendered: list[int] = []
+    biases: list[float] = []
     images: list[tuple[FloatArray, FloatArray]] = []
     start, lost = time.perf_counter(), 0.0
     for frame in range(frames):
@@ -136,9 +149,13 @@ def render_passive(
             pixels = renderer.scene.receiver.pixels
             size = (_BYTES_PER_PIXEL + _BYTES_PER_FRAME * frames) * pixels.count
             require_memory(f"{frames} frames of {pixels.count} pixels", size, "take fewer of them")
+            if smooth and pixels.grid is None:
+                raise UserError(f"smooth = {smooth:g} pixels needs a layout of rows and columns")
             described, first, etendue = _describe(renderer), session, _etendue(renderer)
         try:
-            statistics, log, share = _render_frame(renderer, goals[frame], pass_seed(seed, frame), progress)
+            statistics, log, share, bias = _render_frame(
+                renderer, goals[frame], pass_seed(seed, frame), progress, smooth
+            )
         except KeyboardInterrupt:
             if not images:
                 raise
@@ -146,6 +163,7 @@ def render_passive(
             break
         images.append((statistics.ratio, statistics.stderr))
         rendered.append(log.count)
+        biases.append(bias)
         if statistics.invalid:
             logger.warning("%d of %d pixels have non-finite radiance", statistics.invalid, len(statistics.ratio))
         last, lost, interrupted = log, max(lost, share), log.interrupted
@@ -163,6 +181,8 @@ def render_passive(
         frame_passes=rendered,
         frame_step_s=step,
     )
+    if smooth:
+        attributes |= {"smooth_pixels": smooth, "smoothing_bias": max(biases)}
     times = step * np.arange(len(images), dtype=np.float64) if frames > 1 else None
     return _labelled(images, times, pixels, etendue, width, attributes)
 
@@ -198,16 +218,26 @@ def _labelled(
 
 
 def _render_frame(
-    renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None
-) -> tuple[RatioStatistics, PassLog, float]:
-    """Render one frame's passes; return statistics, log and share of the light lost at the surface's edge."""
-    statistics, received = RatioStatistics(renderer.scene.receiver.pixels.count), 0.0
+    renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None, smooth: float | None
+) -> tuple[RatioStatistics, PassLog, float, float]:
+    """Render one frame's passes; return statistics, log, share of the light lost at the surface's edge, and bias.
+
+    The bias is that of smoothed images, else NaN.
+    """
+    pixels = renderer.scene.receiver.pixels
+    statistics, scattered, received = RatioStatistics(pixels.count), PassStatistics(), 0.0
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal received
         daylight = renderer.render_pass(seed)
-        found = np.array(daylight.found)
-        statistics.add(found, np.array(daylight.sampled))
+        found, sampled = np.array(daylight.found), np.array(daylight.sampled)
+        if smooth:
+            assert pixels.grid is not None
+            diffuse = np.array(daylight.scattered)
+            radiance = _smoothed(diffuse, sampled, pixels.grid, smooth)
+            scattered.add(radiance)
+            found += radiance * sampled - diffuse
+        statistics.add(found, sampled)
         received += float(np.sum(found))
         return float(daylight.edge_loss[0])
 
@@ -227,7 +257,22 @@ def _render_frame(
         verify=require_light,
         progress=progress,
     )
-    return statistics, log, log.edge_loss_share(received)
+    bias = np.nan
+    if smooth:
+        assert pixels.grid is not None
+        known = np.isfinite(statistics.ratio) & (statistics.ratio > 0)
+        mean = np.where(known, scattered.mean, 0)
+        change = _smoothed(mean, known.astype(np.float64), pixels.grid, smooth) - mean
+        bias = float(smoothing_bias(change, scattered.stderr, statistics.ratio, known))
+    return statistics, log, log.edge_loss_share(received), bias
+
+
+def _smoothed(found: FloatArray, sampled: FloatArray, grid: tuple[int, int], smooth: float) -> FloatArray:
+    """Return the smoothed ratio of an image and its samples, shape (pixels,); 0 far from all samples."""
+    from scipy.ndimage import gaussian_filter
+
+    light, samples = (gaussian_filter(one.reshape(grid), smooth).ravel() for one in (found, sampled))
+    return np.asarray(np.divide(light, samples, out=np.zeros_like(light), where=samples > 0))
 
 
 def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, increasing_array, integer
+from mitransient_lidar.core.validation import BoolArray, FloatArray, increasing_array, integer
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.files import Given, dataset_of
 from mitransient_lidar.results.gate_stack import as_stack, average_frames, has_frames
@@ -19,7 +19,7 @@ from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, opt
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
 _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
-_CERTAIN = 4.0  # standard errors that are enough for any gate
+_CERTAIN = 4.0  # standard errors that are enough for any gate, and that depths in frames need
 _FIRST_ECHOES = 1.0  # percentile of the echoes' times before which all pixels see the column
 _BLOCK = 8192  # pixels computed at once
 
@@ -51,7 +51,13 @@ class DepthImage(NamedTuple):
 
 
 def range_from_gates(
-    energy: npt.ArrayLike, stderr: npt.ArrayLike, gate_mid: npt.ArrayLike, *, reach: int | None = None
+    energy: npt.ArrayLike,
+    stderr: npt.ArrayLike,
+    gate_mid: npt.ArrayLike,
+    *,
+    reach: int | None = None,
+    least_excess: float = 0.0,
+    saturated: npt.ArrayLike | None = None,
 ) -> RangeImage:
     """Find every pixel's echo above the water column's backscatter.
 
@@ -66,6 +72,11 @@ def range_from_gates(
     reach : int, optional
         Largest echo extent on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the number of
         overlapping gates. By default 2, less with fewer than 7 gates.
+    least_excess : float, optional
+        Least excess over the column of an echo's gate [standard errors], at least 0.
+    saturated : array_like of bool, shape (..., gate), optional
+        Gates whose energy is too small. Pixels that need them have no depth: for an echo and its column, or since an
+        echo may be in them. Gates from the first one on are the column.
 
     Returns
     -------
@@ -102,11 +113,13 @@ def range_from_gates(
     largest = (mid.size - 3) // 2
     half = min(2, largest) if reach is None else integer("reach", reach, 0, largest)
     column = _ColumnModel(mid, half)
+    limited = np.broadcast_to(False if saturated is None else np.asarray(saturated, dtype=np.bool_), e.shape)
+    flat_limited = limited.reshape(-1, mid.size)
     flat, flat_error = e.reshape(-1, mid.size), s.reshape(-1, mid.size)
     found = np.empty((3, flat.shape[0]))
     for start in range(0, flat.shape[0], _BLOCK):
         pixels = slice(start, start + _BLOCK)
-        found[:, pixels] = _ranges(flat[pixels], flat_error[pixels], column)
+        found[:, pixels] = _ranges(flat[pixels], flat_error[pixels], column, least_excess, flat_limited[pixels])
     return RangeImage(*found.reshape(3, *e.shape[:-1]))
 
 
@@ -117,7 +130,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     ----------
     stack : xarray.Dataset
         A gate stack with at least 3 gates, whose last dimension is ``gate``; or camera frames, whose mean above the
-        level without light counts, with frame noise and render error.
+        level without light counts, with frame noise and render error. In frames, echoes of less than 4 standard errors
+        and echoes beside saturated gates have no depth: their errors would not hold.
     reach : int, optional
         As for `range_from_gates`.
 
@@ -139,7 +153,11 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     farther from nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
     """
     stack = dataset_of("stack", stack, "gates", "frames")
-    stack = _light_of_frames(stack) if has_frames(stack) else average_frames(stack)
+    limits: dict[str, Any] = {}
+    if has_frames(stack):
+        full = stack["saturated"].any("frame").values if "saturated" in stack else None
+        limits = {"least_excess": _CERTAIN, "saturated": full}
+    stack = _light_of_frames(stack) if limits else average_frames(stack)
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
@@ -149,7 +167,7 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
             f"the gates leave gaps of {gap:.3g} ns, in which echoes of the pulse of {pulse:.3g} ns are lost: "
             "depths need gates that adjoin"
         )
-    found = range_from_gates(energy, stderr, middles, reach=reach)
+    found = range_from_gates(energy, stderr, middles, reach=reach, **limits)
     try:
         lines = LinesOfSight.from_dataset(stack)
         geometry = lidar_geometry(stack.attrs)
@@ -170,11 +188,22 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
 
 
 def _light_of_frames(frames: xr.Dataset) -> xr.Dataset:
-    """Return the frames' mean as a gate stack, with errors by noise and render [DN]."""
-    stack, rendered = as_stack(frames), frames["signal_mean_stderr"]
+    """Return the frames' mean as a gate stack, with errors by noise and render [DN].
+
+    A few photoelectrons are not normal: where a gate exceeds its mean, its noise is that of light at this level.
+    """
+    number = frames.sizes["frame"]
+    stack, rendered, mean = as_stack(frames), frames["signal_mean_stderr"], frames["signal_mean"]
+    level = mean.mean("frame") if "frame" in mean.dims else mean
     if "frame" in rendered.dims:  # on as many seas
-        rendered = (rendered**2).mean("frame") ** 0.5 / math.sqrt(frames.sizes["frame"])
-    return stack.assign(gate_energy_stderr=(stack["gate_energy_stderr"] ** 2 + rendered**2) ** 0.5)
+        rendered = (rendered**2).mean("frame") ** 0.5 / math.sqrt(number)
+    light, variance = level - frames["dark_level"], number * stack["gate_energy_stderr"] ** 2
+    # Photon transfer: the variance grows with the light.
+    apart = light - light.mean()
+    per_light = max(float((apart * variance).sum() / max(float((apart**2).sum()), 1e-300)), 0.0)
+    brighter = np.maximum(stack["gate_energy"] - light, 0)
+    square = (variance + per_light * brighter) / number + rendered**2
+    return stack.assign(gate_energy_stderr=square**0.5)
 
 
 def _column(
@@ -237,7 +266,9 @@ class _ColumnModel:
                 self.deep[behind, k] = 1 / behind.size
 
 
-def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> FloatArray:
+def _ranges(
+    energy: FloatArray, stderr: FloatArray, column: _ColumnModel, least_excess: float, saturated: BoolArray
+) -> FloatArray:
     """Return the pixels' depth, sigma and confidence, shape (3, pixel), from energies with the shape (pixel, gate)."""
     from scipy.special import ndtr
 
@@ -288,7 +319,11 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
         variance += np.sum((own * weights + turned * column.slope.T[peak]) ** 2 * log_variance, axis=1)
         behind = np.sum(np.where(limited & (weight > 0) & (deep > 0), lever, 0), axis=1, keepdims=True)
         variance += np.sum((behind * column.deep.T[peak] * s) ** 2, axis=1)
-    found = known & (z_peak > 0)
+    found = known & (z_peak > 0) & (z_peak >= least_excess)
+    gate, apart = np.arange(column.mid.size), column.half + np.array([_COLUMN_GATES, _DEEP_GATES])
+    used = (gate >= at_peak - apart[0]) & (gate <= at_peak + apart[1])
+    used |= (gate >= column.first) & ~np.logical_and.accumulate(saturated, axis=1)
+    found &= ~(saturated & used).any(axis=1)
     confidence = ndtr(z_peak) ** (column.mid.size - column.first)
     return np.stack(
         [np.where(found, depth, np.nan), np.where(found, np.sqrt(variance), np.nan), np.where(found, confidence, 0)]

@@ -14,7 +14,7 @@ from mitransient_lidar.analysis.gates.range_images import DepthImage, depth_imag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.gates.images import known_depths, reached_by_surface
-from mitransient_lidar.results.gate_stack import as_stack
+from mitransient_lidar.results.gate_stack import as_stack, has_frames
 from mitransient_lidar.results.geometry import optional_number
 
 _NAMED_PIXELS = 16  # on an axis
@@ -49,7 +49,8 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
         place = "below the surface echo" if from_depth is None else f"below from_depth = {from_depth:g} m"
         raise UserError(f"{count} of {depths.size} gates lie {place}, but a drawing of depths needs at least 3")
     stack, depths = stack.isel(gate=used), depths[used]
-    found = depth_image(stack, reach=_reach(stack))
+    given = dataset.isel(gate=used) if has_frames(dataset) else stack
+    found = depth_image(given, reach=_reach(stack))
     (_draw_pixel_depths if "pixel" in stack.dims else _draw_depth_image)(figure, stack, found)
     text = f"depth of the strongest echo, gates at {depths.min():.2f} to {depths.max():.2f} m on the axis"
     figure.suptitle(drawing.titled(stack.attrs, text))

@@ -40,6 +40,7 @@ class ReceivedDaylight:
 
     #: Each pixel's radiance times solid angle [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
     found: mi.Float64
+    scattered: mi.Float64  #: Part of `found` by paths that the water has scattered, without values that are not finite.
     sampled: mi.Float64  #: Solid angle that each pixel's samples represent [sr], shape (pixels,).
     #: Radiance times solid angle that would have been found if the surface mesh did not end, shape (1,).
     edge_loss: mi.Float64
@@ -54,11 +55,15 @@ class DaylightLight(PathLight):
         self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
         self.invalid = dr.zeros(mi.Bool, dr.width(received.found))
 
-    def add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
-        """Add radiance to pixels, and mark those that it makes invalid."""
+    def add(self, path: ConnectedPath, found: mi.Float, active: mi.Bool) -> None:
+        """Add radiance to the paths' pixels, and mark those that it makes invalid."""
+        pixel = path.pixel
         # Sums leave out values that are not finite; the pixel is marked instead.
         dr.scatter(self.invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
-        dr.scatter_add(self.received.found, mi.Float64(found), pixel, active & (found > 0))
+        bright = active & (found > 0)
+        dr.scatter_add(self.received.found, mi.Float64(found), pixel, bright)
+        diffuse = bright & (path.scatterings > 0) & dr.isfinite(found)
+        dr.scatter_add(self.received.scattered, mi.Float64(found), pixel, diffuse)
 
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
@@ -73,7 +78,7 @@ class DaylightLight(PathLight):
         self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
         """Add sunlight."""
-        self.add(path.pixel, energy, active)
+        self.add(path, energy, active)
 
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
         """Add the sky where paths leave the scene, and the sun where they could not be connected to it."""
@@ -81,7 +86,7 @@ class DaylightLight(PathLight):
         radiance = dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))
         if scene.sun is not None:
             radiance += dr.select(path.specular, scene.sun.radiance(path.direction), 0)
-        self.add(path.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
+        self.add(path, self.weight * path.throughput * radiance, active & ~path.in_water)
 
     def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
         """Add the sky that the dry side of the sea surface reflects, where the ray is not blocked."""
@@ -96,7 +101,7 @@ class DaylightLight(PathLight):
         bright = active & (radiance > 0)
         bright &= ~self.scene.ray_test(ray, bright)
         path.rays += dr.select(active, mi.UInt32(1), 0)
-        self.add(path.pixel, self.weight * path.throughput * radiance, bright)
+        self.add(path, self.weight * path.throughput * radiance, bright)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add sunlight to the losses."""
@@ -132,8 +137,8 @@ class DaylightRenderer:
     def follow(self, path: ConnectedPath, rng: mi.PCG32, weight: mi.Float) -> ReceivedDaylight:
         """Trace paths from their last vertices to their ends, with the weight [sr] of each."""
         pixels = self.scene.receiver.pixels.count
-        found, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, 1))
-        received = ReceivedDaylight(found, sampled, lost, mi.Float64(0))
+        found, scattered, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, pixels, 1))
+        received = ReceivedDaylight(found, scattered, sampled, lost, mi.Float64(0))
         dr.scatter_add(received.sampled, mi.Float64(weight), path.pixel, weight > 0)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         light = DaylightLight(self.scene, received, u, weight)
@@ -144,7 +149,7 @@ class DaylightRenderer:
             options = replace(options, guiding_probability=0.0)
         received.rays = PathTracer(self.scene, options, light).trace(path, rng)
         received.found = dr.select(light.invalid, dr.nan, received.found)
-        dr.eval(received.found, received.sampled, received.edge_loss, received.rays)
+        dr.eval(received)
         return received
 
 

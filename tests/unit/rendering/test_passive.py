@@ -74,12 +74,35 @@ def test_ratio_statistics():
 
 
 @pytest.mark.slow
+def test_smoothed_images_are_those_of_other_passes_with_less_noise():
+    """In a circular field of view over a level bottom, where smoothing changes little."""
+    parts = {**scene("24x24"), "integrator": {**PASSIVE, "paths_per_pass": 2**14}}
+    sharp, smooth = (render(parts, passes=12, seed=seed, smooth=sigma) for seed, sigma in ((1, None), (2, 2.0)))
+    errors = np.hypot(sharp["radiance_stderr"], smooth["radiance_stderr"]).values
+    z = (smooth["radiance"] - sharp["radiance"]).values / errors
+    lit = np.isfinite(z)
+    assert lit.sum() > 400
+    assert 0.9 < np.sqrt(np.mean(z[lit] ** 2)) < 1.3  # errors of twelve passes, some of them bright
+    # Smoothing moves light between pixels: their sum has the error of sharp ones.
+    sums = [one["radiance"].values[lit].sum() for one in (sharp, smooth)]
+    assert abs(sums[1] - sums[0]) < 4.5 * np.sqrt(2 * (sharp["radiance_stderr"].values[lit] ** 2).sum())
+    variance = [float((one["radiance_stderr"] ** 2).mean()) for one in (sharp, smooth)]
+    assert variance[1] < 0.4 * variance[0]
+    assert smooth.attrs["smooth_pixels"] == 2.0
+    assert 0 <= smooth.attrs["smoothing_bias"] < 0.05
+    again = mitransient_lidar.render(smooth, passes=2)
+    assert again.attrs["smooth_pixels"] == 2.0
+    with pytest.raises(UserError, match="smooth = 1 pixels needs a layout of rows and columns"):
+        render(scene("hex7"), smooth=1.0)
+
+
+@pytest.mark.slow
 def test_non_finite_radiance_is_kept_and_reported(monkeypatch, caplog):
     """One pixel of sixteen receives a value that is not finite."""
     original = DaylightLight.add
 
-    def add(self, pixel, found, active):
-        original(self, pixel, dr.select(pixel == 5, dr.nan, found), active)
+    def add(self, path, found, active):
+        original(self, path, dr.select(path.pixel == 5, dr.nan, found), active)
 
     monkeypatch.setattr(DaylightLight, "add", add)
     picture = render()

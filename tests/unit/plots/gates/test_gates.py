@@ -5,6 +5,7 @@ import pytest
 from figure_inputs import stack
 from PIL import Image
 
+from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.gates.echoes import plot_depths
 from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates, reached_by_surface
@@ -86,6 +87,17 @@ def test_depth_map_begins_below_the_latest_surface_of_lit_pixels():
     found = reached_by_surface(made.assign_coords(surface_time=(dims, times), beam_share=(dims, share)))
     start = made["gate_start"].values
     np.testing.assert_array_equal(found, start < 1420.0 + 5 + 7.5)
+
+
+def test_depth_map_of_frames_leaves_out_weak_and_saturated_echoes():
+    """The echoes of 1e-15 J saturate the camera, and those of 1e-19 J give it less than a photoelectron."""
+    made = stack(np.full((ROWS, COLUMNS), 4.0), gates=60)
+    for factor, shown in ((1.0, False), (1e-2, True), (1e-4, False)):
+        dimmed = made.assign(
+            gate_energy=factor * made["gate_energy"], gate_energy_stderr=0 * made["gate_energy_stderr"]
+        )
+        depth = images(plot_depths(detect_waveforms(dimmed, "icmos", shots=2, seed=1)))[0].get_array()
+        assert np.isfinite(np.ma.filled(depth, np.nan)).any() == shown
 
 
 def test_depth_map_needs_three_gates_with_depths(tmp_path):
