@@ -320,7 +320,7 @@ class ShotBatches:
                 transmitter_poses=all_shots.transmitter,
             )
             fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves[0], copies)
-            return renderer.over(placed, fields, copies)
+            return renderer.over(placed, fields)
 
         return renderer_of
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -45,7 +45,7 @@ _RAYS, _BEAM_PER_VIEW, _GLINTS_PER_VIEW = 512, 2, 8
 _PLANES, _DEPTHS = 16, 16
 
 #: Paths of scattered light at each depth, and those that each ray looks up at the bottom.
-_PATHS, _PATHS_AT_BOTTOM = 2**12, 12
+_PATHS, _PATHS_AT_BOTTOM = 2**12, 48
 
 #: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
 _LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
@@ -152,7 +152,7 @@ class LightMapRenderer(PassRenderer):
         turned = [b * float(phase.eval_s(1.0)) for b, phase in zip(column.scattering, phases, strict=True)]
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
         self._ripples = scene.seas[0].rippled(scene.refractive_index) if level else scene.surfaces[0].bsdf()
-        self._sea, self._copies = HeightFields.about(scene, level=level), 1
+        self._sea = HeightFields.about(scene, level=level)
         self._solids = scene_of_shapes(scene.solids, scene.groups) if scene.solids else None
 
     @property
@@ -165,16 +165,13 @@ class LightMapRenderer(PassRenderer):
         """No values of parameters of the integrator."""
         return {}
 
-    def over(self, scene: LidarScene, sea: HeightFields, copies: int) -> LightMapRenderer:
-        """Return a renderer of shots, each several times in turn, that meet a scene in parts and heights of the sea.
-
-        The copies of a shot have rays of the view of their own, and share the maps.
-        """
-        return changed(self, scene=scene, _sea=sea, _copies=copies)
+    def over(self, scene: LidarScene, sea: HeightFields) -> LightMapRenderer:
+        """Return a renderer of shots that meet a scene in parts and heights of the sea."""
+        return changed(self, scene=scene, _sea=sea)
 
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
         """Look up the light of one pass for each shot, with a number of rays of the view."""
-        maps = self._maps(shots, _BEAM_PER_VIEW * paths * self._copies)
+        maps = self._maps(shots, _BEAM_PER_VIEW * paths)
         self._reflect(received, shots, _GLINTS_PER_VIEW * paths)
         seen = self._view(shots, paths)
         self._return(received, shots, paths, maps, seen, _WATER)
@@ -202,24 +199,19 @@ class LightMapRenderer(PassRenderer):
 
     def _maps(self, shots: Shots, count: int) -> LightMaps:
         """Return the maps of the beams, of a number of rays each."""
-        scene, water, copies = self.scene, self.scene.required_water, self._copies
-
-        def of_maps(per_map: int) -> Lanes:
-            lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots.count // copies * per_map), shots.count, per_map)
-            return replace(lanes, shot=lanes.shot * copies)
-
-        lanes = of_maps(count)
+        scene, water = self.scene, self.scene.required_water
+        lanes = shots.paths(count)
         moved, (x, y, *ripple) = lanes.pick(scene), _spaced(shots, lanes, _BEAM, 5)
         angles = mi.Point2f(*scene.transmitter.sample_tangent(mi.Point2f(x, y)))
         si, length = self._meet_sea(moved, lanes, moved.transmitter_pose, angles, mi.Bool(True))
         share = dr.full(mi.Float, 1 / count, dr.width(lanes.number))
         rays = self._enter(si, length, share, mi.TransportMode.Importance, ripple)
         dr.eval(rays)
-        maps = LightMaps(scene, self._planes, shots.count, copies)
+        maps = LightMaps(scene, self._planes, shots.count)
         # Plane after plane, so that the lanes of a packet add to one map. Planes above troughs serve places below them.
-        own, of_map = of_maps(count * maps.count), opaque_index(count)
+        own, of_map = shots.paths(count * maps.count), opaque_index(count)
         plane = own.number // of_map
-        rays = dr.gather(_Rays, rays, own.shot // copies * of_map + own.number - plane * of_map)
+        rays = dr.gather(_Rays, rays, own.shot * of_map + own.number - plane * of_map)
         distance = (-maps.depth_of(plane) - rays.point.z) / rays.direction.z
         start, down = -rays.point.z, -rays.direction.z
         absorbed, scattered = (
