@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -31,9 +31,10 @@ from mitransient_lidar.transport.paths.path_classes import PathClasses
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import met_shape, scene_of_shapes
+from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
 
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
@@ -62,6 +63,12 @@ _APART = 0.05
 
 #: Largest mean number of scattering events on one way to the bottom, beyond which light arrives too late.
 _MOST_EVENTS = 8.0
+
+#: Largest share of a pixel's light that meets a target whose shadow is left out, and deflection by waves over depth.
+_SHADOWED, _DEFLECTED = 0.1, 0.05
+
+#: Largest slope of a bottom on which displaced light arrives at another depth: steeper ones are sides.
+_STEEPEST = 1.0
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -97,7 +104,7 @@ class _Seen:
     to_bed, bed, solid
         Distance to the bottom [m], place there, and number of the solid.
     slope
-        Slopes of the bottom along x and y.
+        Slopes of the bottom along x and y, 0 on steep sides.
     turned
         Reflected radiance over the energy through a horizontal area [1/sr].
     """
@@ -119,7 +126,7 @@ class UnsuitedError(UserError):
 class LightMapRenderer(PassRenderer):
     """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
-    Paths that change more than once between down and up are left out, and the sides and shadows of solids.
+    Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
     Parameters
     ----------
@@ -248,6 +255,7 @@ class LightMapRenderer(PassRenderer):
         on_bed = rays.active & bed.is_valid()
         # Light comes down along the ray: the bottom turns what passes a horizontal area by its cosine over this one's.
         value = bed.bsdf().eval(mi.BSDFContext(), moved.on_shapes(bed), bed.wi, on_bed)[0]
+        slope = mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z)
         seen = _Seen(
             rays,
             mi.UInt32(sample.pixel),
@@ -255,7 +263,7 @@ class LightMapRenderer(PassRenderer):
             dr.select(on_bed, bed.t, _NO_BED),
             bed.p,
             self.classes.solid(met_shape(bed)),
-            mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z),
+            dr.select(dr.norm(slope) <= _STEEPEST, slope, 0),
             dr.select(on_bed, value / -rays.direction.z, 0),
         )
         dr.eval(seen)
@@ -360,13 +368,42 @@ def unsuited(scene: LidarScene) -> str | None:
     return None
 
 
-def reach_of_maps(scene: LidarScene, depth: float) -> float:
-    """Return the distance from a shot's place within which maps and view reach at a depth [m]."""
-    pose = scene.receiver.pose
-    below = refract_level(pose.axis, scene.refractive_index)
-    view = 0.5 * scene.receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])
-    half = max(float(Planes.of_scene(scene, depth, 2).half[-1]), view)
-    return half - depth * float(np.hypot(below[0], below[1]) / below[2])
+def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
+    """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
+
+    In each pixel at most `_SHADOWED` of the beam over a level sea meets the box of the target, widened as waves deflect
+    the light.
+
+    Parameters
+    ----------
+    scene, target
+        The lidar's scene, and a target of it.
+    places
+        Points (x, y) of the shots among the shapes [m], shape (shots, 2).
+    turns
+        Cosine and sine of their rotations about the vertical, shape (shots, 2); None without any.
+    """
+    low, high = box_of(target)
+    rays = Rays.of_beam(scene, scene.transmitter)
+    pixel, seen = scene.receiver.pixels.pixel_at(*rays.angles, mi.Float(0.5))
+    pixel, counted = np.array(pixel), np.array(seen) > 0
+    pose, height = scene.transmitter.pose, 0.5 * (low[2] + high[2])
+    lit = scene.level_sea.at_height(pose.origin, rays.directions, height) - pose.ground_point()[:2]
+    counted &= np.isfinite(lit).all(axis=1)
+    lit, pixel = lit[counted] @ [1, 1j], pixel[counted]
+    whole = np.maximum(np.bincount(pixel, minlength=scene.receiver.pixels.count), 1)
+    # A ray that meets the box below or above its middle height does so beside it.
+    axis = np.abs(refract_level(pose.axis, scene.refractive_index))
+    wider = _DEFLECTED * max(-float(low[2]), 0.0) + 0.5 * (high[2] - low[2]) * np.hypot(*axis[:2]) / axis[2]
+    centre, half = (0.5 * (low + high)[:2]), 0.5 * (high - low)[:2] + wider
+    faint = np.ones(len(places), dtype=bool)
+    farthest = float(np.abs(lit).max(initial=0.0))
+    for shot in np.flatnonzero(np.all(np.abs(places - centre) <= half + farthest, axis=1)):
+        turned = lit if turns is None else lit * complex(*turns[shot])
+        beside = np.abs(np.stack([turned.real, turned.imag], axis=-1) + places[shot] - centre)
+        met = np.bincount(pixel[np.all(beside <= half, axis=1)], minlength=whole.size)
+        faint[shot] = np.all(met <= _SHADOWED * whole)
+    return faint
 
 
 def reach_of_scattering(scene: LidarScene) -> float:
