@@ -10,11 +10,15 @@ from scipy.ndimage import uniform_filter1d
 
 from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
 from mitransient_lidar.campaigns.design import Column
+from mitransient_lidar.core.validation import IntArray
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 
 #: Bins whose variances are pooled, and bins of a mean power.
 _POOLED_BINS, _MEAN_BINS = 21, 5
+
+#: Fewest passes of a shot whose own errors are known.
+_KNOWN_PASSES = 4
 
 #: Names of the inputs of pulses that hold a setting of a channel, which end in its number.
 SETTINGS = {"receiver_gain_": "factor of the gain", "receiver_density_": "optical density of the filter"}
@@ -75,7 +79,7 @@ def has_automatic_settings(plan: FlightPlan, instrument: str | None) -> bool:
     return any("auto" in (channel.gain, channel.optical_density) for channel in receiver.all_channels)
 
 
-def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
+def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray) -> xr.DataArray:
     """Return standard errors that are at least those which neighbouring bins have.
 
     A standard error of a few passes is itself uncertain by a third, and too small where none of the rare bright paths
@@ -84,15 +88,31 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
     errors rise behind an echo: pooled, they would raise that of its peak. Of 64 pulses of ``semi_arc`` and ``palmer``,
     8 and 11 passes against renders to 2 %, the root mean square of error over pooled error is 1.26 and 0.98; with
     pooled relative errors it would be 1.69 and 1.26.
+
+    The error of two passes is hardly known, and twice too large at one bottom in twenty, which would be lost in it.
+    Where there are fewer than four passes, the relative error of the 21 bins is that of all such shots together, larger
+    beside their echo, and a bin's own error does not count.
+
+    Parameters
+    ----------
+    waveform, stderr
+        Mean power and its standard error, with the dimensions shot, pixel and time.
+    passes
+        Passes of each shot, shape (shots,).
     """
     power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
     # A mean over bins, since one that is low by chance is so in both.
     level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
     of_all, variance = (uniform_filter1d(one, _POOLED_BINS, axis=-1, mode="nearest") for one in (level, error**2))
+    if (few := passes < _KNOWN_PASSES).any():
+        known = np.sum(uniform_filter1d(level[few] ** 2, _POOLED_BINS, axis=-1, mode="nearest"), axis=0)
+        relative = np.divide(np.sum(variance[few], axis=0), known, out=np.zeros_like(known), where=known > 0)
+        variance[few] = np.maximum(level, of_all)[few] * of_all[few] * relative
     ratio = np.divide(variance, of_all, out=np.zeros_like(error), where=of_all > 0)
     # Running sums leave rounding errors below 0.
     pooled = np.sqrt(np.maximum(level * ratio, 0))
-    return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
+    own = np.where(few[:, None, None], 0.0, error)
+    return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(own, pooled))
 
 
 def _receiver(series: xr.Dataset, plan: FlightPlan) -> ReceiverChannels:

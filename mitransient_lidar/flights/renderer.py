@@ -173,7 +173,9 @@ class FlightRenderer(Renderer):
     def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
         series, later, _ = self._render(inputs, self._passes(until_error=True))
-        series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
+        series["waveform_stderr"] = pooled_errors(
+            series["waveform"], series["waveform_stderr"], series["shot_passes"].values
+        )
         recorded = record(series, self.plan, inputs)
         measured = self._with_turned_pixels(recorded, inputs) if turned else recorded
         infrared = self._infrared_record(inputs, later) if self.plan.infrared else None
@@ -214,7 +216,9 @@ class FlightRenderer(Renderer):
         own = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
         renderer = _infrared(self, int(bins[0]))
         series, own_later, _ = renderer._render({**own, "record_start_ns": start}, self._passes(until_error=True))
-        series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
+        series["waveform_stderr"] = pooled_errors(
+            series["waveform"], series["waveform_stderr"], series["shot_passes"].values
+        )
         recorded = record(series, renderer.plan, own)
         apart = xr.DataArray(later - own_later, dims="shot")
         return recorded.assign_coords(surface_time=recorded["surface_time"] + apart)
@@ -310,7 +314,8 @@ class FlightRenderer(Renderer):
                 rows.append(some)
         joined = ReceivedShots.joined(rendered, np.argsort(np.concatenate(rows)))
         attributes = scene.attributes(used=batches.used_values, passes=int(joined.passes.max()))
-        series = scene.dataset(joined, attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
+        known = {**truth_coordinates(sea, scene.lidar, poses), "shot_passes": ("shot", joined.passes)}
+        series = scene.dataset(joined, attributes).assign_coords(known)
         return series, 1e9 / C0 * (further - further % width), joined.errors
 
 

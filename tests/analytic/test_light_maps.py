@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import significance
 import xarray as xr
+from scipy.stats import f as f_distribution
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -117,10 +118,29 @@ def test_what_maps_are_not_for(options, message):
 
 
 @pytest.mark.slow
-def test_shots_near_a_target_are_merged():
-    places = np.array([[-41.0, 60.0], [-45.0, 58.0], [-41.0, 80.0], [0.0, 0.0]])
+def test_shots_that_light_a_target_are_merged():
+    """The light is 1.4 m ahead of the place: where a cube of 1 m is met, and not beyond 2 m beside it."""
+    places = np.array([[-42.6, 60.0], [-41.0, 60.0], [-45.0, 60.0], [-41.0, 63.0], [0.0, 0.0]])
     scene = ShotScene("flight", {"cube_x": -41, "cube_y": 60}, places, light="maps", check=False)
-    np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [False, False, True, True])
+    np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [False, False, True, True, True])
+
+
+@pytest.mark.slow
+def test_passes_of_a_shot_state_their_spread():
+    """Energies of 128 seeds of one place, two passes each: passes that share a map would state half of their spread."""
+    places = np.zeros((64, 2))
+    batches = ShotScene("table1", {}, places, light="maps", check=False).batches(2, 1.0, None)
+    renderer = batches.at(ShotPoses(places))(2)
+    energy = np.concatenate(
+        [renderer.render_pass(list(range(start, start + 128))).histogram.energy() for start in (0, 128)]
+    )
+    shape = 128, 2, renderer.scene.receiver.pixels.count, renderer.scene.axis.bin_count
+    whole = energy.reshape(shape).sum(axis=2)
+    # Light behind the surface echo.
+    late = whole[..., np.argmax(whole.mean(axis=(0, 1))) + 20 :].sum(axis=-1)
+    stated, spread = np.mean(np.diff(late) ** 2) / 4, late.mean(axis=1).var(ddof=1)
+    limit = f_distribution.isf(1e-6, 127, 128)
+    assert 1 / limit < spread / stated < limit
 
 
 @pytest.mark.slow

@@ -21,12 +21,12 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, reach_of_maps
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, light_faintly
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.probe import gaps, land_of_shots
+from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
@@ -319,7 +319,7 @@ class ShotBatches:
                 transmitter_poses=all_shots.transmitter,
             )
             fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves[0], copies)
-            return renderer.over(placed, fields, copies)
+            return renderer.over(placed, fields)
 
         return renderer_of
 
@@ -407,10 +407,10 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 
 
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
-    """Return which shots of a scene that suits light maps are so far from its targets that it has no part in them."""
+    """Return which shots of a scene that suits light maps light its targets so faintly that maps serve them."""
     places = poses.places - lidar.frame_origin[:2]
-    apart = [gaps(places, target) > reach_of_maps(lidar, -float(target.bbox().min.z)) for target in lidar.targets]
-    return np.all(apart, axis=0) if apart else np.ones(len(poses), dtype=bool)
+    faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
+    return np.all(faint, axis=0) if faint else np.ones(len(poses), dtype=bool)
 
 
 def share_for_error(error: float) -> float:

@@ -69,11 +69,11 @@ class LightMaps:
     Parameters
     ----------
     scene
-        Scene of several shots, each `copies` times in turn, that share a map.
+        Scene of one or several shots.
     """
 
-    def __init__(self, scene: LidarScene, planes: Planes, shots: int, copies: int) -> None:
-        self.count, self._copies = planes.depths.size, copies
+    def __init__(self, scene: LidarScene, planes: Planes, shots: int) -> None:
+        self.count = planes.depths.size
         self._step = opaque(float(planes.depths[1]))
         self._half, self._absorbed, self._scattered = (
             aligned(mi.Float, each.astype(np.float32)) for each in (planes.half, planes.absorbed, planes.scattered)
@@ -93,7 +93,7 @@ class LightMaps:
         to_entry = np.linalg.norm(entries - origins, axis=1) - ranges
         self._to_entry = aligned(mi.Float, to_entry.astype(np.float32))
         self._per_depth = aligned(mi.Float, (scene.group_index / -below[:, 2]).astype(np.float32))
-        size = shots // copies * self.count * _CELLS**2
+        size = shots * self.count * _CELLS**2
         self._energy, self._clear = (dr.zeros(mi.UInt32, size) for _ in range(2))
         self._length = dr.zeros(mi.Int32, size)
 
@@ -120,7 +120,7 @@ class LightMaps:
         level = (
             lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth + dr.dot(beside, lanes.pick(self._later))
         )
-        return (lanes.shot // self._copies * self.count + plane) * _CELLS**2 + cell, inside, level
+        return (lanes.shot * self.count + plane) * _CELLS**2 + cell, inside, level
 
     def add(
         self,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -30,9 +30,10 @@ from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, 
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.probe import Rays
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import met_shape, scene_of_shapes
+from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
 
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
@@ -44,7 +45,7 @@ _RAYS, _BEAM_PER_VIEW, _GLINTS_PER_VIEW = 512, 2, 8
 _PLANES, _DEPTHS = 16, 16
 
 #: Paths of scattered light at each depth, and those that each ray looks up at the bottom.
-_PATHS, _PATHS_AT_BOTTOM = 2**12, 12
+_PATHS, _PATHS_AT_BOTTOM = 2**12, 48
 
 #: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
 _LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
@@ -61,6 +62,12 @@ _APART = 0.05
 
 #: Largest mean number of scattering events on one way to the bottom, beyond which light arrives too late.
 _MOST_EVENTS = 8.0
+
+#: Largest share of a pixel's light that meets a target whose shadow is left out, and deflection by waves over depth.
+_SHADOWED, _DEFLECTED = 0.1, 0.05
+
+#: Largest slope of a bottom on which displaced light arrives at another depth: steeper ones are sides.
+_STEEPEST = 1.0
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -96,7 +103,7 @@ class _Seen:
     to_bed, bed, solid
         Distance to the bottom [m], place there, and number of the solid.
     slope
-        Slopes of the bottom along x and y.
+        Slopes of the bottom along x and y, 0 on steep sides.
     turned
         Reflected radiance over the energy through a horizontal area [1/sr].
     """
@@ -118,7 +125,7 @@ class UnsuitedError(UserError):
 class LightMapRenderer(PassRenderer):
     """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
-    Paths that change more than once between down and up are left out, and the sides and shadows of solids.
+    Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
     Parameters
     ----------
@@ -151,7 +158,7 @@ class LightMapRenderer(PassRenderer):
         turned = [b * float(phase.eval_s(1.0)) for b, phase in zip(column.scattering, phases, strict=True)]
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
         self._ripples = scene.seas[0].rippled(scene.refractive_index) if level else scene.surfaces[0].bsdf()
-        self._sea, self._copies = HeightFields.about(scene, level=level), 1
+        self._sea = HeightFields.about(scene, level=level)
         self._solids = scene_of_shapes(scene.solids, scene.groups) if scene.solids else None
 
     @property
@@ -164,16 +171,13 @@ class LightMapRenderer(PassRenderer):
         """No values of parameters of the integrator."""
         return {}
 
-    def over(self, scene: LidarScene, sea: HeightFields, copies: int) -> LightMapRenderer:
-        """Return a renderer of shots, each several times in turn, that meet a scene in parts and heights of the sea.
-
-        The copies of a shot have rays of the view of their own, and share the maps.
-        """
-        return changed(self, scene=scene, _sea=sea, _copies=copies)
+    def over(self, scene: LidarScene, sea: HeightFields) -> LightMapRenderer:
+        """Return a renderer of shots that meet a scene in parts and heights of the sea."""
+        return changed(self, scene=scene, _sea=sea)
 
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
         """Look up the light of one pass for each shot, with a number of rays of the view."""
-        maps = self._maps(shots, _BEAM_PER_VIEW * paths * self._copies)
+        maps = self._maps(shots, _BEAM_PER_VIEW * paths)
         self._reflect(received, shots, _GLINTS_PER_VIEW * paths)
         seen = self._view(shots, paths)
         self._return(received, shots, paths, maps, seen, _WATER)
@@ -201,24 +205,19 @@ class LightMapRenderer(PassRenderer):
 
     def _maps(self, shots: Shots, count: int) -> LightMaps:
         """Return the maps of the beams, of a number of rays each."""
-        scene, water, copies = self.scene, self.scene.required_water, self._copies
-
-        def of_maps(per_map: int) -> Lanes:
-            lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots.count // copies * per_map), shots.count, per_map)
-            return replace(lanes, shot=lanes.shot * copies)
-
-        lanes = of_maps(count)
+        scene, water = self.scene, self.scene.required_water
+        lanes = shots.paths(count)
         moved, (x, y, *ripple) = lanes.pick(scene), _spaced(shots, lanes, _BEAM, 5)
         angles = mi.Point2f(*scene.transmitter.sample_tangent(mi.Point2f(x, y)))
         si, length = self._meet_sea(moved, lanes, moved.transmitter_pose, angles, mi.Bool(True))
         share = dr.full(mi.Float, 1 / count, dr.width(lanes.number))
         rays = self._enter(si, length, share, mi.TransportMode.Importance, ripple)
         dr.eval(rays)
-        maps = LightMaps(scene, self._planes, shots.count, copies)
+        maps = LightMaps(scene, self._planes, shots.count)
         # Plane after plane, so that the lanes of a packet add to one map. Planes above troughs serve places below them.
-        own, of_map = of_maps(count * maps.count), opaque_index(count)
+        own, of_map = shots.paths(count * maps.count), opaque_index(count)
         plane = own.number // of_map
-        rays = dr.gather(_Rays, rays, own.shot // copies * of_map + own.number - plane * of_map)
+        rays = dr.gather(_Rays, rays, own.shot * of_map + own.number - plane * of_map)
         distance = (-maps.depth_of(plane) - rays.point.z) / rays.direction.z
         start, down = -rays.point.z, -rays.direction.z
         absorbed, scattered = (
@@ -255,6 +254,7 @@ class LightMapRenderer(PassRenderer):
         on_bed = rays.active & bed.is_valid()
         # Light comes down along the ray: the bottom turns what passes a horizontal area by its cosine over this one's.
         value = bed.bsdf().eval(mi.BSDFContext(), moved.on_shapes(bed), bed.wi, on_bed)[0]
+        slope = mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z)
         seen = _Seen(
             rays,
             mi.UInt32(sample.pixel),
@@ -262,7 +262,7 @@ class LightMapRenderer(PassRenderer):
             dr.select(on_bed, bed.t, _NO_BED),
             bed.p,
             self.classes.solid(met_shape(bed)),
-            mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z),
+            dr.select(dr.norm(slope) <= _STEEPEST, slope, 0),
             dr.select(on_bed, value / -rays.direction.z, 0),
         )
         dr.eval(seen)
@@ -367,13 +367,42 @@ def unsuited(scene: LidarScene) -> str | None:
     return None
 
 
-def reach_of_maps(scene: LidarScene, depth: float) -> float:
-    """Return the distance from a shot's place within which maps and view reach at a depth [m]."""
-    pose = scene.receiver.pose
-    below = refract_level(pose.axis, scene.refractive_index)
-    view = 0.5 * scene.receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])
-    half = max(float(Planes.of_scene(scene, depth, 2).half[-1]), view)
-    return half - depth * float(np.hypot(below[0], below[1]) / below[2])
+def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
+    """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
+
+    In each pixel at most `_SHADOWED` of the beam over a level sea meets the box of the target, widened as waves deflect
+    the light.
+
+    Parameters
+    ----------
+    scene, target
+        The lidar's scene, and a target of it.
+    places
+        Points (x, y) of the shots among the shapes [m], shape (shots, 2).
+    turns
+        Cosine and sine of their rotations about the vertical, shape (shots, 2); None without any.
+    """
+    low, high = box_of(target)
+    rays = Rays.of_beam(scene, scene.transmitter)
+    pixel, seen = scene.receiver.pixels.pixel_at(*rays.angles, mi.Float(0.5))
+    pixel, counted = np.array(pixel), np.array(seen) > 0
+    pose, height = scene.transmitter.pose, 0.5 * (low[2] + high[2])
+    lit = scene.level_sea.at_height(pose.origin, rays.directions, height) - pose.ground_point()[:2]
+    counted &= np.isfinite(lit).all(axis=1)
+    lit, pixel = lit[counted] @ [1, 1j], pixel[counted]
+    whole = np.maximum(np.bincount(pixel, minlength=scene.receiver.pixels.count), 1)
+    # A ray that meets the box below or above its middle height does so beside it.
+    axis = np.abs(refract_level(pose.axis, scene.refractive_index))
+    wider = _DEFLECTED * max(-float(low[2]), 0.0) + 0.5 * (high[2] - low[2]) * np.hypot(*axis[:2]) / axis[2]
+    centre, half = (0.5 * (low + high)[:2]), 0.5 * (high - low)[:2] + wider
+    faint = np.ones(len(places), dtype=bool)
+    farthest = float(np.abs(lit).max(initial=0.0))
+    for shot in np.flatnonzero(np.all(np.abs(places - centre) <= half + farthest, axis=1)):
+        turned = lit if turns is None else lit * complex(*turns[shot])
+        beside = np.abs(np.stack([turned.real, turned.imag], axis=-1) + places[shot] - centre)
+        met = np.bincount(pixel[np.all(beside <= half, axis=1)], minlength=whole.size)
+        faint[shot] = np.all(met <= _SHADOWED * whole)
+    return faint
 
 
 def reach_of_scattering(scene: LidarScene) -> float:
