@@ -284,6 +284,9 @@ class Leaf(SampledBSDF):
 
     .. math:: f = \frac{R}{\pi} \text{ on the side of the light}, \quad f = \frac{T}{\pi} \text{ on the other side}.
 
+    Between two media (``int_ior`` above 1, such as foam on the sea) light from the back, where the index is n,
+    transmits :math:`T / n^2`, as reciprocity requires of diffuse light.
+
     .. example::
 
         {'type': 'leaf', 'reflectance': 0.08, 'transmittance': 0.1}
@@ -294,6 +297,7 @@ class Leaf(SampledBSDF):
         kinds = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.DiffuseTransmission
         super().__init__(props, *(kind.value | sides for kind in kinds))
         self.reflectance, self.transmittance = props.read("reflectance"), props.read("transmittance")
+        self._index = props.read("int_ior")
         if self.reflectance + self.transmittance > 1:
             raise UserError(
                 f"reflectance = {self.reflectance:g} and transmittance = {self.transmittance:g} of a leaf must be at "
@@ -318,7 +322,10 @@ class Leaf(SampledBSDF):
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         share = dr.select(cos_i * cos_o > 0, mi.Float(reflected), mi.Float(transmitted))
         value = dr.select(active & (cos_i != 0), share * dr.abs(cos_o) * dr.inv_pi, 0)
-        return mi.Color1f(value), value / max(reflected + transmitted, 1e-30)
+        # Light from the back: `wi` is where radiance goes, and where importance comes from.
+        slower = (cos_i * cos_o < 0) & ((cos_i > 0) == (ctx.mode == mi.TransportMode.Radiance))
+        pdf = value / max(reflected + transmitted, 1e-30)
+        return mi.Color1f(dr.select(slower, value / self._index**2, value)), pdf
 
 
 _TERMS = ("c21", "c03", "c40", "c22", "c04")

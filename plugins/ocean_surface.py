@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
+from mitransient_lidar.physics.sea.foam import foam_whiteness
 from mitransient_lidar.physics.sea.sea_mesh import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
@@ -92,11 +93,11 @@ class OceanSurface(mi.Mesh):
     have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not run
     up the shore. Wake heights stay within a quarter of the depth; a mean slope stays as given.
 
-    Foam (``foam``) covers whole faces: a Lambertian plate with ``foam_reflectance``, from above and from below, that
-    absorbs the rest. It lies where the waves rise most above their surroundings within 2 m, and thus follows the crests
+    Foam (``foam``) covers whole faces: a thin layer that reflects ``foam_reflectance``, from above and from below,
+    transmits ``foam_transmittance`` as a ``leaf`` does, both evenly over all directions, and absorbs the rest. It lies
+    where the waves rise most above their surroundings within 2 m, and thus follows the crests
     of short waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam
-    approaches ``surf_foam`` where the depth limits the waves. The infrared needs a lower reflectance: by the shape in
-    Frouin et al. 1996, the value at 1064 nm is half the value at 532 nm.
+    approaches ``surf_foam`` where the depth limits the waves. A ``foam_map`` states where foam lies besides.
 
     A mean slope turns the sea about the patch centre, or about each shot's location in a series. It is as wide as the
     patch; beyond it the sea is level. It adds to the wave slopes, and not to ``slope_variance``.
@@ -128,7 +129,7 @@ class OceanSurface(mi.Mesh):
             return self._values[name]
 
         read = OCEAN_SURFACE.reader(get)
-        read("foam_reflectance")
+        self._read_foam(read)
         #: Surface shape (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
         self.sea = SeaSurface.read(read, is_placeholder=waits)
         #: Mesh resolution; None for a level plane in its place.
@@ -137,8 +138,9 @@ class OceanSurface(mi.Mesh):
         water = next((child.water for child in children if isinstance(child, WaterMedium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
-            self._own_ripples = self._ripples(1.34 if water is None else water.refractive_index)
-            props["ripples"] = self._foamed(self._own_ripples)
+            index = 1.34 if water is None else water.refractive_index
+            self._own_ripples = self._ripples(index)
+            props["ripples"] = self._foamed(self._own_ripples, index)
         elif self.sea.has_foam:
             raise UserError(f"foam = {self._values['foam']} is beside ripples, which a nested bsdf replaces")
         elif self.sea.slope_series is not None:
@@ -216,7 +218,7 @@ class OceanSurface(mi.Mesh):
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
-        return self._foamed(self._ripples(refractive_index, (factor, factor)))
+        return self._foamed(self._ripples(refractive_index, (factor, factor)), refractive_index)
 
     def rippled(self, refractive_index: float) -> mi.BSDF:
         """Return the BSDF of a level sea, all of whose slopes are ripples."""
@@ -227,12 +229,22 @@ class OceanSurface(mi.Mesh):
         series = None if series is None else series.of_part(sea.ripple_variance, (float(total[0]), float(total[1])))
         return self._ripples(refractive_index, (along, across), series)
 
-    def _foamed(self, ripples: mi.BSDF) -> mi.BSDF:
-        """Return the BSDF of ripples with foam on some faces: a white plate, from above and from below."""
+    def _read_foam(self, read: Callable[..., Any]) -> None:
+        """Read what foam does with light; raise UserError if it returns more than arrives."""
+        white, through = read("foam_reflectance"), read("foam_transmittance")
+        if white + through > 1:
+            raise UserError(
+                f"foam_reflectance = {white:g} and foam_transmittance = {through:g} must be at most 1 together"
+            )
+        white = min(white * foam_whiteness(read("wavelength_nm")), 1 - through)
+        self._foam = {"reflectance": white, "transmittance": through}
+
+    def _foamed(self, ripples: mi.BSDF, refractive_index: float) -> mi.BSDF:
+        """Return the BSDF of ripples with foam on some faces, which reflects and transmits diffuse light."""
         if not self.sea.has_foam:
             return ripples
-        plate = create_object("diffuse", reflectance=float(self._values["foam_reflectance"]))
-        foam, share = create_object("twosided", plate=plate), create_object("mesh_attribute", name=FOAM)
+        foam = create_object("leaf", int_ior=refractive_index, **self._foam)
+        share = create_object("mesh_attribute", name=FOAM)
         return create_object("blendbsdf", weight=share, bsdf_0=ripples, bsdf_1=foam)
 
     def _ripples(

@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.bottom import SEABED
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_range, positive
-from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
+from mitransient_lidar.physics.sea.height_maps import HeightMap, map_origin, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
 from mitransient_lidar.transport.medium.nested_objects import create_object
@@ -168,16 +168,13 @@ def _read_terrain(read: Read) -> HeightMap | None:
     """Read the height map, if there is one."""
     path = read("filename", "")
     names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data")
-    given = size, x, y, values, holes, cell, unit, no_data = tuple(map(read, names))
+    given = size, _, _, values, holes, cell, unit, no_data = tuple(map(read, names))
     if not path:
         for name, value in zip(names, given, strict=True):
             if value is not None:
                 raise UserError(f"{name} = {value} needs a height map: give its filename")
         return None
-    if (x is None) != (y is None):
-        raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
-    origin = None if x is None else (x, y)
-    return read_height_map(path, size, origin, values, holes or "refuse", cell, unit, no_data)
+    return read_height_map(path, size, map_origin(read), values, holes or "refuse", cell, unit, no_data)
 
 
 def _read_patches(text: str) -> tuple[Patch, ...]:

@@ -197,6 +197,10 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     return chosen
 
 
+#: Plugins with maps that may be in map coordinates.
+_WITH_MAPS = ("seabed", "ocean_surface")
+
+
 def read_source(
     scene: str | os.PathLike[str],
     params: Mapping[str, Any] | None,
@@ -217,24 +221,24 @@ def read_source(
 
 
 def _with_maps_about(document: SceneDocument, origin: tuple[float, float]) -> SceneDocument:
-    """Return a scene whose seabeds with a map in map coordinates have an ``origin_x`` and ``origin_y`` [m]."""
+    """Return a scene whose seabeds and seas with a map in map coordinates have an ``origin_x`` and ``origin_y`` [m]."""
     changed, placed = document.copied(), False
-    seabeds = {id(one.element) for one in changed.settings if one.attribute == "type" and one.value == "seabed"}
+    shapes = {id(one.element) for one in changed.settings if one.attribute == "type" and one.value in _WITH_MAPS}
     for setting in changed.settings:
-        seabed: Any = setting.element.parentNode
-        if setting.owner != "filename" or Path(setting.value).suffix.lower() not in IN_MAP_COORDINATES:
+        shape: Any = setting.element.parentNode
+        if setting.owner not in ("filename", "foam_map") or id(shape) not in shapes:
             continue
-        if id(seabed) not in seabeds:
+        if Path(setting.value).suffix.lower() not in IN_MAP_COORDINATES:
             continue
-        names = [child.getAttribute("name") for child in seabed.getElementsByTagName("float")]
+        names = [child.getAttribute("name") for child in shape.getElementsByTagName("float")]
         if "origin_x" in names or "origin_y" in names:
             continue
         placed = True
         for name, value in zip(("origin_x", "origin_y"), origin, strict=True):
-            number = seabed.ownerDocument.createElement("float")
+            number = shape.ownerDocument.createElement("float")
             number.setAttribute("name", name)
             number.setAttribute("value", repr(value))
-            seabed.appendChild(number)
+            shape.appendChild(number)
     # The copy has the settings before its change.
     return replace(changed) if placed else document
 

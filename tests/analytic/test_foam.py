@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from oracles.beam_average import echo_energies
 from rows import each_row
-from significance import assert_equal
+from significance import assert_equal, largest_z, mean_and_error
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.foam import LAWS, foam_cover
+from mitransient_lidar.physics.sea.foam import LAWS, foam_cover, foam_whiteness
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.shoaling import BottomDepths
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -41,6 +41,44 @@ def test_whole_cover_is_a_lambertian_plate(lidar_scene, passes, integrator):
     )
     energy = passes(scene, 8).sum(axis=(1, 2))
     assert_equal(energy, closed_form((0.01, 0.01), 0.4, 1.0).bottom, error=0.003)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
+def test_bottom_close_below_foam_that_transmits(lidar_scene, passes, integrator):
+    """Light leaves the water with T / n^2: foam and bottom reflect R + T^2 rho / n^2 / (1 - R rho) together.
+
+    Without the reciprocity of diffuse light (T on both ways) it would be 45 % more.
+    """
+    scene = lidar_scene(
+        integrator={"type": integrator, "paths_per_pass": 2**14},
+        film={"time_start_ns": 1400.0, "bin_width_ns": 40.0, "bin_count": 2},
+        sea={"foam": "1", "foam_reflectance": 0.2, "foam_transmittance": 0.7},
+        water={"attenuation": 0.0, "scattering": 0.0, "backscattering": 0.0},
+        bottom=0.02,
+        rho=0.8,
+    )
+    both = 0.2 + 0.7**2 * 0.8 / 1.34**2 / (1 - 0.2 * 0.8)
+    energy = passes(scene, 16).sum(axis=(1, 2))
+    assert_equal(energy, closed_form((0.01, 0.01), both, 1.0).bottom, error=0.005)
+
+
+@pytest.mark.slow
+def test_foam_over_a_bottom_in_turbid_water(lidar_scene, passes):
+    """Half of a sea transmits diffuse light; both integrators find as much below it."""
+    found = []
+    for integrator in ("lidar_volpath", "lidar_merging"):
+        scene = lidar_scene(
+            integrator={"type": integrator, "paths_per_pass": 2**14},
+            film={"time_start_ns": 1425.0, "bin_width_ns": 60.0, "bin_count": 1},
+            sea={"foam": "0.5", "foam_reflectance": 0.2, "foam_transmittance": 0.7},
+            bottom=2.0,
+            rho=0.5,
+        )
+        found.append(mean_and_error(passes(scene, 32).sum(axis=(1, 2))))
+    (first, error), (second, other) = found
+    assert np.hypot(error, other) < 0.01 * second
+    assert abs(first - second) < largest_z(32) * np.hypot(error, other)
 
 
 @pytest.mark.slow
@@ -91,6 +129,29 @@ def test_foam_lies_on_crests():
     assert 0.3 < mesh.foam[(x > -12) & (x < -2)].mean() < 0.6
 
 
+def test_a_mask_is_read_as_a_map(tmp_path):
+    """Foam lies where the map has it, in the map's rows and columns, and nowhere beyond it."""
+    path = tmp_path / "mask.npz"
+    mask = np.zeros((9, 9))
+    mask[:, 6:] = 1.0
+    mask[:2, :] = 0.0
+    np.savez(path, heights=mask, x=np.arange(-4.0, 5.0), y=np.arange(-4.0, 5.0))
+    patch = {"cell_size": 0.25, "shortest_wave": 1.0, "refined_size": 32.0, "size": 32.0}
+    mesh = read(**patch, foam_map=str(path)).mesh()
+    x, y, _ = np.moveaxis(mesh.vertices[mesh.faces].mean(axis=1), -1, 0)
+    assert (mesh.foam[(x > 2) & (x < 4) & (y > -2) & (y < 4)] == 1).all()
+    assert (mesh.foam[(x < 1) | (x > 5) | (y < -3) | (y > 5)] == 0).all()
+    np.savez(path, heights=255 * mask, x=np.arange(-4.0, 5.0), y=np.arange(-4.0, 5.0))
+    with pytest.raises(UserError, match=r"mask.npz has values from 0 to 255: shares of foam lie from 0 to 1"):
+        read(foam_map=str(path))
+
+
+def test_infrared_foam_is_half_as_white():
+    """Shape of Frouin et al. 1996 against 532 nm: table of 6S, 0.103 / 0.216 at 1064 nm."""
+    assert foam_whiteness(532.0) == 1
+    assert abs(foam_whiteness(1064.0) - 0.103 / 0.216) < 5e-3
+
+
 def test_laws_and_refusals():
     # Albert et al. 2016, doi:10.5194/acp-16-13725-2016, quote the second law; its parts meet at 10.2 m/s.
     table = {LAWS[0]: (0.0098, 0.0406), LAWS[1]: (0.00795, 0.0236), LAWS[2]: (0.00433, 0.0570)}
@@ -104,6 +165,8 @@ def test_laws_and_refusals():
         ({"foam": "koepke"}, "foam = 'koepke' must be none, monahan"),
         ({"surf_foam": 0.3}, "surf_foam = 0.3 needs foam"),
         ({"foam": "0.1", "foam_reflectance": 1.2}, "foam_reflectance = 1.2 must"),
+        ({"foam": "0.1", "foam_transmittance": 0.9}, "foam_reflectance = 0.22 and foam_transmittance = 0.9 must"),
+        ({"foam_map": "none.npz"}, "none.npz"),
     ):
         with pytest.raises(Exception, match=message):
             mi.load_dict({"type": "ocean_surface", **given})

@@ -87,7 +87,13 @@ RETROREFLECTOR = plugin(
 _REFLECTANCE = number("reflectance", 0.08, "1", 0, 1, "Share of the light that a leaf reflects diffusely", by_id=True)
 _TRANSMITTANCE = number("transmittance", 0.1, "1", 0, 1, "Share that it transmits diffusely", by_id=True)
 
-LEAF = plugin("leaf", _REFLECTANCE, _TRANSMITTANCE)
+LEAF = plugin(
+    "leaf",
+    _REFLECTANCE,
+    _TRANSMITTANCE,
+    number("int_ior", 1.0, "1", 1, 3,
+        "Refractive index on its back, over that on its front: that of water for foam on the sea"),
+)
 
 CANOPY = plugin(
     "canopy",

@@ -47,8 +47,13 @@ OCEAN_SURFACE = plugin(
         "Share of the sea that foam covers: ``none``, a number, or by wind speed ``monahan_omuircheartaigh_1980``, "
         "``callaghan_2008`` or ``stramska_petelski_2003``", unit="1"),
     number("foam_reflectance", 0.22, "1", 0, 1,
-        "Lambertian foam reflectance: 0.22 is the mean over whitecaps of all ages in visible light (Koepke 1984), "
-        "0.4 for fresh ones"),
+        "Lambertian foam reflectance at 532 nm: 0.22 is the mean over whitecaps of all ages (Koepke 1984), 0.4 for "
+        "fresh ones; at ``wavelength_nm`` it changes as in Frouin et al. 1996, to half of it at 1064 nm"),
+    number("foam_transmittance", 0.0, "1", 0, 1,
+        "Share of the light from above that foam transmits diffusely; the rest is absorbed"),
+    file("foam_map",
+        "Map of more foam: share of each place, 0 to 1, as a mask from a picture, in the formats of a ``seabed``"),
+    number("wavelength_nm", 532.0, "nm", 300, 1100, "Wavelength for the foam reflectance"),
     number("surf_foam", 0.0, "1", 0, 1,
         "With ``foam``, the share that foam covers where the depth limits the wave height (``shoaling``); about 0.3 "
         "to 1 in surf, for which no law is published"),
@@ -83,8 +88,12 @@ OCEAN_SURFACE = plugin(
     number("size", AUTO, "m", 1e-3, LARGEST_SIDE,
         "Side of the surface; ``auto``: 1000 or more. Cells grow outside the patch"),
     _length("period", "Sea period; ``auto``: three peak wavelengths or more, in steps of 32 m, at most 512 m"),
-    _length("map_size", "Side of a height map that carries no positions"),
+    _length("map_size", "Side of a height map or foam map that carries no positions"),
     file("filename", "File of a ``height_map``"),
+    number("origin_x", None, "m", float("-inf"), float("inf"),
+        "Point of these maps, in their coordinates in metres, that lies at x = y = 0",
+        otherwise="the ``origin`` of a flight, else the map centre, as for a ``seabed``"),
+    number("origin_y", None, "m", float("-inf"), float("inf"), "Its y"),
     number("altitude", None, "m", 0.1, 1e6,
         "Value for the choice by ``auto`` instead of the value in the scene's ``lidar_transmitter`` and receiver",
         by_id=True),

@@ -8,9 +8,13 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
+from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 
 #: Names of the laws for the cover against wind speed.
 LAWS = ("monahan_omuircheartaigh_1980", "callaghan_2008", "stramska_petelski_2003")
+
+#: Reflectance over that at short wavelengths, at wavelengths [nm].
+_SHAPE = ((500.0, 1.0), (600.0, 0.95), (1000.0, 0.5), (1100.0, 0.45))
 
 #: Distance within which crests rise above their surroundings [m].
 SURROUNDINGS = 2.0
@@ -49,6 +53,28 @@ def foam_cover(foam: str, wind_speed: float) -> float:
     except ValueError:
         raise UserError(f"foam = {foam!r} must be none, {', '.join(LAWS)} or a number from 0 to 1") from None
     return in_range("foam", number, 0.0, 1.0)
+
+
+def foam_whiteness(wavelength_nm: float) -> float:
+    """Return the foam reflectance at a wavelength [nm] over that at 532 nm [1].
+
+    The shape of Frouin et al. 1996, doi:10.1029/96JC00629, between 400 and 1100 nm: 1 up to 500 nm, 0.5 at 1000 nm.
+    """
+    nodes, shape = zip(*_SHAPE, strict=True)
+    at, green = np.interp([wavelength_nm, 532.0], nodes, shape)
+    return float(at / green)
+
+
+def read_foam_map(path: str, size: float | None, origin: tuple[float, float] | None) -> HeightMap:
+    """Return the map of a foam share [1], as `height_maps.read_height_map` reads those of heights.
+
+    Raises UserError if the file is no map, or has values outside 0 to 1.
+    """
+    cover = read_height_map(path, size, origin)
+    low, high = float(cover.heights.min()), float(cover.heights.max())
+    if low < 0 or high > 1:
+        raise UserError(f"foam_map = {path} has values from {low:g} to {high:g}: shares of foam lie from 0 to 1")
+    return cover
 
 
 def crest_heights(sample: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, y: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -167,6 +168,14 @@ def read_height_map(
         described(grid.stated, values, unit, 0 if filled is None else int(filled.sum())),
     )
     return terrain
+
+
+def map_origin(read: Callable[..., Any]) -> tuple[float, float] | None:
+    """Return the map point at x = y = 0 [m] of a plugin's parameters; raise UserError if it has one of two alone."""
+    x, y = read("origin_x"), read("origin_y")
+    if (x is None) != (y is None):
+        raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
+    return None if x is None else (x, y)
 
 
 def _points(path: Path, cell: float | None, given: _Given) -> Grid:

@@ -15,8 +15,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
-from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_on_crests
-from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
+from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_on_crests, read_foam_map
+from mitransient_lidar.physics.sea.height_maps import HeightMap, map_origin, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.sea_mesh import Footprint, Resolution, SeaMesh, grid_indices, joined, triangulate
@@ -102,6 +102,7 @@ class SeaSurface:
     slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
     foam: float = 0.0  #: Share of the sea with foam [1].
     surf_foam: float = 0.0  #: Share with surf foam, where the depth limits the waves [1].
+    foam_map: HeightMap | None = None  #: Map of more foam [1].
 
     @classmethod
     def read(
@@ -143,6 +144,7 @@ class SeaSurface:
         resolution = Resolution.read(read, footprints)
         period, map_size = (None if value == AUTO else value for value in map(read, ("period", "map_size")))
         depth, path, focuses = read("water_depth"), read("filename", ""), read("ripple_focusing")
+        origin, foam_path = map_origin(read), read("foam_map", "")
         series = _read_series(read("slope_distribution"), slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
@@ -176,7 +178,7 @@ class SeaSurface:
         elif spectrum == "height_map":
             if not path:
                 raise UserError("filename is missing: the spectrum 'height_map' is read from it")
-            waves = terrain = read_height_map(path, map_size)
+            waves = terrain = read_height_map(path, map_size, origin)
             cell = float(terrain.x[1] - terrain.x[0])
             refined_size = float(terrain.x[-1] - terrain.x[0])
             middle = tuple(0.5 * float(lines[0] + lines[-1]) for lines in (terrain.x, terrain.y))
@@ -212,6 +214,7 @@ class SeaSurface:
             (slope[0], slope[1]),
             foam_cover(foam, wind_speed),
             surf_foam,
+            read_foam_map(foam_path, map_size, origin) if foam_path else None,
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -323,7 +326,7 @@ class SeaSurface:
     @property
     def has_foam(self) -> bool:
         """Whether faces may have foam."""
-        return self.foam > 0 or self.surf_foam > 0
+        return self.foam > 0 or self.surf_foam > 0 or self.foam_map is not None
 
     @property
     def _crested(self) -> PeriodicHeights | HeightMap | None:
@@ -353,6 +356,9 @@ class SeaSurface:
         if isinstance(self.waves, ShoalingHeights):
             cover += (max(self.surf_foam, self.foam) - self.foam) * self.waves.broken(x, y)
         share = foam_on_crests(crests, self._all_crests, cover)
+        if self.foam_map is not None:
+            inside = self.foam_map.covers(*np.meshgrid(x, y))
+            share = np.maximum(share, np.where(inside, self.foam_map.sample(x, y), 0.0))
         return replace(mesh, foam=share.ravel()[mesh.faces].mean(axis=1))
 
     def heights_about(self, place: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ WITHOUT_VALUE = {
     "canopy": {"bending_azimuth_deg", "shoot_density"},
     "ocean_surface": {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
-        *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
+        *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad", "foam_map", "origin_x", "origin_y"),
     },
     "seabed": {
         *("filename", "map_size", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data", "origin_x"),
