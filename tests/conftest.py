@@ -5,6 +5,8 @@ import os
 # Before NumPy: threads that wait for each other take more time than the small matrices of tests, all the more in two
 # processes.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
+# Tests compile more than they run.
+os.environ.setdefault("MITRANSIENT_LIDAR_QUICK_KERNELS", "1")
 
 # Before Mitsuba: the package sets the path of LLVM for Dr.Jit. The process that distributes the tests needs no Mitsuba.
 import mitransient_lidar  # noqa: F401, I001
