@@ -177,7 +177,7 @@ def limit_threads() -> None:
 
 @contextlib.contextmanager
 def several_threads() -> Iterator[None]:
-    """Give Dr.Jit at least two threads for a while: with one thread, Mitsuba never finishes reading an EXR file."""
+    """Give Dr.Jit at least two threads for a while: with one, Mitsuba never ends reading or writing EXR files."""
     import drjit as dr
 
     count = dr.thread_count()
