@@ -104,12 +104,16 @@ def image(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         import mitsuba as mi
 
+        from mitransient_lidar.loading import variants
+
         path = folder / f"image{suffix}"
         values = np.arange(1, 64, dtype=np.uint8).reshape(7, 9)
         if suffix == ".npy":
             np.save(path, values)
         else:
-            mi.Bitmap(values[..., None] if suffix == ".png" else values[..., None].astype(np.float32)).write(str(path))
+            with variants.several_threads():
+                picture = values[..., None] if suffix == ".png" else values[..., None].astype(np.float32)
+                mi.Bitmap(picture).write(str(path))
         return path
 
     return make

@@ -5,13 +5,19 @@ import os
 # Before NumPy: threads that wait for each other take more time than the small matrices of tests, all the more in two
 # processes.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
+# Tests compile more than they run.
+os.environ.setdefault("MITRANSIENT_LIDAR_QUICK_KERNELS", "1")
 
-# Before Mitsuba: the package sets the path of LLVM for Dr.Jit. The process that distributes the tests needs no Mitsuba.
+# Before Mitsuba: the package sets the path of LLVM for Dr.Jit.
 import mitransient_lidar  # noqa: F401, I001
 
+import drjit as dr
 import numpy as np
 import pytest
 import significance
+
+# Workers share the processors: threads that wait for each other's kernels take a fifth of the processor time.
+dr.set_thread_count(max(1, dr.thread_count() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
 
 #: Comparisons of each worker of pytest-xdist.
 _comparisons = {}
@@ -60,8 +66,6 @@ def variant():
 @pytest.fixture(autouse=True)
 def clean_drjit():
     """Leave Dr.Jit's flags as they were, whatever a test sets."""
-    import drjit as dr
-
     flags = {flag: dr.flag(flag) for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls)}
     yield
     for flag, value in flags.items():

@@ -14,8 +14,9 @@ import mitransient_lidar
 # Ten gates of 4 ns from 8 m on, and pulses of 0.5 µJ; 16 passes, so that the light is smoother than the frames.
 
 params = {"target_depth": 9, "target_x": 2.2, "bottom_depth": 12, "pulse_energy_mj": 0.0005, "layout": "32x32"}
+params |= {"paths_per_pass": 2**14, "photons_per_pass": 2**14}
 gates = {"gate_start_depth": 8, "gate_width_ns": 4, "gate_step_ns": 4, "gate_count": 10}
-stack = mitransient_lidar.render("gated_mine", params={**params, **gates}, passes=16, pass_share=1 / 4, seed=1)
+stack = mitransient_lidar.render("gated_mine", params={**params, **gates}, passes=16, seed=1)
 frames = mitransient_lidar.record(stack, "icmos", shots=64, seed=1)
 print(f"{frames.sizes['frame']} frames, {frames.signal.dtype}; largest SNR of a pixel: {float(frames.snr.max()):.2f}")
 

@@ -49,23 +49,6 @@ def test_fixed_parameters_replace_defaults_before_anything_is_loaded(tmp_path):
 
 
 @pytest.mark.slow
-def test_rows_that_maps_do_not_suit_are_merged():
-    """Over foam, and with a cube in the beam; over a bottom alone maps give other light."""
-    for scene, fixed, is_merged in (
-        ("table1", {**FLAT, "foam": 0.1}, True),
-        ("flight", {"cube_x": 0, "cube_y": 0, "aim_x": 0, "aim_y": 0}, True),
-        ("table1", FLAT, False),
-    ):
-        rows = []
-        for light in ("merging", "maps"):
-            given = {"scene": scene, "light": light, "fixed": fixed, "parameters": {"altitude": [200, 220]}}
-            campaign = Campaign.of_file({**given, "target_error": 0.5, "design": {"kind": "grid"}})
-            runs = RunRenderer.of(campaign, campaign.table())
-            rows.append(runs.stacked(np.array([0]), {"altitude": np.array([200])})["waveform"].values)
-        assert np.array_equal(*rows) == is_merged
-
-
-@pytest.mark.slow
 def test_random_seas_are_of_the_run():
     runs = renderer({"bottom_depth": [3.0, 4.0]})
     seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]
@@ -87,7 +70,9 @@ def asked(monkeypatch):
 
 
 def test_what_is_asked_of_a_run(asked):
-    campaign, _columns = planned({"bottom_depth": [3.0, 4.0]}, kind="random", count=5, shots=40, seed=2)
+    design = {"kind": "random", "count": 5, "shots": 40, "seed": 2}
+    given = {"scene": "table1", "light": "maps", "fixed": FLAT, "parameters": {"bottom_depth": [3.0, 4.0]}}
+    campaign = Campaign.of_file({**given, "design": design})
     runs = RunRenderer(campaign, source_of(campaign), TimeAxis(1300, 1, 300))
     for number in (3, 4, 3):
         runs.series(number, {"bottom_depth": 4.0})
@@ -101,7 +86,7 @@ def test_what_is_asked_of_a_run(asked):
     assert 100 < np.abs(first["positions"]).max() <= 256
     assert (first["target_error"], first["components"], first["move_target"]) == (0.05, False, False)
     assert first["axis"] == TimeAxis(1300, 1, 300)
-    assert first["max_time"] is None
+    assert (first["max_time"], first["light"], first["merge_unsuited"]) == (None, "maps", True)
 
 
 @pytest.mark.slow

@@ -73,6 +73,29 @@ def test_importing_without_a_usable_llvm_is_a_readable_error(tmp_path):
         assert "is not a file: install LLVM" in done.stderr
 
 
+@pytest.mark.slow
+def test_quick_kernels_are_others_with_the_same_bits_in_a_folder_of_their_own(tmp_path):
+    """LLVM takes the options, without a word: the loop's kernel has another code."""
+    loop = """
+import mitransient_lidar
+import drjit as dr
+from drjit.llvm import Float
+value, = dr.while_loop((dr.arange(Float, 64) / 7,), lambda x: x < 100, lambda x: (dr.sin(x) + 1.5 * x + 1,))
+print(value.numpy().tobytes().hex())
+"""
+    kernels, bits = [], []
+    for folder, variable in ((".drjit", ""), (".drjit/quick", "1")):
+        environment = {**os.environ, "HOME": str(tmp_path), "MITRANSIENT_LIDAR_QUICK_KERNELS": variable}
+        environment.pop("DRJIT_CACHE_DIR", None)
+        done = subprocess.run([sys.executable, "-c", loop], env=environment, capture_output=True, text=True, check=True)
+        assert done.stderr == ""
+        bits.append(done.stdout)
+        kernels.append({file.name: file.read_bytes() for file in (tmp_path / folder).glob("*.bin")})
+    assert bits[0] == bits[1]
+    assert kernels[0].keys() == kernels[1].keys()
+    assert variants.find_llvm() is None or kernels[0] != kernels[1]
+
+
 @pytest.fixture
 def rgb():
     """Another variant, which the plugins do not support."""

@@ -69,12 +69,8 @@ def looks(line):
     return to_hex(line.get_color()), (None if dashes is None else str(dashes), str(line.get_marker()))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FIGURES)
-def test_figures_are_legible(name):
-    figure = FIGURES[name]()
-    figure.draw_without_rendering()
-    # 7 pt where the figure is 7 inches wide.
+def check_texts(figure):
+    """Texts have 7 pt where the figure is 7 inches wide; axes have units; lines of a legend are told apart."""
     sizes = {text.get_text(): text.get_fontsize() for text in figure.findobj(Text) if text.get_text()}
     small = {text: size for text, size in sizes.items() if size < figure.get_figwidth() - 1e-6}
     assert small == {}
@@ -88,16 +84,19 @@ def test_figures_are_legible(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
-def test_legends_hide_no_data(name):
+def test_figures_are_legible_and_legends_hide_no_data(name):
     """Below a legend there are the background and the grid alone."""
     figure = FIGURES[name]()
     canvas = drawing.FigureCanvasAgg(figure)
     canvas.draw()
-    boxes = [legend.get_window_extent() for ax in figure.axes if (legend := ax.get_legend())]
+    check_texts(figure)
+    legends = [legend for ax in figure.axes if (legend := ax.get_legend())]
+    if not legends:
+        return
+    boxes = [legend.get_window_extent() for legend in legends]
     figure.set_layout_engine("none")
-    for ax in figure.axes:
-        if legend := ax.get_legend():
-            legend.set_visible(False)
+    for legend in legends:
+        legend.set_visible(False)
     canvas.draw()
     dots = np.asarray(canvas.buffer_rgba())[::-1, :, :3].astype(int)
     for box in boxes:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from rows import each_row
 
+from mitransient_lidar.loading import variants
+
 BRIGHT = {"sea": {"slope_variance": "0.02"}, "film": {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 7}}
 BRIGHT |= {"integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14}}
 
@@ -21,7 +23,8 @@ def png(tmp_path):
         if name.endswith(".npy"):
             np.save(path, values)
         else:
-            mi.Bitmap(np.ascontiguousarray(values)[..., None]).write(str(path))
+            with variants.several_threads():
+                mi.Bitmap(np.ascontiguousarray(values)[..., None]).write(str(path))
         return str(path)
 
     return write
