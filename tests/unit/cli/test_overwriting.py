@@ -3,15 +3,14 @@
 import os
 import shutil
 
-import numpy as np
 import pytest
+import synthetic_shots
 from command_line import GROUP, assert_refused, run, stub
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import files, overwriting
 from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 #: Wrong options, found after the check of the files and before the render.
 WRONG = ["-D", "no_such_parameter=1"]
@@ -118,16 +117,9 @@ def folder(tmp_path, monkeypatch, small_result):
 
 @pytest.fixture(scope="module")
 def small_result(tmp_path_factory):
-    """A result of two pixels, as a script saves it."""
+    """A result, as a script saves it."""
     path = tmp_path_factory.mktemp("result") / "shot.nc"
-    dataset = results.build(
-        *np.ones((4, 2, 5)),
-        time=TimeAxis(0.0, 1e-9, 5),
-        pixel_names=["a", "b"],
-        pixel_centres_mrad=np.zeros((2, 2)),
-        attributes={"scene": "table1"},
-    )
-    results.save(dataset, path)
+    results.save(synthetic_shots.result(scene="table1"), path)
     return path
 
 
