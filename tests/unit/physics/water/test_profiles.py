@@ -201,10 +201,7 @@ def test_units_of_netcdf_variables(tmp_path):
         ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth or z and two of a, b, c, omega"),
         ("depth,z,a,b\n0,0,0,0", "has the columns depth, z, a, b: needed are depth or z and two"),
         ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth or z and two of a, b, c, omega"),
-        (
-            "depth,a,b,bbp\n0,0,0,0\n",
-            r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\], omega, bb_ratio \[1, %\]",
-        ),
+        ("depth,a,b,bbp\n0,0,0,0\n", r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\]"),
         ("depth,a440,c532\n0,0,0\n", "has columns for 440, 532 nm: the wavelength must be chosen"),
         ("depth,a,b,a\n0,0,0,0\n", "has 2 columns a and a for a: allowed is one"),
         ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
@@ -227,10 +224,7 @@ def test_units_of_netcdf_variables(tmp_path):
         ("depth,a,omega\n0,1,1\n2,1,1\n", "line 2: omega = 1 must be below 1 if b is to follow from a = 1 1/m"),
         ("depth,b,omega\n0,1,0\n2,1,1\n", "line 2: omega = 0 must be greater than 0 if a is to follow from b = 1 1/m"),
         ("depth,a,b,c\n0,1,1,2\n2,1,1,2.1\n", "line 3: c = 2.1 contradicts a = 1 and b = 1, which give 2"),
-        (
-            "depth,b,c,omega\n0,1,2,0.5\n2,1,2,0.55\n",
-            "line 3: omega = 0.55 contradicts b = 1 and c = 2, which give 0.5",
-        ),
+        ("depth,b,c,omega\n0,1,2,0.5\n2,1,2,0.55\n", "line 3: omega = 0.55 contradicts b = 1 and c = 2, which give"),
     ],
 )
 def test_invalid_csv_files_are_rejected(tmp_path, text, message):
