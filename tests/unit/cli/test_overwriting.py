@@ -16,19 +16,26 @@ from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
 WRONG = ["-D", "no_such_parameter=1"]
 OTHER = {"scene": "fig09_2x2"}
 
+INSTRUMENT = {"instrument": "other"}
+
+
+def figure(*words, files=("png", "nc"), other=OTHER):
+    """Return the row of a command that draws a figure, and its data beside it."""
+    return [*words, *WRONG, "-o", f"d/f.{files[0]}"], [f"d/f.{end}" for end in files], other
+
+
 #: For each command: its arguments, which fail once the files may be written; its files; what another subject is.
+GATES = ("gates.exr", "gates.png", "depth.png", "gates.gif", "gates.html", "components.png")
+FRAMES = (".nc", "_gates.exr", "_gates.png", "_depth.png")
 CASES = {
     "render": (
         ["table1", *WRONG, "-o", "d"],
-        ["d/table1.exr", "d/table1.nc", "d/table1.png", "d/table1_layout.png"],
+        [f"d/table1{end}" for end in (".exr", ".nc", ".png", "_layout.png")],
         OTHER,
     ),
     "render gates": (
         ["gated_mine", "--gif", "--html", "--components", *WRONG, "-o", "d"],
-        [
-            f"d/gated_mine_{name}"
-            for name in ("gates.exr", "gates.png", "depth.png", "gates.gif", "gates.html", "components.png")
-        ],
+        [f"d/gated_mine_{name}" for name in GATES],
         OTHER,
     ),
     "render instrument": (
@@ -36,40 +43,32 @@ CASES = {
         ["d/table1.nc"],
         {"instrument": ""},
     ),
-    "frames": (
-        ["gated_mine", *WRONG, "-o", "d"],
-        [f"d/gated_mine_frames{end}" for end in (".nc", "_gates.exr", "_gates.png", "_depth.png")],
-        OTHER,
-    ),
+    "frames": (["gated_mine", *WRONG, "-o", "d"], [f"d/gated_mine_frames{end}" for end in FRAMES], OTHER),
     "passive": (
         ["passive_sea", *WRONG, "-o", "d"],
         [f"d/passive_sea_passive{end}" for end in (".nc", ".exr", ".png")],
         OTHER,
     ),
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
-    "find-shots": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png"], OTHER),
-    "target-signal": (["fig13_2x2", *WRONG, "-o", "d/f.pdf"], ["d/f.pdf", "d/f.nc"], OTHER),
-    "detect": (["fig13_2x2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "estimate": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "find-shots": figure("table1", files=["png"]),
+    "target-signal": figure("fig13_2x2", files=("pdf", "nc")),
+    "detect": figure("fig13_2x2"),
+    "estimate": figure("table1"),
     "depth-bias": (
         ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
         ["d/t.nc", "d/t.png"],
-        {"instrument": "other"},
+        INSTRUMENT,
     ),
     "tpu": (
         ["riegl_vq840g", *WRONG, "-o", "d"],
-        ["d/riegl_vq840g_tpu.nc", "d/riegl_vq840g_150m_20deg_tvu.csv", "d/riegl_vq840g_150m_20deg_orders.png"],
-        {"instrument": "other"},
+        [f"d/riegl_vq840g_{end}" for end in ("tpu.nc", "150m_20deg_tvu.csv", "150m_20deg_orders.png")],
+        INSTRUMENT,
     ),
-    "forecast": (
-        ["riegl_vq840g", "1:3", *WRONG, "-o", "d/f.png"],
-        ["d/f.png", "d/f.nc", "d/f.tif"],
-        {"instrument": "other"},
-    ),
-    "bounds": (["table1", "--free", "bottom_depth", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc", "d/f.csv"], OTHER),
-    "beam-spread": (["table1", "--depths", "2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "fov-sweep": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "scattering-orders": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "forecast": figure("riegl_vq840g", "1:3", files=("png", "nc", "tif"), other=INSTRUMENT),
+    "bounds": figure("table1", "--free", "bottom_depth", files=("png", "nc", "csv")),
+    "beam-spread": figure("table1", "--depths", "2"),
+    "fov-sweep": figure("table1"),
+    "scattering-orders": figure("table1"),
     "water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
     "figures": (["fig09", "--target-error", "-1", "-o", "d"], ["d/fig09.png", "d/statements.csv"], None),
     "view": (["damaged.nc", "-o", "d/v.html", "--no-browser"], ["d/v.html"], OTHER),
