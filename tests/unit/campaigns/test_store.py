@@ -208,7 +208,6 @@ def test_damaged_values_are_not_read(full, path):
 @each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
 @each_row("damage", [flip, Path.unlink])
 def test_damaged_coordinates_are_refused(made, tmp_path, name, damage):
-    """They are those of all runs, and nothing else has them."""
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     damage(path / name / "c" / "0")
     with pytest.raises(ValueError, match=r"campaign\.zarr is damaged|checksum"):

@@ -163,7 +163,6 @@ def outside(kind, option):
 
 @pytest.mark.parametrize("command", MADE)
 def test_bad_values_are_refused_by_name(command, needed, tmp_path):
-    """The check is made before anything is rendered or written."""
     for name, (kind, option, _, parameter) in options_of(command).items():
         for value in [] if (command, name) in UNTRIED else [*outside(kind, option), *OTHERS.get((command, name), [])]:
             pair = option.form == "ALONG,ACROSS"

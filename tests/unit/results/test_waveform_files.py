@@ -333,7 +333,6 @@ def test_echoes_of_a_file(tmp_path):
 
 
 def test_commands_take_files(tmp_path):
-    """Parts of a file, in compare and view; what is missing, in one sentence."""
     water_file(tmp_path / "sea.las")
     same = run("compare", tmp_path / "sea.las", tmp_path / "sea.las", "-o", tmp_path / "same.png")
     assert same.stdout.splitlines()[1].startswith("agree: 240 bins, rms 0.00"), same.stderr

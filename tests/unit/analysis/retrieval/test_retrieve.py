@@ -53,7 +53,6 @@ def test_a_slope_that_the_sea_cannot_have_is_refused():
 
 
 def test_a_receiver_of_one_pixel_gives_bottom_and_water():
-    """Refused for want of slopes before, which neither needs."""
     one = result(4 * waveform()[np.newaxis])
     found = retrieve.retrieve(one)
     assert np.isnan(found["slope_along"])
