@@ -127,9 +127,7 @@ OPTIONS = [
     (("depth-bias", "eye"), "--seed", "1", "instrument = 'eye' is not known"),
     (("depth-bias", "riegl_vq880g2_infrared"), "--seed", "1", "wavelength_nm = 1064: depth errors are of green light"),
     (("depth-bias", "riegl_vq840g"), "--waters", ",", "--waters = ',' has an empty entry"),
-    (("tpu", "riegl_vq840g"), "--estimator", "eye", "estimator = 'eye' must be one of threshold"),
     (("tpu", "icesat2_atlas"), "--seed", "1", "no shipped corrections of the instrument icesat2_atlas"),
-    (("beam-spread", "fig09_2x2"), "--depths", "2;5", "must hold numbers only"),
 ]
 
 
@@ -224,10 +222,7 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
     [
         (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
         (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
-        (quietly(passes=1e20), "passes = 100000000000000000000 must lie between"),
         (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
-        (quietly(seed=2**64), "seed = 18446744073709551616 must lie between"),
-        (quietly(max_memory={}), "max_memory = {} must be a number"),
         (quietly(variant=3), "variant = 3 is not supported"),
         (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
         (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),

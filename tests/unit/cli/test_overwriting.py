@@ -218,7 +218,7 @@ def small_figures(monkeypatch):
 
 @pytest.mark.usefixtures("small_figures")
 @pytest.mark.slow
-def test_line_names_what_differs():
+def test_line_names_what_differs(folder):
     first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
     assert line(run(*first)) == []
     done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
@@ -230,6 +230,14 @@ def test_line_names_what_differs():
     done = run("estimate", "fig09_2x2", "--paths", 64, "-o", "d/a.png", "--overwrite")
     assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
     assert done.exit_code == 0
+    # Files of one name in two folders are two scenes.
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        run("scenes", "copy", "table1", f"{name}/lab.xml")
+    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
+    assert run(*estimate, "a/lab.xml").exit_code == 0
+    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
+    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
 
 
 def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
@@ -246,18 +254,6 @@ def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
     assert_refused(command("render"), "since its scene is fig09_2x2")
     saved.to_netcdf("d/table1.nc", engine="h5netcdf")
     assert_refused(command("render"), "since no command has written it as it is")
-
-
-@pytest.mark.usefixtures("small_figures")
-@pytest.mark.slow
-def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
-    for name in ("a", "b"):
-        (folder / name).mkdir()
-        run("scenes", "copy", "table1", f"{name}/lab.xml")
-    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
-    assert run(*estimate, "a/lab.xml").exit_code == 0
-    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
-    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
 
 
 @pytest.mark.usefixtures("small_figures")

@@ -112,6 +112,7 @@ def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
     ("free", "options", "message"),
     [
         (["bottom_deep"], {}, "parameter 'bottom_deep' is not one of the scene: did you mean bottom_depth"),
+        ([], {}, "must name one or more parameters"),
         (["attenuation", "attenuation"], {}, "names attenuation twice"),
         (["attenuation"], {"params": {"attenuation": "0.9, 0.5"}}, r"name one of its elements attenuation\[0\]"),
         (["attenuation[2]"], {}, r"parameter attenuation\[2\]: the index must be 0 to 0"),
