@@ -50,6 +50,7 @@ def test_clean_values():
         (lambda: finite_array("x", [1, np.nan]), "x holds nan but every value must be finite"),
         (lambda: finite_array("x", ["a"]), "must hold numbers only"),
         (lambda: non_negative_array("x", [1, -2, -3]), "x = -3 must not be negative"),
+        (lambda: non_negative_array("x", [1, -1e-9]), "x = -1e-09 must not be negative"),
         (lambda: increasing_array("x", [1]), r"x of shape \(1,\) must be a list of at least 2 numbers"),
         (lambda: increasing_array("x", [[1, 2]]), r"x of shape \(1, 2\) must be a list"),
         (lambda: increasing_array("x", [0, 2, 2]), "x must increase strictly, but 2 is followed by 2"),

@@ -203,3 +203,11 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
     with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
         scenes.open_scene(own)
+
+
+def test_folders_of_a_scene_are_those_beside_it(tmp_path, monkeypatch):
+    for folder in ("scene/a", "here/a"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "scene" / "own.xml").write_text('<scene version="3.0.0"><path value="a"/></scene>')
+    monkeypatch.chdir(tmp_path / "here")
+    assert read_document(tmp_path / "scene" / "own.xml").folders[0] == (tmp_path / "scene" / "a").resolve()
